@@ -1,0 +1,152 @@
+"""Everything that can go wrong between a bus and a sample.
+
+DriverError
+├── BusError                  the bus cannot be opened, or has gone
+├── NodeMissing               a configured node does not answer
+├── IdentityMismatch          1018h is not what the cell configuration expects
+├── NmtRefused                a node did not confirm an NMT state by heartbeat
+├── ObjectAccessError         an SDO transfer was aborted or timed out
+├── MappingRefused            a PDO mapping could not be written, or reads back differently
+├── StateRefused              a CiA 402 transition did not happen in its bound
+├── SampleLost                a SYNC cycle had no complete answer
+├── DriveFault                EMCY, fault bit or following error while running
+├── HeartbeatLost             a node fell silent
+├── MotionRefused             motion was asked for without permission, or outside the limits
+└── MotionTimeout             a move did not end in its bound
+"""
+
+from __future__ import annotations
+
+
+class DriverError(Exception):
+    """Root of the tree; carries the evidence as attributes and says it in its message."""
+
+
+class BusError(DriverError):
+    """The bus cannot be opened, or has gone."""
+
+    def __init__(self, address: str, reason: str) -> None:
+        super().__init__(f"bus {address}: {reason}")
+        self.address = address
+        self.reason = reason
+
+
+class NodeMissing(DriverError):
+    """A configured node does not answer."""
+
+    def __init__(self, node_ids: tuple[int, ...], found: tuple[int, ...], waited_s: float) -> None:
+        super().__init__(
+            f"node {', '.join(map(str, node_ids))} did not answer within {waited_s:g} s "
+            f"(answered: {', '.join(map(str, found)) or 'none'}); check power, wiring, bit rate and node id"
+        )
+        self.node_ids = node_ids
+        self.found = found
+        self.waited_s = waited_s
+
+
+class IdentityMismatch(DriverError):
+    """Object 1018h is not what the cell configuration expects."""
+
+    def __init__(self, node_id: int, field: str, expected: int, found: int) -> None:
+        super().__init__(
+            f"node {node_id}: {field} is {found:#x}, the cell configuration expects {expected:#x}; "
+            "was an amplifier exchanged? correct the configuration only after checking the hardware"
+        )
+        self.node_id = node_id
+        self.field = field
+        self.expected = expected
+        self.found = found
+
+
+class NmtRefused(DriverError):
+    """A node did not confirm an NMT state by heartbeat."""
+
+    def __init__(self, node_id: int, asked: str, found: str, waited_s: float) -> None:
+        super().__init__(
+            f"node {node_id}: asked for NMT {asked}, its heartbeat still says {found} after {waited_s:g} s; "
+            "read its error register 1001h"
+        )
+        self.node_id = node_id
+        self.asked = asked
+        self.found = found
+
+
+class ObjectAccessError(DriverError):
+    """An SDO transfer was aborted or timed out."""
+
+    def __init__(self, node_id: int, entry: str, reason: str, abort_code: int | None = None) -> None:
+        super().__init__(f"node {node_id}: object {entry}: {reason}")
+        self.node_id = node_id
+        self.entry = entry
+        self.reason = reason
+        self.abort_code = abort_code
+
+
+class MappingRefused(DriverError):
+    """A PDO mapping could not be written, or reads back differently."""
+
+    def __init__(self, node_id: int, pdo: str, reason: str) -> None:
+        super().__init__(f"node {node_id}: {pdo}: {reason}")
+        self.node_id = node_id
+        self.pdo = pdo
+        self.reason = reason
+
+
+class StateRefused(DriverError):
+    """A CiA 402 transition did not happen in its bound."""
+
+    def __init__(self, node_id: int, asked: str, found: str, statusword: int) -> None:
+        super().__init__(
+            f"node {node_id}: asked for {asked}, statusword {statusword:#06x} says {found}; "
+            "check the power stage, the safety chain (STO) and the fault memory"
+        )
+        self.node_id = node_id
+        self.asked = asked
+        self.found = found
+        self.statusword = statusword
+
+
+class SampleLost(DriverError):
+    """A SYNC cycle had no complete answer."""
+
+    def __init__(self, cycle: int, axes: tuple[int, ...]) -> None:
+        super().__init__(f"cycle {cycle}: no answer from axis {', '.join(str(a + 1) for a in axes)}")
+        self.cycle = cycle
+        self.axes = axes
+
+
+class DriveFault(DriverError):
+    """EMCY, fault bit or following error while running; the axes have been stopped."""
+
+    def __init__(self, node_id: int, reason: str, statusword: int | None = None, emcy_code: int | None = None) -> None:
+        super().__init__(f"node {node_id}: {reason}; all axes were stopped and stay disabled")
+        self.node_id = node_id
+        self.reason = reason
+        self.statusword = statusword
+        self.emcy_code = emcy_code
+
+
+class HeartbeatLost(DriverError):
+    """A node fell silent; the axes have been stopped."""
+
+    def __init__(self, node_id: int, silent_s: float) -> None:
+        super().__init__(f"node {node_id}: no heartbeat for {silent_s:g} s; all axes were stopped and stay disabled")
+        self.node_id = node_id
+        self.silent_s = silent_s
+
+
+class MotionRefused(DriverError):
+    """Motion was asked for without permission, or outside the limits."""
+
+
+class MotionTimeout(DriverError):
+    """A move did not end in its bound; the axes have been stopped."""
+
+    def __init__(self, move: int, axes: tuple[int, ...], waited_s: float) -> None:
+        super().__init__(
+            f"move {move}: axis {', '.join(str(a + 1) for a in axes)} did not reach its target "
+            f"within {waited_s:g} s; all axes were stopped"
+        )
+        self.move = move
+        self.axes = axes
+        self.waited_s = waited_s

@@ -1,0 +1,1 @@
+"""The science: arrays in, results out. No bus, no log, no clock."""

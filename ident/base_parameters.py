@@ -1,0 +1,69 @@
+"""Base parameters: the fewest columns that say everything the standard ones can (paper §2.1, QR method)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BaseParameters:
+    """Which standard columns are independent, and what each of them gathers from the others.
+
+    Attributes:
+        independent: indices of the base columns among the standard ones, ascending.
+        grouping: shape (b, c): base parameter = grouping @ standard parameters.
+        names: leading name and what is regrouped with it.
+    """
+
+    independent: tuple[int, ...]
+    grouping: FloatArray
+    names: tuple[str, ...]
+
+
+def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:
+    """Find them in the triangular factor of an observation matrix.
+
+    A column is independent when what its predecessors leave of it is more than ``tolerance`` of its norm; taking the
+    first ones in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
+
+    Args:
+        triangle: any matrix with the same Gram matrix as the observation matrix, shape (m, c).
+        names: of the c standard parameters.
+        tolerance: relative to each column's norm; columns below 1e-9 of the largest count as zero before that, or one
+            of them survives its normalisation and the condition number becomes 1e16.
+    """
+    norms = np.linalg.norm(triangle, axis=0)
+    present = norms > 1e-9 * float(norms.max(initial=0.0))
+    independent: list[int] = []
+    basis = np.zeros((triangle.shape[0], 0))
+    for column in np.flatnonzero(present):
+        unit = triangle[:, column] / norms[column]
+        rest = unit - basis @ (basis.T @ unit)
+        rest -= basis @ (basis.T @ rest)  # twice is enough (Kahan): the first projection loses digits by cancellation
+        size = float(np.linalg.norm(rest))
+        if size > tolerance:
+            independent.append(int(column))
+            basis = np.column_stack((basis, rest / size))
+    chosen = triangle[:, independent]
+    scale = norms[independent]
+    weights = linalg.lstsq(chosen / scale, triangle)[0] / scale[:, None]
+    weights[:, ~present] = 0.0
+    weights[:, independent] = np.eye(len(independent))
+    weights[np.abs(weights) < 1e-6] = 0.0
+    grouped = tuple(_name(row, leading, names) for row, leading in zip(weights, independent, strict=True))
+    return BaseParameters(tuple(independent), weights, grouped)
+
+
+def _name(row: FloatArray, leading: int, names: tuple[str, ...]) -> str:
+    text = names[leading]
+    for other in np.flatnonzero(row):
+        if other != leading:
+            weight = round(float(row[other]), 6)
+            text += f" {'+' if weight > 0 else '-'} {abs(weight)}*{names[other]}"
+    return text

@@ -1,0 +1,124 @@
+"""The calibration: drive gains with their uncertainty, parameters, effects and where all of it came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """One joint drive gain g = N·Gt·Kt (paper eq. 4).
+
+    Attributes:
+        axis: name of the axis.
+        value, std: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed.
+        unit: Nm at the joint per unit of the current-loop reference.
+        nameplate: the manufacturer's a priori gain [unit].
+    """
+
+    axis: str
+    value: float
+    std: float
+    unit: str
+    nameplate: float
+
+    @property
+    def std_percent(self) -> float:
+        """Relative standard deviation (eq. 11) [%]."""
+        return 100.0 * self.std / abs(self.value)
+
+    @property
+    def change_percent(self) -> float:
+        """Change from the nameplate [%]."""
+        return 100.0 * (self.value / self.nameplate - 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One identified dynamic parameter, with the regrouping in its name where it has one."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+    @property
+    def std_percent(self) -> float:
+        """Relative standard deviation (eq. 11) [%]; inf for a value of zero."""
+        return 100.0 * self.std / abs(self.value) if self.value else float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeError:
+    """‖ρ‖/‖Y‖ of each axis and of all together [%]; it means nothing without the filter beside it."""
+
+    axes: tuple[float, ...]
+    total: float
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedEffect:
+    """An effect that the declared model lacked and that held-out data asked for.
+
+    Attributes:
+        name: family, as in ident/effects/.
+        axis: name of the axis.
+        settings: the searched (non-linear) parameters by name, units in the names.
+        coefficients: the linear parameters, identified.
+        error_before_percent, error_after_percent: relative error of the axis on the data not used for the fit [%].
+        ambiguity: families whose held-out score cannot be told from this one's.
+    """
+
+    name: str
+    axis: str
+    settings: dict[str, float]
+    coefficients: tuple[Parameter, ...]
+    error_before_percent: float
+    error_after_percent: float
+    ambiguity: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One log that the calibration rests on."""
+
+    name: str
+    sha256: str
+    role: str
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What is kept, shown, compared and written back.
+
+    Attributes:
+        cell: name of the cell.
+        method: ls, wls, tls or ml.
+        gains: one an axis.
+        parameters: base parameters of the robot, then the unknown parameters of each payload mounting.
+        effects: accepted effects.
+        relative_error_percent: on the data of the fit.
+        holdout_error_percent: on a run that was used for nothing else, None where there was none.
+        condition: of the weighted observation matrix.
+        rows: of the observation after masks and decimation.
+        filter: cut-offs, orders, decimation and standstill speeds, by name.
+        sources: logs, with digests and roles.
+        configuration_sha256: of the cell configuration that the logs carry.
+        created: ISO 8601 time, given by the caller.
+        software: name and version that made it.
+    """
+
+    cell: str
+    method: str
+    gains: tuple[Gain, ...]
+    parameters: tuple[Parameter, ...]
+    effects: tuple[AcceptedEffect, ...]
+    relative_error_percent: RelativeError
+    holdout_error_percent: RelativeError | None
+    condition: float
+    rows: int
+    filter: dict[str, float | list[float]]
+    sources: tuple[Source, ...]
+    configuration_sha256: str
+    created: str
+    software: str

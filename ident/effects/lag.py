@@ -1,0 +1,42 @@
+"""A current that is seen later than the position: a filter in the drive, or a time skew of the record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.effects.effect import Property, Side
+from ident.model import Column
+from ident.signals import Signals
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """τ = −c · d(g v)/dt
+
+    v(t − c) ≈ v(t) − c v̇(t) with the current that the model predicts. Source: first-order expansion of a delay, and of
+    a first-order lag of time constant c alike: the two cannot be told apart here. Signature: rate of torque.
+    """
+
+    name: ClassVar[str] = "lag"
+    side: ClassVar[Side] = Side.MOTOR
+    holds: ClassVar[Property] = Property.RATE_OF_TORQUE
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The searched parameters."""
+        return {}
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """Linear parameters."""
+        return (Column("time", "s"),)
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Torque per unit of each coefficient, shape (1, k)."""
+        return np.asarray(-np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz)[None]

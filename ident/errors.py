@@ -1,0 +1,56 @@
+"""Everything that can be wrong with data or a model before a number may be believed.
+
+IdentificationError
+├── ModelError            the URDF or drive train does not describe this robot
+├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
+├── RankDeficient         the data cannot tell some unknowns apart
+├── NotConverged          the iteration did not reach its optimum
+└── EffectRefused         an effect was asked for that does not exist or does not fit the axis
+"""
+
+from __future__ import annotations
+
+
+class IdentificationError(Exception):
+    """Root of the tree; carries the evidence as attributes and says it in its message."""
+
+
+class ModelError(IdentificationError):
+    """The URDF or drive train does not describe this robot."""
+
+
+class DataUnfit(IdentificationError):
+    """The recording cannot be used."""
+
+    def __init__(self, run: str, reason: str) -> None:
+        super().__init__(f"run {run!r}: {reason}")
+        self.run = run
+        self.reason = reason
+
+
+class RankDeficient(IdentificationError):
+    """The data cannot tell some unknowns apart."""
+
+    def __init__(self, reason: str, condition: float, unknowns: tuple[str, ...]) -> None:
+        super().__init__(f"{reason} (condition {condition:.3g}; unknowns involved: {', '.join(unknowns)})")
+        self.reason = reason
+        self.condition = condition
+        self.unknowns = unknowns
+
+
+class NotConverged(IdentificationError):
+    """The iteration did not reach its optimum."""
+
+    def __init__(self, method: str, iterations: int, cost: tuple[float, ...], step: float) -> None:
+        super().__init__(
+            f"{method} did not converge in {iterations} iterations: the cost went from {cost[0]:.6g} to {cost[-1]:.6g} "
+            f"and the last relative step was {step:.2g}; are roles, payload mass and drive train right?"
+        )
+        self.method = method
+        self.iterations = iterations
+        self.cost = cost
+        self.step = step
+
+
+class EffectRefused(IdentificationError):
+    """An effect was asked for that does not exist or does not fit the axis."""

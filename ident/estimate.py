@@ -1,0 +1,83 @@
+"""What an estimator found, and its certificate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.calibration import RelativeError
+from ident.model import Column
+from ident.observation import Observation
+
+FloatArray = NDArray[np.float64]
+
+
+class Method(Enum):
+    """The estimators, by the names technicians use."""
+
+    LS = "ls"
+    WLS = "wls"
+    TLS = "tls"
+    ML = "ml"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Gains and parameters of one observation.
+
+    Attributes:
+        method: which estimator.
+        gains: g of each motor [Nm at the joint per A], shape (n,).
+        gains_fixed: the gains were given, not estimated.
+        unknowns: name and unit of each parameter: χ, then χ_uL.
+        parameters: their values, shape (p,).
+        covariance: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed.
+        axis_noise: standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
+        singular_values: of the weighted system that was solved.
+        condition: of the weighted observation matrix, unit-free columns not assumed.
+        rows: equations used.
+        iterations: of an iterative estimator.
+    """
+
+    method: Method
+    gains: FloatArray
+    gains_fixed: bool
+    unknowns: tuple[Column, ...]
+    parameters: FloatArray
+    covariance: FloatArray
+    axis_noise: FloatArray
+    singular_values: FloatArray
+    condition: float
+    rows: int
+    iterations: int = 0
+
+    @property
+    def gains_std(self) -> FloatArray:
+        """σ of each gain, shape (n,)."""
+        return np.sqrt(np.diag(self.covariance)[: len(self.gains)])
+
+    @property
+    def parameters_std(self) -> FloatArray:
+        """σ of each parameter, shape (p,)."""
+        return np.sqrt(np.diag(self.covariance)[len(self.gains) :])
+
+    def predicted_torque(self, observation: Observation) -> FloatArray:
+        """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r): what the model says the joints need."""
+        return np.asarray(np.einsum("jpr,p->jr", observation.linear(), self.parameters) + observation.known())
+
+    def residual_torque(self, observation: Observation) -> FloatArray:
+        """ρ = V g − W χ − … (eq. 13) [Nm], shape (n, r)."""
+        return observation.torque(self.gains) - self.predicted_torque(observation)
+
+    def relative_error(self, observation: Observation) -> RelativeError:
+        """‖ρ_j‖/‖Y_j‖ of each joint over its used rows, and of all together [%] (paper Table 6)."""
+        torque, residual = observation.torque(self.gains), self.residual_torque(observation)
+        used = observation.use
+        size = np.array([np.sum(torque[j, used[j]] ** 2) for j in range(len(used))])
+        left = np.array([np.sum(residual[j, used[j]] ** 2) for j in range(len(used))])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            axes = 100.0 * np.sqrt(left / size)
+        return RelativeError(tuple(float(value) for value in axes), float(100.0 * np.sqrt(left.sum() / size.sum())))

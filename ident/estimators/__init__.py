@@ -1,0 +1,1 @@
+"""The estimators, each on the same Observation."""

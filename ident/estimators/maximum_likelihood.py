@@ -1,0 +1,158 @@
+"""Structured total least squares: the errors are in the current references alone.
+
+The positions of a geared robot are known to a few µrad; what differs from run to run is the current reference. So for
+each motor i, with T from the drive train (g_i v_i = (T τ)_i),
+
+    v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i,      γ_i = 1/g_i,     e_i ~ (0, σ_i²),
+
+and the estimate minimises Σ_i ‖e_i‖²/σ_i² with σ_i estimated along: the maximum-likelihood member of the paper's
+family. In the paper's terms it is the total least squares of eq. (17) that corrects the columns V only. It does not
+change when a current is given in another unit or the columns are scaled.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.errors import NotConverged, RankDeficient
+from ident.estimate import Estimate, Method
+from ident.estimators.least_squares import require_known_payload, wls
+from ident.estimators.total_least_squares import Scaling, tls
+from ident.estimators.triangles import Triangles, motor_triangles, singular_values, solve
+from ident.linearisation import jackknife_covariance, linearise
+from ident.observation import Observation
+
+FloatArray = NDArray[np.float64]
+
+MAX_ITERATIONS = 100
+STEP_TOLERANCE = 1e-9
+
+
+def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estimate:
+    """Damped Gauss-Newton from the likeliest of the linear estimates.
+
+    Args:
+        observation: rows of at least one loaded and one unloaded run where the gains are unknown.
+        fixed_gains: known gains [Nm/A], shape (n,); the problem is then linear.
+
+    Raises:
+        DataUnfit: free gains without a known payload, or fewer rows than unknowns.
+        RankDeficient: a gain cannot be told from the parameters.
+        NotConverged: the cost still falls, or cannot fall, after MAX_ITERATIONS.
+    """
+    triangles = motor_triangles(observation)
+    if fixed_gains is None:
+        require_known_payload(observation)
+        gamma, iterations = _gauss_newton(observation, triangles)
+    else:
+        gamma, iterations = 1.0 / fixed_gains, 0
+    free = observation.robot.shape[1] + sum(map(len, observation.payload_columns))
+    free += 0 if fixed_gains is not None else observation.joint_count
+    noise = _noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
+    for _ in range(30):  # σ and χ for these γ: a fixed point of a few rounds
+        parameters = _parameters(triangles, gamma, noise)
+        updated = _noise_of(triangles, gamma, parameters, free)
+        if np.allclose(updated, noise, rtol=1e-10):
+            break
+        noise = updated
+    jacobian_singular = singular_values(_scaled_linear(triangles, gamma, noise))
+    problem = linearise(observation, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None)
+    covariance = jackknife_covariance(problem, len(gamma) + len(parameters))
+    return Estimate(
+        method=Method.ML,
+        gains=1.0 / gamma,
+        gains_fixed=fixed_gains is not None,
+        unknowns=observation.unknowns,
+        parameters=parameters,
+        covariance=covariance,
+        axis_noise=noise,
+        singular_values=jacobian_singular,
+        condition=float(jacobian_singular[0] / jacobian_singular[-1]),
+        rows=int(triangles.rows.sum()),
+        iterations=iterations,
+    )
+
+
+def _scaled_linear(triangles: Triangles, gamma: FloatArray, noise: FloatArray) -> FloatArray:
+    return np.concatenate([f[:, 1:-1] * (g / s) for f, g, s in zip(triangles.factors, gamma, noise, strict=True)])
+
+
+def _parameters(triangles: Triangles, gamma: FloatArray, noise: FloatArray) -> FloatArray:
+    """χ for given γ: linear least squares."""
+    right = np.concatenate(
+        [(f[:, 0] - g * f[:, -1]) / s for f, g, s in zip(triangles.factors, gamma, noise, strict=True)]
+    )
+    return solve(_scaled_linear(triangles, gamma, noise), right)[0]
+
+
+def _residuals(triangles: Triangles, gamma: FloatArray, parameters: FloatArray) -> list[FloatArray]:
+    vectors = (np.concatenate(([1.0], -g * parameters, [-g])) for g in gamma)
+    return [factor @ vector for factor, vector in zip(triangles.factors, vectors, strict=True)]
+
+
+def _noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, free: int) -> FloatArray:
+    size = np.array([float(e @ e) for e in _residuals(triangles, gamma, parameters)])
+    return np.asarray(np.sqrt(size / np.maximum(triangles.rows - free / len(gamma), 1.0)))
+
+
+def _start(observation: Observation, triangles: Triangles) -> FloatArray:
+    """γ of whichever linear estimate makes these data likeliest; each is good somewhere."""
+    even = np.ones(observation.joint_count)
+    starts = [wls(observation), tls(observation, Scaling.COLUMNS), tls(observation, Scaling.BOTH)]
+    gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
+    if not gammas:
+        gains = tuple(f"gain {motor + 1}" for motor in range(len(even)))
+        raise RankDeficient("no linear estimate gives every gain a value", float("inf"), gains)
+    return min(gammas, key=lambda gamma: _log_likelihood_cost(triangles, gamma, _parameters(triangles, gamma, even)))
+
+
+def _gauss_newton(observation: Observation, triangles: Triangles) -> tuple[FloatArray, int]:
+    """γ by variable projection: χ is eliminated for each γ, so that only n unknowns are iterated."""
+    count = observation.joint_count
+    gamma = _start(observation, triangles)
+    noise = np.ones(count)
+    for _ in range(3):
+        parameters = _parameters(triangles, gamma, noise)
+        noise = _noise_of(triangles, gamma, parameters, 0)
+    cost = [_log_likelihood_cost(triangles, gamma, parameters)]
+    damping, step = 1e-3, np.inf
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        parameters = _parameters(triangles, gamma, noise)
+        residual = np.concatenate([e / s for e, s in zip(_residuals(triangles, gamma, parameters), noise, strict=True)])
+        linear = _scaled_linear(triangles, gamma, noise)
+        sizes = [len(factor) for factor in triangles.factors]
+        towards = np.zeros((sum(sizes), count))
+        first = 0
+        for motor, factor in enumerate(triangles.factors):
+            predicted = factor @ np.concatenate(([0.0], parameters, [1.0]))
+            # Relative steps of γ, so that motors of different units are alike.
+            towards[first : first + sizes[motor], motor] = predicted * gamma[motor] / noise[motor]
+            first += sizes[motor]
+        q, _ = np.linalg.qr(linear / np.linalg.norm(linear, axis=0))
+        projected = towards - q @ (q.T @ towards)
+        gram, gradient = projected.T @ projected, projected.T @ residual
+        while True:
+            relative = np.linalg.solve(gram + damping * np.diag(np.diag(gram)), gradient)
+            trial = gamma * (1.0 + relative)
+            if np.all(np.sign(trial) == np.sign(gamma)):
+                candidate = _parameters(triangles, trial, noise)
+                trial_cost = _log_likelihood_cost(triangles, trial, candidate)
+                if trial_cost <= cost[-1] + 1e-12 * abs(cost[-1]):
+                    break
+            damping *= 10.0
+            if damping > 1e12:
+                raise NotConverged("ml", iteration, tuple(cost), float(step))
+        step = float(np.max(np.abs(relative)))
+        gamma, damping = trial, max(damping * 0.1, 1e-12)
+        noise = _noise_of(triangles, gamma, candidate, 0)
+        cost.append(trial_cost)
+        if step < STEP_TOLERANCE:
+            return gamma, iteration
+    raise NotConverged("ml", MAX_ITERATIONS, tuple(cost), step)
+
+
+def _log_likelihood_cost(triangles: Triangles, gamma: FloatArray, parameters: FloatArray) -> float:
+    """−log L up to constants, with each σ_i at its optimum: Σ r_i log ‖e_i‖."""
+    residuals = _residuals(triangles, gamma, parameters)
+    return float(sum(rows * np.log(np.linalg.norm(e)) for rows, e in zip(triangles.rows, residuals, strict=True)))

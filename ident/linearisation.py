@@ -1,0 +1,127 @@
+"""The problem around an estimate as a linear one: whitened residuals and their Jacobian, motor by motor.
+
+e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see estimators/maximum_likelihood.py. The gain
+direction is built from the *predicted* torque, not the measured current, so that the noise does not enter it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.observation import Observation
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Rows of all motors below each other, motor 1 first.
+
+    Attributes:
+        jacobian: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale, shape (rows, f).
+        residual: whitened, shape (rows,).
+        motor: of each row, shape (rows,).
+        cluster: move of each row, numbered 0 … without gaps, shape (rows,).
+        source: index of each row among the observation's decimated rows, shape (rows,).
+        gamma: 1/g, shape (n,).
+        noise: σ_i [A], shape (n,).
+        free: which of (gains, parameters) are free, shape (f,).
+        scale: unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
+    """
+
+    jacobian: FloatArray
+    residual: FloatArray
+    motor: IntArray
+    cluster: IntArray
+    source: IntArray
+    gamma: FloatArray
+    noise: FloatArray
+    free: IntArray
+    scale: FloatArray
+
+    def whitened(self, torque_nm: FloatArray) -> FloatArray:
+        """Motor-side torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra)."""
+        columns = np.empty((len(self.motor), torque_nm.shape[1]))
+        for motor in range(len(self.gamma)):
+            rows = self.motor == motor
+            columns[rows] = torque_nm[motor][:, self.source[rows]].T * (self.gamma[motor] / self.noise[motor])
+        return columns
+
+
+def motor_torque(observation: Observation) -> tuple[FloatArray, FloatArray]:
+    """The model's torque as each motor must give it, T τ (see DriveTrain): linear part (n, p, r), known part (n, r)."""
+    to_motor = observation.drive_train.to_motor
+    linear = observation.linear()
+    mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
+    return mixed, to_motor @ observation.known()
+
+
+def linearise(
+    observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
+) -> Linearisation:
+    """Around given gains [Nm/A], parameters and current noise [A] of each motor."""
+    linear, known = motor_torque(observation)
+    count = len(gains)
+    gamma = 1.0 / gains
+    jacobian, residual, motors, clusters, sources = [], [], [], [], []
+    for motor in range(count):
+        used = np.flatnonzero(observation.motor_use[motor])
+        columns = linear[motor][:, used]
+        torque = parameters @ columns + known[motor, used]
+        rows = np.zeros((len(used), count + len(parameters)))
+        # ∂(γ τ)/∂g = −γ² τ; in units of the gain itself, −γ τ.
+        rows[:, motor] = -gamma[motor] * torque / noise[motor]
+        rows[:, count:] = columns.T * (gamma[motor] / noise[motor])
+        jacobian.append(rows)
+        residual.append((observation.current[motor, used] - gamma[motor] * torque) / noise[motor])
+        motors.append(np.full(len(used), motor))
+        clusters.append(observation.move[used])
+        sources.append(used)
+    matrix = np.concatenate(jacobian)
+    free = np.arange(count if gains_fixed else 0, matrix.shape[1])
+    norms = np.linalg.norm(matrix, axis=0)
+    unit = np.concatenate((gains, np.divide(1.0, norms[count:], where=norms[count:] > 0, out=np.ones(len(parameters)))))
+    matrix[:, count:] *= unit[count:]
+    return Linearisation(
+        jacobian=matrix[:, free],
+        residual=np.concatenate(residual),
+        motor=np.concatenate(motors),
+        cluster=np.unique(np.concatenate(clusters), return_inverse=True)[1].astype(np.int64),
+        source=np.concatenate(sources),
+        gamma=gamma,
+        noise=noise,
+        free=free,
+        scale=unit[free],
+    )
+
+
+def jackknife_covariance(problem: Linearisation, unknowns: int) -> FloatArray:
+    """Covariance of (gains, parameters) by leaving out one move at a time (a CR3 cluster sandwich).
+
+    The residual of a geared robot is correlated over a move (lag one about 0.67), so rows are not independent, moves
+    nearly are. With G_c = J_cᵀJ_c and s_c = J_cᵀe_c of move c, leaving it out shifts the estimate by −(H − G_c)⁻¹ s_c
+    (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002).
+
+    Args:
+        problem: around the estimate.
+        unknowns: length of (gains, parameters), free or not.
+    """
+    order = np.argsort(problem.cluster, kind="stable")
+    moves = int(problem.cluster.max()) + 1
+    bounds = np.searchsorted(problem.cluster[order], np.arange(moves + 1))
+    jacobian, residual = problem.jacobian[order], problem.residual[order]
+    hessian = jacobian.T @ jacobian
+    shifts = np.empty((moves, hessian.shape[0]))
+    for move in range(moves):
+        part = slice(bounds[move], bounds[move + 1])
+        gram, score = jacobian[part].T @ jacobian[part], jacobian[part].T @ residual[part]
+        shifts[move] = np.linalg.lstsq(hessian - gram, score, rcond=None)[0]
+    centred = shifts - shifts.mean(axis=0)
+    covariance = np.zeros((unknowns, unknowns))
+    unit = problem.scale
+    covariance[np.ix_(problem.free, problem.free)] = (moves - 1) / moves * (centred.T @ centred) * np.outer(unit, unit)
+    return covariance

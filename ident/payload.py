@@ -1,0 +1,25 @@
+"""A body fixed to the last link: what is known of it, and what is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+PAYLOAD_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
+"""The ten inertial parameters of a link, in the paper's order: inertia about the link frame's origin [kg m²],
+first moments [kg m] and mass [kg]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """A weighed body as it was mounted; each mounting has its own unknowns.
+
+    Attributes:
+        name: of the body.
+        mounting: names one way of mounting it; runs that share it share their unknown parameters.
+        known: known inertial parameters by their names in PAYLOAD_PARAMETERS, in the last joint's frame
+            (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
+    """
+
+    name: str
+    mounting: str
+    known: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,42 @@
+"""One recording in SI units, as the identification receives it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.payload import Payload
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One recording of n joints over k samples at a constant rate.
+
+    Attributes:
+        name: what a person calls it (the log's stem).
+        time_s: time of each sample [s], shape (k,), uniform.
+        position_rad: joint positions [rad; m for a prismatic joint], shape (k, n).
+        current_a: input references of the current loops, one a motor, in the unit of the reference [A], shape (k, n).
+        payload: what was mounted, or None without load.
+        move: number of the move that each sample belongs to, shape (k,), or None where no one wrote it down.
+        digest: of the log it was read from (sha256, hex).
+        valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
+    """
+
+    name: str
+    time_s: FloatArray
+    position_rad: FloatArray
+    current_a: FloatArray
+    payload: Payload | None = None
+    move: NDArray[np.int64] | None = None
+    digest: str = ""
+    valid: NDArray[np.bool_] | None = None
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate [Hz]."""
+        return float((len(self.time_s) - 1) / (self.time_s[-1] - self.time_s[0]))
