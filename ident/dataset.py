@@ -100,7 +100,7 @@ def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Non
     for label, array in (("position", run.position_rad), ("current", run.current_a)):
         if array.shape != (samples, count):
             raise DataUnfit(
-                run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: one column an axis"
+                run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: a column an axis"
             )
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):

@@ -1,0 +1,32 @@
+"""Recordings shared by the tests of the science; making them is the slow part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.run import Run
+from tests.ident.recordings import MOUNTED, Truth, record, tx40_truth
+
+
+@pytest.fixture(scope="session")
+def truth() -> Truth:
+    """The TX-40-like arm."""
+    return tx40_truth()
+
+
+@pytest.fixture(scope="session")
+def clean_runs(truth: Truth) -> tuple[Run, ...]:
+    """One run without load and one with, without any noise."""
+    rng = np.random.default_rng(11)
+    return (record(truth, "bare", rng), record(truth, "loaded", rng, MOUNTED))
+
+
+@pytest.fixture(scope="session")
+def noisy_runs(truth: Truth) -> tuple[Run, ...]:
+    """Two runs without load and two with, at a relative error of about six per cent."""
+    rng = np.random.default_rng(3)
+    return tuple(
+        record(truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=30.0)
+        for index in range(4)
+    )
