@@ -13,6 +13,7 @@ from ident.model import Column
 from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 class Method(Enum):
@@ -74,10 +75,19 @@ class Estimate:
 
     def relative_error(self, observation: Observation) -> RelativeError:
         """‖ρ_j‖/‖Y_j‖ of each joint over its used rows, and of all together [%] (paper Table 6)."""
-        torque, residual = observation.torque(self.gains), self.residual_torque(observation)
-        used = observation.use
-        size = np.array([np.sum(torque[j, used[j]] ** 2) for j in range(len(used))])
-        left = np.array([np.sum(residual[j, used[j]] ** 2) for j in range(len(used))])
-        with np.errstate(invalid="ignore", divide="ignore"):
-            axes = 100.0 * np.sqrt(left / size)
-        return RelativeError(tuple(float(value) for value in axes), float(100.0 * np.sqrt(left.sum() / size.sum())))
+        return relative_error(observation.torque(self.gains), self.predicted_torque(observation), observation.use)
+
+
+def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray) -> RelativeError:
+    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6); NaN for a joint without a row that counts.
+
+    Args:
+        measured_nm, predicted_nm: joint torque, shape (n, r).
+        use: rows of each joint that count, shape (n, r).
+    """
+    size = np.sum(measured_nm**2, axis=1, where=use)
+    left = np.sum((measured_nm - predicted_nm) ** 2, axis=1, where=use)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axes = 100.0 * np.sqrt(left / size)
+        total = 100.0 * np.sqrt(left.sum() / size.sum())
+    return RelativeError(tuple(float(value) for value in axes), float(total))

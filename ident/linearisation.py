@@ -24,6 +24,7 @@ class Linearisation:
     Attributes:
         jacobian: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale, shape (rows, f).
         residual: whitened, shape (rows,).
+        current: measured, whitened: what the residual is relative to, shape (rows,).
         motor: of each row, shape (rows,).
         cluster: move of each row, numbered 0 … without gaps, shape (rows,).
         source: index of each row among the observation's decimated rows, shape (rows,).
@@ -35,6 +36,7 @@ class Linearisation:
 
     jacobian: FloatArray
     residual: FloatArray
+    current: FloatArray
     motor: IntArray
     cluster: IntArray
     source: IntArray
@@ -67,7 +69,7 @@ def linearise(
     linear, known = motor_torque(observation)
     count = len(gains)
     gamma = 1.0 / gains
-    jacobian, residual, motors, clusters, sources = [], [], [], [], []
+    jacobian, residual, currents, motors, clusters, sources = [], [], [], [], [], []
     for motor in range(count):
         used = np.flatnonzero(observation.motor_use[motor])
         columns = linear[motor][:, used]
@@ -78,6 +80,7 @@ def linearise(
         rows[:, count:] = columns.T * (gamma[motor] / noise[motor])
         jacobian.append(rows)
         residual.append((observation.current[motor, used] - gamma[motor] * torque) / noise[motor])
+        currents.append(observation.current[motor, used] / noise[motor])
         motors.append(np.full(len(used), motor))
         clusters.append(observation.move[used])
         sources.append(used)
@@ -89,6 +92,7 @@ def linearise(
     return Linearisation(
         jacobian=matrix[:, free],
         residual=np.concatenate(residual),
+        current=np.concatenate(currents),
         motor=np.concatenate(motors),
         cluster=np.unique(np.concatenate(clusters), return_inverse=True)[1].astype(np.int64),
         source=np.concatenate(sources),

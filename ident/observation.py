@@ -37,6 +37,7 @@ class Observation:
         flange: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r).
         use: rows of each joint that count: moving and valid, shape (n, r).
         motor_use: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r).
+        time_s: of each row, since the start of its run, shape (r,).
         run: index of each row's run, shape (r,).
         move: number of each row's move, unique over all runs, shape (r,).
         mounting: index into payloads, −1 without load, shape (r,).
@@ -55,6 +56,7 @@ class Observation:
     flange: FloatArray
     use: BoolArray
     motor_use: BoolArray
+    time_s: FloatArray
     run: IntArray
     move: IntArray
     mounting: IntArray
@@ -106,6 +108,7 @@ class Observation:
             flange=self.flange[:, :, rows],
             use=self.use[:, rows],
             motor_use=self.motor_use[:, rows],
+            time_s=self.time_s[rows],
             run=self.run[rows],
             move=self.move[rows],
             mounting=self.mounting[rows],
@@ -130,7 +133,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     """
     payloads = _mountings(datasets)
     parts = [_decimated(model, data, conditioning) for data in datasets]
-    standard, current, use, motor_use, move, run, mounting = [], [], [], [], [], [], []
+    standard, current, use, motor_use, time, move, run, mounting = [], [], [], [], [], [], [], []
     first_move = 0
     for index, (data, part) in enumerate(zip(datasets, parts, strict=True)):
         if not part.use.any():
@@ -139,6 +142,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         current.append(part.current)
         use.append(part.use)
         motor_use.append(part.motor_use)
+        time.append(part.time_s)
         move.append(part.move - int(part.move.min()) + first_move)
         first_move = int(move[-1].max()) + 1
         run.append(np.full(part.use.shape[1], index, dtype=np.int64))
@@ -164,6 +168,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         flange=np.ascontiguousarray(columns[:, model.flange]),
         use=used,
         motor_use=np.concatenate(motor_use, axis=1),
+        time_s=np.concatenate(time),
         run=np.concatenate(run),
         move=np.concatenate(move),
         mounting=np.concatenate(mounting),
@@ -180,12 +185,47 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
     return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
 
 
+def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
+    """The parallel decimation of a run's columns to rows.
+
+    Raises:
+        DataUnfit: the run is too short for it.
+    """
+    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    samples = len(data.time_s)
+    if filter_.rows(samples) < 10:
+        raise DataUnfit(
+            data.name,
+            f"{samples / data.rate_hz:.2g} s are too short to decimate at {conditioning.decimation_cutoff_hz:g} Hz",
+        )
+    return filter_
+
+
+def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
+    """Rows of each joint, and of each motor, that count (Observation.use, .motor_use), both of shape (n, r)."""
+    filter_ = row_filter(data, conditioning)
+    # A row's share of standstill is weighted as the filter weights its samples.
+    window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
+    share = conditioning.standstill_share
+    use = (window((~data.moving).astype(np.float64)) <= share) & (window((~data.valid).astype(np.float64)) == 0.0)
+    motor_still = window((~data.motor_moving).astype(np.float64)) > share
+    # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
+    needed = np.abs(drive_train.to_motor) > 0
+    turned = np.abs(drive_train.direction) > 0
+    motor_use = np.stack([use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))])
+    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
+    for motor in drive_train.coupled:
+        use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
+    return use, motor_use
+
+
 @dataclass(frozen=True, slots=True)
 class _Part:
     standard: FloatArray
     current: FloatArray
     use: BoolArray
     motor_use: BoolArray
+    time_s: FloatArray
     move: IntArray
 
 
@@ -197,27 +237,13 @@ def _chunks(filter_: Decimator, samples: int) -> Iterator[slice]:
 
 
 def _decimated(model: Model, data: Dataset, conditioning: Conditioning) -> _Part:
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    filter_ = row_filter(data, conditioning)
     samples = len(data.time_s)
-    if filter_.rows(samples) < 10:
-        raise DataUnfit(
-            data.name,
-            f"{samples / data.rate_hz:.2g} s are too short to decimate at {conditioning.decimation_cutoff_hz:g} Hz",
-        )
     standard = np.concatenate([filter_(model.regressor(data, part)) for part in _chunks(filter_, samples)], axis=2)
-    # A row's share of standstill is weighted as the filter weights its samples.
-    window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
-    share = conditioning.standstill_share
-    use = (window((~data.moving).astype(np.float64)) <= share) & (window((~data.valid).astype(np.float64)) == 0.0)
-    motor_still = window((~data.motor_moving).astype(np.float64)) > share
-    # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
-    needed = np.abs(model.drive_train.to_motor) > 0
-    turned = np.abs(model.drive_train.direction) > 0
-    motor_use = np.stack([use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))])
-    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
-    for motor in model.drive_train.coupled:
-        use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
-    return _Part(standard, filter_(data.current_a), use, motor_use, data.move[filter_.centres(samples)])
+    use, motor_use = row_masks(model.drive_train, data, conditioning)
+    centres = filter_.centres(samples)
+    time_s = data.time_s[centres] - data.time_s[0]
+    return _Part(standard, filter_(data.current_a), use, motor_use, time_s, data.move[centres])
 
 
 def _mountings(datasets: Sequence[Dataset]) -> tuple[Payload, ...]:

@@ -24,7 +24,7 @@ from scipy import linalg, stats
 from ident.conditioning import Conditioning
 from ident.dataset import Dataset
 from ident.effects import EFFECTS
-from ident.effects.effect import Effect, Side
+from ident.effects.effect import Effect, at_joints
 from ident.estimate import Estimate
 from ident.linearisation import linearise
 from ident.model import Model
@@ -57,7 +57,8 @@ class Finding:
         probability: that noise alone makes a candidate this strong somewhere among all.
         folds_better: share of folds on which it lowers the error.
         explained: share of the axis' squared residual.
-        error_fall: relative fall of the axis' error on left-out moves.
+        error_before_percent, error_after_percent: of the axis on left-out moves, ‖e‖/‖v‖ of its current [%].
+        error_fall: relative fall from one to the other.
         held_out_fall: fall of the whole whitened ‖e‖² on left-out moves; the rank.
         passed: whether every gate is open.
         ambiguity: other families whose left-out score cannot be told from this one's.
@@ -69,6 +70,8 @@ class Finding:
     probability: float
     folds_better: float
     explained: float
+    error_before_percent: float
+    error_after_percent: float
     error_fall: float
     held_out_fall: float
     passed: bool
@@ -87,11 +90,7 @@ def effect_torque(
     parts = [
         decimate_rows(data, conditioning, effect.columns(run, axis)) for run, data in zip(runs, datasets, strict=True)
     ]
-    columns = np.concatenate(parts, axis=1)
-    acts_on = np.eye(model.robot.joint_count)[axis]
-    if effect.side is Side.MOTOR:
-        acts_on = model.drive_train.direction[axis]
-    return np.asarray(acts_on[:, None, None] * columns[None])
+    return at_joints(effect, axis, np.concatenate(parts, axis=1), model.drive_train)
 
 
 def find(
@@ -156,9 +155,11 @@ def _judge(
     effect, trial = members[best]
     before, after = folds.square_sum(folds.residual), _nested(folds, members)
     fall = before.sum(axis=1) - after.sum(axis=1)
-    own = float(np.sum(problem.residual[problem.motor == axis] ** 2))
+    rows = problem.motor == axis
+    own, size = float(np.sum(problem.residual[rows] ** 2)), float(np.sum(problem.current[rows] ** 2))
     explained = float(trial.fallen[axis] / own)
-    error_fall = float(1.0 - np.sqrt(after[:, axis].sum() / before[:, axis].sum()))
+    error_before, error_after = (float(np.sqrt(part[:, axis].sum() / size)) for part in (before, after))
+    error_fall = 1.0 - error_after / error_before
     folds_better = float(np.mean(fall > 0))
     passed = (
         probability[best] <= gates.false_alarm
@@ -173,6 +174,8 @@ def _judge(
         probability=float(probability[best]),
         folds_better=folds_better,
         explained=explained,
+        error_before_percent=100.0 * error_before,
+        error_after_percent=100.0 * error_after,
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
         passed=bool(passed),

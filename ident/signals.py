@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from ident.dataset import Dataset
 from ident.estimate import Estimate
 from ident.model import Model
 from ident.observation import Observation
-from ident.payload import PAYLOAD_PARAMETERS
+from ident.payload import PAYLOAD_PARAMETERS, Payload
 
 FloatArray = NDArray[np.float64]
 
@@ -55,11 +56,24 @@ def signals(model: Model, data: Dataset, observation: Observation, estimate: Est
         observation: whose base parameters the estimate speaks of.
         estimate: gains and parameters; columns of effects, behind the base parameters, are left out.
     """
-    names = tuple(column.name for column in model.columns)
-    standard = np.zeros(len(names))
+    standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
     standard[independent] = estimate.parameters[: len(independent)]
-    standard[model.flange] += _payload(data, observation, estimate)
+    standard[model.flange] += inertia(data.payload, _identified(data.payload, observation, estimate))
+    return declared_signals(model, data, standard, estimate.gains)
+
+
+def declared_signals(model: Model, data: Dataset, standard: FloatArray, gains: FloatArray) -> Signals:
+    """Predict a run's torques with standard parameters.
+
+    Args:
+        model: the declared model.
+        data: the run.
+        standard: χ_st with the payload on the flange; base parameters at their leading columns, zero elsewhere,
+            are as good as the true standard ones (paper §2.1). Shape (c,).
+        gains: g of each motor [Nm at the joint per A], shape (n,).
+    """
+    names = tuple(column.name for column in model.columns)
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
     inertial = np.array([not name.startswith(("Ia", "fv", "fs", "off")) for name in names])
     load, total = [], []
@@ -77,19 +91,26 @@ def signals(model: Model, data: Dataset, observation: Observation, estimate: Est
         motor_position_rad=model.drive_train.ratio @ data.position_rad,
         load_torque_nm=np.concatenate(load, axis=1),
         motor_torque_nm=motor,
-        current_a=motor / estimate.gains[:, None],
+        current_a=motor / gains[:, None],
     )
 
 
-def _payload(data: Dataset, observation: Observation, estimate: Estimate) -> FloatArray:
-    inertial = np.zeros(10)
-    if data.payload is None:
-        return inertial
-    for name, value in data.payload.known.items():
-        inertial[PAYLOAD_PARAMETERS.index(name)] = value
+def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
+    """χ_kL and χ_uL of a payload in the order of PAYLOAD_PARAMETERS, shape (10,); zeros without load.
+
+    Args:
+        payload: what was mounted.
+        identified: its unknown parameters by name; those that the data of the fit did not see are left out and zero.
+    """
+    values = {} if payload is None else {**payload.known, **identified}
+    return np.array([values.get(name, 0.0) for name in PAYLOAD_PARAMETERS])
+
+
+def _identified(payload: Payload | None, observation: Observation, estimate: Estimate) -> dict[str, float]:
     first = observation.robot.shape[1]
-    for payload, indices in zip(observation.payloads, observation.payload_columns, strict=True):
-        if payload.mounting == data.payload.mounting:
-            inertial[list(indices)] = estimate.parameters[first : first + len(indices)]
+    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
+        values = estimate.parameters[first : first + len(indices)]
+        if payload is not None and other.mounting == payload.mounting:
+            return {PAYLOAD_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
-    return inertial
+    return {}

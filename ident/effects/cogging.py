@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -29,6 +29,7 @@ class Cogging:
     name: ClassVar[str] = "cogging"
     side: ClassVar[Side] = Side.MOTOR
     holds: ClassVar[Property] = Property.PERIODIC_IN_MOTOR_ANGLE
+    abscissa: ClassVar[Abscissa] = Abscissa.MOTOR_ANGLE
 
     order: int
 

@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.drive_train import DriveTrain
 from ident.model import Column
 from ident.signals import Signals
 
@@ -19,6 +20,17 @@ class Side(Enum):
 
     JOINT = "joint"
     MOTOR = "motor"
+
+
+class Abscissa(Enum):
+    """What a person plots a residual against to see an effect: label with unit."""
+
+    VELOCITY = "joint velocity [rad/s]"
+    POSITION = "joint position [rad]"
+    LOAD = "load torque [Nm]"
+    MOTOR_ANGLE = "motor angle, one revolution [rad]"
+    CURRENT = "predicted current [A]"
+    TORQUE_RATE = "rate of the motor torque [Nm/s]"
 
 
 class Property(Enum):
@@ -39,12 +51,13 @@ class Effect(Protocol):
         name: what a technician calls it.
         side: where it acts.
         holds: what it claims about its columns.
-        needs_motion: its columns vanish or lose their meaning at rest.
+        abscissa: what shows it in a picture.
     """
 
     name: ClassVar[str]
     side: ClassVar[Side]
     holds: ClassVar[Property]
+    abscissa: ClassVar[Abscissa]
 
     @property
     def settings(self) -> dict[str, float]:
@@ -59,3 +72,23 @@ class Effect(Protocol):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque at the axis per unit of each coefficient [Nm], shape (coefficients, k)."""
         ...
+
+
+def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
+    """An effect's columns at its axis, shape (p, k), as torque of all joints, shape (n, p, k)."""
+    acts_on = drive_train.direction[axis] if effect.side is Side.MOTOR else np.eye(len(drive_train.ratio))[axis]
+    return np.asarray(acts_on[:, None, None] * columns[None])
+
+
+def along(abscissa: Abscissa, signals: Signals, axis: int) -> FloatArray:
+    """The variable that a picture is drawn along, shape (k,)."""
+    rate = np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz
+    variables: dict[Abscissa, FloatArray] = {
+        Abscissa.VELOCITY: signals.velocity_rad_s[axis],
+        Abscissa.POSITION: signals.position_rad[axis],
+        Abscissa.LOAD: signals.load_torque_nm[axis],
+        Abscissa.MOTOR_ANGLE: np.mod(signals.motor_position_rad[axis], 2.0 * np.pi),
+        Abscissa.CURRENT: signals.current_a[axis],
+        Abscissa.TORQUE_RATE: np.asarray(rate),
+    }
+    return variables[abscissa]

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -26,6 +26,7 @@ class Lag:
     name: ClassVar[str] = "lag"
     side: ClassVar[Side] = Side.MOTOR
     holds: ClassVar[Property] = Property.RATE_OF_TORQUE
+    abscissa: ClassVar[Abscissa] = Abscissa.TORQUE_RATE
 
     @property
     def settings(self) -> dict[str, float]:

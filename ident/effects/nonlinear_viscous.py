@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -29,6 +29,7 @@ class NonlinearViscous:
     name: ClassVar[str] = "nonlinear-viscous"
     side: ClassVar[Side] = Side.JOINT
     holds: ClassVar[Property] = Property.ODD_IN_VELOCITY
+    abscissa: ClassVar[Abscissa] = Abscissa.VELOCITY
 
     exponent: float
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -26,6 +26,7 @@ class PositionFriction:
     name: ClassVar[str] = "position-friction"
     side: ClassVar[Side] = Side.JOINT
     holds: ClassVar[Property] = Property.ODD_IN_VELOCITY
+    abscissa: ClassVar[Abscissa] = Abscissa.POSITION
 
     @property
     def settings(self) -> dict[str, float]:

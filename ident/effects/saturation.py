@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -26,6 +26,7 @@ class Saturation:
     name: ClassVar[str] = "saturation"
     side: ClassVar[Side] = Side.MOTOR
     holds: ClassVar[Property] = Property.ODD_IN_CURRENT
+    abscissa: ClassVar[Abscissa] = Abscissa.CURRENT
 
     @property
     def settings(self) -> dict[str, float]:

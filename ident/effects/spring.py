@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Property, Side
+from ident.effects.effect import Abscissa, Property, Side
 from ident.model import Column
 from ident.signals import Signals
 
@@ -25,6 +25,7 @@ class Spring:
     name: ClassVar[str] = "spring"
     side: ClassVar[Side] = Side.JOINT
     holds: ClassVar[Property] = Property.INDEPENDENT_OF_VELOCITY
+    abscissa: ClassVar[Abscissa] = Abscissa.POSITION
 
     @property
     def settings(self) -> dict[str, float]:

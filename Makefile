@@ -1,0 +1,71 @@
+# drivegain: `make demo` and `make test` are all that a fresh machine needs (Python >= 3.11, pip, make).
+# PYTHON=python3.12 make setup   chooses another interpreter; the environment is made in .venv.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.drivegain-stamp
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: help setup demo test check bench wheel lock clean
+
+help:
+	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
+	@echo "make test    set up, then lint, types, import contracts and tests"
+	@echo "make setup   make .venv alone"
+	@echo "make check   lint, types, import contracts"
+	@echo "make bench   measure, slowly"
+	@echo "make wheel   build dist/*.whl"
+	@echo "make lock    resolve the dependencies anew into requirements.lock"
+	@echo "make clean   remove .venv and everything made"
+
+setup: $(STAMP)
+
+# The stamp is written last: a set-up that was interrupted is taken up again. Where Debian's python3 comes without
+# python3-venv, pip is put into the environment from outside.
+$(STAMP): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "drivegain needs Python 3.11 or later; found: $$($(PYTHON) --version 2>&1)." >&2; \
+		echo "Install one (Debian, Ubuntu: apt install python3 python3-pip) or name it: make PYTHON=python3.12 ..." >&2; \
+		exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) >/dev/null 2>&1; } || { \
+		rm -rf $(VENV); $(PYTHON) -m venv --without-pip $(VENV) && \
+		$(PYTHON) -m pip --python $(BIN)/python install -qq pip; } || { \
+		echo "$(PYTHON) can make no environment with pip in it (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	@echo "installing the locked dependencies into $(VENV) (once; some hundred MB)"
+	@$(BIN)/python -m pip install -qq --require-hashes --requirement requirements.lock
+	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: setup
+	$(BIN)/drivegain demo --out out/demo
+
+test: check
+	$(BIN)/python -m pytest -q
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup
+	$(BIN)/python -m pytest -q -s tests/bench
+
+wheel: setup
+	$(BIN)/python -m pip wheel -qq --no-deps --no-build-isolation --wheel-dir dist .
+
+# One lock for all platforms and both kinds of user; no index address in it, so that any mirror serves.
+lock:
+	@rm -rf out/lock-venv
+	@$(PYTHON) -m venv out/lock-venv
+	@out/lock-venv/bin/python -m pip install -qq uv
+	out/lock-venv/bin/uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url \
+		--no-annotate --no-header --python-version 3.11 --output-file requirements.lock
+	@rm -rf out/lock-venv
+
+clean:
+	rm -rf $(VENV) out dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

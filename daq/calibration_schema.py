@@ -1,0 +1,122 @@
+"""Schema of calibration.yaml: its keys and types, for the file border only."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from daq.configuration.yaml_file import StrictModel
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError, Source
+
+_Deviation = Annotated[float, Field(ge=0.0)]
+
+
+class GainEntry(StrictModel):
+    """One drive gain; the percentages are for readers."""
+
+    axis: str
+    value: float
+    std: _Deviation
+    std_percent: float | None
+    unit: str
+    nameplate: float
+    change_percent: float | None
+
+
+class ParameterEntry(StrictModel):
+    """One dynamic parameter or coefficient of an effect."""
+
+    name: str
+    value: float
+    std: _Deviation
+    std_percent: float | None
+    unit: str
+
+
+class RelativeErrorEntry(StrictModel):
+    """Relative errors in percent."""
+
+    axes: tuple[float, ...]
+    total: float
+
+
+class EffectEntry(StrictModel):
+    """One accepted effect."""
+
+    name: str
+    axis: str
+    settings: dict[str, float]
+    coefficients: tuple[ParameterEntry, ...]
+    error_before_percent: float
+    error_after_percent: float
+    ambiguity: tuple[str, ...]
+
+
+class SourceEntry(StrictModel):
+    """One log."""
+
+    name: str
+    sha256: str
+    role: str
+
+
+class CalibrationDocument(StrictModel):
+    """The whole file; `digests` are compared by the reader."""
+
+    format: Literal["drivegain-calibration"]
+    version: int
+    digests: dict[str, str]
+    cell: str
+    method: str
+    gains: tuple[GainEntry, ...]
+    parameters: tuple[ParameterEntry, ...]
+    relative_error_percent: RelativeErrorEntry
+    holdout_error_percent: RelativeErrorEntry | None
+    condition: float
+    rows: int
+    filter: dict[str, float | list[float]]
+    effects: tuple[EffectEntry, ...]
+    sources: tuple[SourceEntry, ...]
+    configuration_sha256: str
+    created: str
+    software: str
+
+
+def _parameter(entry: ParameterEntry) -> Parameter:
+    return Parameter(entry.name, entry.value, entry.std, entry.unit)
+
+
+def _error(entry: RelativeErrorEntry) -> RelativeError:
+    return RelativeError(tuple(entry.axes), entry.total)
+
+
+def calibration_of(entries: CalibrationDocument) -> Calibration:
+    """The calibration that a checked document says."""
+    return Calibration(
+        cell=entries.cell,
+        method=entries.method,
+        gains=tuple(Gain(g.axis, g.value, g.std, g.unit, g.nameplate) for g in entries.gains),
+        parameters=tuple(_parameter(p) for p in entries.parameters),
+        effects=tuple(
+            AcceptedEffect(
+                name=e.name,
+                axis=e.axis,
+                settings=dict(e.settings),
+                coefficients=tuple(_parameter(c) for c in e.coefficients),
+                error_before_percent=e.error_before_percent,
+                error_after_percent=e.error_after_percent,
+                ambiguity=e.ambiguity,
+            )
+            for e in entries.effects
+        ),
+        relative_error_percent=_error(entries.relative_error_percent),
+        holdout_error_percent=None if entries.holdout_error_percent is None else _error(entries.holdout_error_percent),
+        condition=entries.condition,
+        rows=entries.rows,
+        filter=dict(entries.filter),
+        sources=tuple(Source(s.name, s.sha256, s.role) for s in entries.sources),
+        configuration_sha256=entries.configuration_sha256,
+        created=entries.created,
+        software=entries.software,
+    )

@@ -1,0 +1,5 @@
+"""The command `drivegain`."""
+
+from daq.cli.app import main
+
+__all__ = ["main"]

@@ -1,0 +1,133 @@
+"""`drivegain fit`: all gains and all parameters from logs, in one step."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from daq.calibration_file import as_document, save
+from daq.cli.progress import status
+from daq.cli.verb import JsonOption, Verb, print_json
+from daq.configuration.cell_file import load_cell
+from daq.errors import OutputFailed
+from daq.fit import Fit, calibration_of, fit
+from daq.report.gain_table import gain_table
+from ident.calibration import Calibration
+from ident.estimate import Method
+
+
+class Gains(Enum):
+    """Whether the gains are unknown."""
+
+    FREE = "free"
+    FIXED = "fixed"
+
+
+LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
+HoldoutOption = Annotated[
+    list[Path] | None,
+    typer.Option("--holdout", help="Log that the fit must not see, for the final figure; repeatable."),
+]
+OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
+CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
+GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
+
+
+def fit_verb(
+    logs: LogsArgument,
+    method: Annotated[
+        Method | None,
+        typer.Option(help="ls, wls and tls of the paper, or ml; by default ml, and wls when the gains are fixed."),
+    ] = None,
+    gains: GainsOption = Gains.FREE,
+    holdout: HoldoutOption = None,
+    out: OutOption = None,
+    cell: CellOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
+    with status("identifying"):
+        fitted = fit(
+            logs,
+            holdout=holdout or (),
+            method=method,
+            gains_fixed=gains is Gains.FIXED,
+            cell=None if cell is None else load_cell(cell),
+        )
+        calibration = calibration_of(fitted, datetime.now(UTC))
+    if out is not None:
+        save_calibration(calibration, out)
+    if json:
+        print_json({**as_document(calibration), **compared(fitted)})
+    else:
+        show(fitted, calibration, Console(soft_wrap=True, highlight=False))
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write it whole or not at all.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    try:
+        save(calibration, path)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+
+
+def compared(fitted: Fit) -> dict[str, Any]:
+    """The paper's estimate beside ours, for --json."""
+    if fitted.paper is None:
+        return {"compared": {}}
+    paper = fitted.paper
+    gains = [
+        {"axis": axis.name, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
+        for axis, value, std in zip(fitted.cell.axes, paper.gains, paper.gains_std, strict=True)
+    ]
+    return {"compared": {"tls": {"gains": gains, "condition": paper.condition}}}
+
+
+def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
+    """Gains, errors and what they rest on, for a person."""
+    estimate = fitted.final.estimate
+    console.print(gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}"))
+    if fitted.paper is not None:
+        values = ", ".join(f"{value:.4g}" for value in fitted.paper.gains)
+        console.print(f"For comparison, the paper's total least squares on the same rows: {values}")
+    console.print()
+    console.print(error_table(fitted, calibration))
+    filter_ = fitted.final.training.conditioning
+    console.print(
+        f"{estimate.rows} rows, {len(fitted.final.training.columns)} base parameters and effects, condition "
+        f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
+        f"{filter_.decimation_cutoff_hz:g} Hz: a relative error means nothing without them."
+    )
+    if not estimate.gains_fixed:
+        console.print(
+            "What these data cannot tell: a wrong payload mass scales all gains alike and leaves no residual; "
+            "a gear efficiency that is the same in both directions is part of its gain."
+        )
+
+
+def error_table(fitted: Fit, calibration: Calibration) -> Table:
+    """Relative error of each axis, on the rows of the fit and on those it has not seen."""
+    table = Table(
+        title="Relative error ‖ρ‖/‖Y‖ [%]", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+    )
+    for heading in ("", *(axis.name for axis in fitted.cell.axes), "total"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    rows = [("fit", calibration.relative_error_percent), ("unused", calibration.holdout_error_percent)]
+    for name, error in rows:
+        if error is not None:
+            table.add_row(name, *(f"{value:.2f}" for value in error.axes), f"{error.total:.2f}")
+    return table
+
+
+FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout unused.mcap --out calibration.yaml")

@@ -1,0 +1,104 @@
+"""`drivegain info`: what is in a log."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from daq.cli.verb import JsonOption, Verb, print_json, printable
+from daq.configuration.cell_file import cell_from_bundle
+from daq.log.reader import LogReader
+from drivers.event import EventKind
+
+_ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
+"""Events of every run; the others are worth reading."""
+
+
+def describe_log(path: Path) -> dict[str, Any]:
+    """Everything that is known of a log without converting it, in one pass and bounded memory.
+
+    Raises:
+        LogUnreadable: the log cannot be read.
+        ConfigurationError: the cell in it is inconsistent.
+    """
+    reader = LogReader(path)
+    samples, first_ns, last_ns = 0, None, 0
+    for block in reader:
+        samples += len(block.cycle)
+        first_ns = int(block.time_ns[0]) if first_ns is None else first_ns
+        last_ns = int(block.time_ns[-1])
+    head, statistics = reader.head, reader.statistics
+    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+    run = head.run
+    return {
+        "log": str(path),
+        "sha256": reader.digest,
+        "run_id": run.run_id,
+        "cell": cell.name,
+        "cell_sha256": cell.digest,
+        "axes": list(cell.axis_names),
+        "role": run.role.value,
+        "payload": None
+        if run.payload is None
+        else {"name": run.payload.name, "mounting": run.payload.mounting, "known": run.payload.known},
+        "rate_hz": run.rate_hz,
+        "samples": samples,
+        "duration_s": samples / run.rate_hz,
+        "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
+        "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
+        "lost_cycles": statistics.lost_cycles,
+        "missing": dict(zip(cell.axis_names, statistics.missing, strict=False)),
+        "valid": statistics.valid,
+        "reason": statistics.reason,
+        "events": [
+            {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
+            for e in reader.events
+            if e.kind not in _ROUTINE
+        ],
+        "operator": run.operator,
+        "software": run.software,
+        "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        "origin": run.origin,
+        "complete": samples == statistics.samples,
+        "attachments": {name: len(data) for name, data in sorted(head.files.items())},
+    }
+
+
+def info(
+    log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
+    json: JsonOption = False,
+) -> None:
+    """Show what is in a log: role and payload, duration, losses, moves, validity."""
+    description = describe_log(log)
+    if json:
+        print_json(description)
+        return
+    table = Table(show_header=False, box=None)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for key, value in description.items():
+        table.add_row(key.replace("_", " "), Text(printable(_readable(value))))
+    Console(soft_wrap=True).print(table)
+
+
+def _readable(value: Any) -> str:
+    if value is None or value in ("", [], {}):
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_readable(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_readable(item) for item in value)
+    return str(value)
+
+
+INFO = Verb("info", info, "drivegain info runs/unloaded-1.mcap --json")

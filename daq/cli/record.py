@@ -1,0 +1,81 @@
+"""`drivegain record`: make a plan's moves and log every sample. This moves the robot."""
+
+from __future__ import annotations
+
+import getpass
+import uuid
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daq.cli.progress import progress_bar
+from daq.cli.verb import JsonOption, Verb, print_json
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from daq.errors import UsageError
+from daq.plan import slowed
+from daq.plan_file import load_plan
+from daq.record import record
+from ident.payload import Payload
+
+
+def record_verb(
+    cell: Annotated[Path, typer.Argument(help="Cell file.")],
+    plan: Annotated[Path, typer.Argument(help="Plan of `drivegain plan`.")],
+    out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
+    enable_motion: Annotated[
+        bool, typer.Option("--enable-motion", help="Allow the axes to move; nothing moves without it.")
+    ] = False,
+    payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
+    operator: Annotated[str | None, typer.Option(help="Who stands for this recording; you, by default.")] = None,
+    speed: Annotated[float, typer.Option(help="Speed override for a first run.", min=0.05, max=1.0)] = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Make the moves of a plan and log every sample; Ctrl-C stops the axes."""
+    declared = load_cell(cell)
+    moves = slowed(load_plan(plan, declared), speed)
+    who = operator or getpass.getuser()
+    with progress_bar("recording") as told:
+        done = record(
+            cell,
+            declared,
+            moves,
+            out,
+            payload=mounted(declared, payload),
+            operator=who,
+            granted_by=who if enable_motion else None,
+            run_id=str(uuid.uuid4()),
+            progress=lambda count, total: told(count, total, "moves"),
+        )
+    log = done.log
+    if json:
+        print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
+                    "valid": log.valid, "reason": log.reason})  # fmt: skip
+    else:
+        verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
+        typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
+
+
+def mounted(cell: Cell, name: str | None) -> Payload | None:
+    """The payload of that name.
+
+    Raises:
+        UsageError: the cell has none of that name.
+    """
+    if name is None:
+        return None
+    for candidate in cell.payloads:
+        if candidate.name == name:
+            return candidate.payload
+    raise UsageError(
+        f"payload {name!r}",
+        found="no such payload in the cell file",
+        expected=", ".join(payload.name for payload in cell.payloads) or "none: the cell declares no payloads",
+        remedy="weigh it and add it to the cell's payloads",
+    )
+
+
+RECORD = Verb(
+    "record", record_verb, "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --enable-motion"
+)

@@ -1,0 +1,49 @@
+"""What makes a verb of the command line, and what all of them share."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import typer
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+
+
+@dataclass(frozen=True, slots=True)
+class Verb:
+    """One verb.
+
+    Attributes:
+        name: as technicians say it.
+        function: takes its arguments as typer reads them; its docstring is the help.
+        example: a command line that works, shown at the end of the help.
+    """
+
+    name: str
+    function: Callable[..., None]
+    example: str
+
+
+def print_json(document: Any) -> None:
+    """One JSON document on stdout; numbers that JSON cannot say become null."""
+    sys.stdout.write(json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def printable(text: str) -> str:
+    """Text from a file as a terminal may show it: control characters, which could command it, are spelt out."""
+    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
+
+
+def _sayable(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {str(key): _sayable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_sayable(item) for item in value]
+    return value

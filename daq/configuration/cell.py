@@ -1,0 +1,158 @@
+"""A cell: robot, drive train, bus, axes, payloads, filters and the controller that gets the gains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.axis import Identity
+from drivers.profile import DriveProfile
+from ident.conditioning import Conditioning
+from ident.payload import Payload
+
+FloatArray = NDArray[np.float64]
+
+
+class Pacing(Enum):
+    """When the next SYNC is sent."""
+
+    LOCKSTEP = "lockstep"
+    TIMED = "timed"
+
+
+@dataclass(frozen=True, slots=True)
+class Bus:
+    """How the bus is reached, as python-can names it; host and port are those of a socketcand hub."""
+
+    interface: str
+    channel: str
+    bitrate_bit_s: int
+    host: str
+    port: int
+
+
+@dataclass(frozen=True, slots=True)
+class Sync:
+    """The sampling period [µs], and what paces it."""
+
+    period_us: int
+    pacing: Pacing
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Of a joint, in rad (m for a prismatic joint).
+
+    Attributes:
+        position: lower and upper end [rad].
+        velocity: largest speed [rad/s].
+        acceleration: largest acceleration [rad/s²].
+    """
+
+    position: tuple[float, float]
+    velocity: float
+    acceleration: float
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """One motor with its amplifier, and the joint of the same number.
+
+    Attributes:
+        name: of the axis.
+        node_id, drive, profile, identity: of the amplifier; None in a cell that only imports recordings.
+        counts_per_revolution: encoder counts a motor revolution; None where the import chooses its own count.
+        zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad].
+        nameplate_gain: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed.
+        gain_unit: Nm at the joint per unit of the current-loop reference.
+        limits: of the joint.
+    """
+
+    name: str
+    node_id: int | None
+    drive: str | None
+    profile: DriveProfile | None
+    identity: Identity | None
+    counts_per_revolution: int | None
+    zero_offset_rad: float
+    nameplate_gain: float
+    gain_unit: str
+    limits: Limits
+
+
+@dataclass(frozen=True, slots=True)
+class WeighedPayload:
+    """A body that can be mounted.
+
+    Attributes:
+        name, mounting: the body, and the one way in which it is mounted.
+        mass_kg, mass_tolerance_kg: as weighed [kg].
+        known: further inertial parameters that are known, by their names in ident.payload.PAYLOAD_PARAMETERS.
+    """
+
+    name: str
+    mounting: str
+    mass_kg: float
+    mass_tolerance_kg: float
+    known: dict[str, float]
+
+    @property
+    def payload(self) -> Payload:
+        """As the identification takes it."""
+        return Payload(self.name, self.mounting, {**self.known, "m": self.mass_kg})
+
+
+@dataclass(frozen=True, slots=True)
+class Controller:
+    """Where the gains are written: a file, relative to the cell file, and the dotted key of each axis."""
+
+    file: str
+    gains: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cell:
+    """Everything that is declared of a cell, in SI units.
+
+    Attributes:
+        name: of the cell.
+        urdf: text of the URDF.
+        gravity_m_s2: in the base frame.
+        ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n).
+        bus, sync: None in a cell that only imports recordings.
+        axes: n of them.
+        payloads: bodies that can be mounted.
+        conditioning: the filters.
+        controller: None where nothing is written back.
+        folder: of the cell file; None for a cell that was read from a log.
+        digest: sha256 of the cell file and all files it refers to, hex.
+    """
+
+    name: str
+    urdf: str
+    gravity_m_s2: tuple[float, float, float]
+    ratio: FloatArray
+    bus: Bus | None
+    sync: Sync | None
+    axes: tuple[Axis, ...]
+    payloads: tuple[WeighedPayload, ...]
+    conditioning: Conditioning
+    controller: Controller | None
+    folder: Path | None
+    digest: str
+
+    @property
+    def controller_path(self) -> Path | None:
+        """The controller's file, where it is known."""
+        if self.controller is None or self.folder is None:
+            return None
+        return (self.folder / self.controller.file).resolve()
+
+    @property
+    def axis_names(self) -> tuple[str, ...]:
+        """In the order of the axes."""
+        return tuple(axis.name for axis in self.axes)

@@ -1,0 +1,163 @@
+"""From a cell file, or from the copy of it that a log carries, to a `Cell`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from math import radians
+from pathlib import Path
+
+import numpy as np
+
+from daq.configuration.cell import (
+    Axis,
+    Bus,
+    Cell,
+    Controller,
+    Limits,
+    Sync,
+    WeighedPayload,
+)
+from daq.configuration.cell_checks import check
+from daq.configuration.cell_schema import AxisModel, CellModel, PayloadModel
+from daq.configuration.drive import drive_from_text
+from daq.configuration.yaml_file import parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationMissing
+from daq.resources import shipped_configurations
+from drivers.axis import Identity
+from drivers.profile import DriveProfile
+from ident.conditioning import Conditioning
+
+CELL = "cell.yaml"
+URDF = "robot.urdf"
+DRIVES = "drives/"
+
+
+def load_cell(path: Path) -> Cell:
+    """Read a cell file and all it refers to.
+
+    Raises:
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+    """
+    sources = _sources(path)
+    names = {name: str(source) for name, source in sources.items()}
+    return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path.parent, names)
+
+
+def bundle(path: Path) -> dict[str, bytes]:
+    """The texts of a cell file and of all files that it refers to, by fixed names; what a log carries.
+
+    Raises:
+        ConfigurationError: a file is missing, or the cell file is not what its schema says.
+    """
+    return {name: read_bytes(source) for name, source in _sources(path).items()}
+
+
+def cell_from_bundle(
+    files: Mapping[str, bytes], folder: Path | None = None, names: Mapping[str, str] | None = None
+) -> Cell:
+    """The cell that a bundle describes.
+
+    Args:
+        files: as `bundle` made them; other entries (a log has more attachments) are passed over.
+        folder: of the cell file, where there is one.
+        names: what to call the files in messages.
+
+    Raises:
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+    """
+    names = names or {}
+    document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
+    model = read_model(document, CellModel)
+    urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
+    profiles = {
+        drive: drive_from_text(_member(files, member, names), names.get(member, member))
+        for drive in model.drives
+        for member in (f"{DRIVES}{drive}.yaml",)
+    }
+    check(document, model, urdf)
+    used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
+    return Cell(
+        name=model.name,
+        urdf=urdf,
+        gravity_m_s2=model.robot.gravity_m_s2,
+        ratio=np.array(model.drive_train.ratio, dtype=np.float64),
+        bus=None if model.bus is None else Bus(**model.bus.model_dump()),
+        sync=None if model.sync is None else Sync(**model.sync.model_dump()),
+        axes=tuple(_axis(axis, profiles) for axis in model.axes),
+        payloads=tuple(_payload(payload) for payload in model.payloads),
+        conditioning=Conditioning(**model.conditioning.model_dump()),
+        controller=None if model.controller is None else Controller(**model.controller.model_dump()),
+        folder=folder,
+        digest=digest({name: files[name] for name in used}),
+    )
+
+
+def digest(files: Mapping[str, bytes]) -> str:
+    """sha256 over names and contents, in the order of the names, hex."""
+    total = hashlib.sha256()
+    for name in sorted(files):
+        total.update(f"{name}\0{len(files[name])}\0".encode())
+        total.update(files[name])
+    return total.hexdigest()
+
+
+def _sources(path: Path) -> dict[str, Path]:
+    """Where the members of a cell's bundle are on disk."""
+    model = read_model(parse_yaml(read_bytes(path), str(path)), CellModel)
+    drives = {f"{DRIVES}{drive}.yaml": _drive_path(path.parent, drive) for drive in model.drives}
+    return {CELL: path, URDF: path.parent / model.robot.urdf, **drives}
+
+
+def _drive_path(folder: Path, drive: str) -> Path:
+    """A profile beside the cell (drives/ or ../drives/), else the shipped one."""
+    file = f"{drive}.yaml"
+    candidates = (folder / "drives" / file, folder.parent / "drives" / file, shipped_configurations() / "drives" / file)
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    shipped = ", ".join(sorted(entry.stem for entry in candidates[-1].parent.glob("*.yaml")))
+    raise ConfigurationMissing(
+        f"drive profile {drive!r}",
+        found="no file " + ", ".join(map(str, candidates)),
+        expected=f"a profile beside the cell, or a shipped one ({shipped})",
+        remedy="correct the axis's `drive`, or write the profile",
+    )
+
+
+def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -> bytes:
+    if member in files:
+        return files[member]
+    raise ConfigurationMissing(
+        names.get(member, member),
+        found="only " + (", ".join(sorted(files)) or "nothing"),
+        expected=f"{member} among the files of the cell",
+        remedy="the log or bundle is incomplete; record or import it again",
+    )
+
+
+def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
+    limits = model.limits
+    per_ampere = model.nameplate_gain_nm_per_a
+    return Axis(
+        name=model.name,
+        node_id=model.node_id,
+        drive=model.drive,
+        profile=None if model.drive is None else profiles[model.drive],
+        identity=None if model.identity is None else Identity(**model.identity.model_dump()),
+        counts_per_revolution=model.counts_per_revolution,
+        zero_offset_rad=radians(model.zero_offset_deg),
+        # The schema lets exactly one of the two be given.
+        nameplate_gain=(model.nameplate_gain or 0.0) if per_ampere is None else per_ampere,
+        gain_unit=model.gain_unit or "Nm/A",
+        limits=Limits(
+            position=(radians(limits.position_deg[0]), radians(limits.position_deg[1])),
+            velocity=radians(limits.velocity_deg_s),
+            acceleration=radians(limits.acceleration_deg_s2),
+        ),
+    )
+
+
+def _payload(model: PayloadModel) -> WeighedPayload:
+    known = {} if model.known is None else model.known.model_dump(exclude_none=True)
+    return WeighedPayload(model.name, model.mounting, model.mass_kg, model.mass_tolerance_kg, known)

@@ -1,0 +1,145 @@
+"""A simulation file: the truth of a simulated cell. Only `simulate` and `demo` read it; no fit, plan or report does."""
+
+from __future__ import annotations
+
+import re
+from math import radians
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationInconsistent, UsageError
+from drivers.simulated.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class AxisSpecModel(StrictModel):
+    """The fields of drivers.simulated.spec.AxisSpec."""
+
+    node_id: Annotated[int, Field(ge=1, le=127)]
+    vendor_id: U32
+    product_code: U32
+    revision: U32
+    serial: U32
+    counts_per_revolution: Annotated[int, Field(gt=0)]
+    rated_current_a: Positive
+    peak_current_a: Positive
+    gain_nm_per_a: float
+    motor_inertia_kg_m2: NotNegative
+    viscous_nm_s_rad: NotNegative
+    coulomb_nm: NotNegative
+    motor_viscous_nm_s_rad: NotNegative
+    motor_coulomb_nm: NotNegative
+    offset_nm: float
+    current_noise_a: NotNegative
+    noise_correlation_s: NotNegative
+
+
+class BodyModel(StrictModel):
+    """A payload's true inertia."""
+
+    mass_kg: Positive
+    centre_m: tuple[float, float, float]
+    inertia_kg_m2: tuple[float, float, float, float, float, float]
+
+
+class EffectModel(StrictModel):
+    """An undeclared effect."""
+
+    name: Annotated[str, Field(min_length=1)]
+    axis: Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+
+class SimulationModel(StrictModel):
+    """A whole simulation file."""
+
+    urdf: Annotated[str, Field(min_length=1)]
+    gravity_m_s2: tuple[float, float, float]
+    ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1)]
+    sync_period_us: Annotated[int, Field(ge=250, le=1_000_000)]
+    substeps: Annotated[int, Field(ge=1, le=100)]
+    seed: Annotated[int, Field(ge=0)]
+    start_deg: tuple[float, ...]
+    axes: Annotated[tuple[AxisSpecModel, ...], Field(min_length=1, max_length=32)]
+    payloads: dict[str, BodyModel] = Field(default_factory=dict)
+    effects: tuple[EffectModel, ...] = ()
+
+
+def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
+    """Read a simulation file.
+
+    Args:
+        path: of the file.
+        payload: name of the mounted body, or None.
+
+    Raises:
+        ConfigurationError: the file is missing, wrong, or contradicts itself.
+        UsageError: there is no such payload.
+    """
+    document = parse_yaml(read_bytes(path), str(path))
+    model = read_model(document, SimulationModel)
+    _check(document, model)
+    if payload is not None and payload not in model.payloads:
+        raise UsageError(
+            f"payload {payload!r}",
+            found="no such body in the simulation",
+            expected=f"one of {', '.join(model.payloads) or 'none: it has no payloads'}",
+            remedy=f"choose one, or add it to {path}",
+        )
+    return CellSpec(
+        urdf=read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace"),
+        gravity_m_s2=model.gravity_m_s2,
+        ratio=np.array(model.ratio, dtype=np.float64),
+        axes=tuple(AxisSpec(**axis.model_dump()) for axis in model.axes),
+        start_rad=np.array([radians(angle) for angle in model.start_deg]),
+        payload=None if payload is None else Body(**model.payloads[payload].model_dump()),
+        effects=tuple(UndeclaredEffect(e.name, axis_index(e.axis), dict(e.parameters)) for e in model.effects),
+        sync_period_us=model.sync_period_us,
+        substeps=model.substeps,
+        seed=model.seed,
+    )
+
+
+def payload_names(path: Path) -> tuple[str, ...]:
+    """Bodies that a simulation file knows.
+
+    Raises:
+        ConfigurationError: the file is missing or wrong.
+    """
+    return tuple(read_model(parse_yaml(read_bytes(path), str(path)), SimulationModel).payloads)
+
+
+def axis_index(axis: str | int) -> int:
+    """Index from 0 of an axis given as "J3" or by its number from 1."""
+    number = int(re.sub(r"^J", "", axis)) if isinstance(axis, str) else axis
+    return number - 1
+
+
+def _check(document: Document, model: SimulationModel) -> None:
+    n = len(model.axes)
+    faults = []
+    if len(model.ratio) != n or any(len(row) != n for row in model.ratio):
+        faults.append(Fault(("ratio",), f"{len(model.ratio)} rows", f"{n} × {n}, a row for each motor"))
+    if len(model.start_deg) != n:
+        faults.append(Fault(("start_deg",), f"{len(model.start_deg)} angles", f"{n}, one for each joint"))
+    if len({axis.node_id for axis in model.axes}) != n:
+        faults.append(Fault(("axes",), "a node id used twice", "each node once"))
+    faults += [
+        Fault(("axes", index, "gain_nm_per_a"), "0", "a gain that is not zero")
+        for index, axis in enumerate(model.axes)
+        if axis.gain_nm_per_a == 0.0
+    ]
+    faults += [
+        Fault(("effects", index, "axis"), f"axis {effect.axis}", f"J1 to J{n}")
+        for index, effect in enumerate(model.effects)
+        if axis_index(effect.axis) >= n
+    ]
+    if faults:
+        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")

@@ -1,0 +1,271 @@
+"""Strict YAML: what is misspelt, doubled or of the wrong type is refused with its line, never guessed."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
+
+Location = tuple[str | int, ...]
+MAX_BYTES = 4 * 2**20
+"""No configuration is larger; a file that is must be something else."""
+MAX_DEPTH = 40
+"""Lists in lists; deeper ones take time and memory beyond their size."""
+MAX_SHOWN = 8
+"""Faults listed in one message."""
+
+
+class StrictModel(BaseModel):
+    """Schema of one mapping: nothing unknown, nothing converted, no NaN. Lives at the file border only."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Model = TypeVar("Model", bound=StrictModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A parsed file.
+
+    Attributes:
+        name: what to call it in messages.
+        tree: mappings, lists and scalars.
+        lines: line number of every value, from 1, by its path.
+    """
+
+    name: str
+    tree: Any
+    lines: dict[Location, int]
+
+    def where(self, path: Location) -> str:
+        """'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the file."""
+        known = path
+        while known not in self.lines and known:
+            known = known[:-1]
+        line = self.lines.get(known)
+        return f"{self.name}{f':{line}' if line else ''}: {spell(path)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong at one place of a file."""
+
+    path: Location
+    found: str
+    expected: str
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2 core scalars only: `no` is text and 1e-6 a number, unlike in YAML 1.1."""
+
+
+_Loader.yaml_implicit_resolvers = {}
+
+_CORE_SCALARS = (
+    ("null", r"(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("bool", r"(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    ("int", r"(?:[-+]?(?:0|[1-9][0-9]*)|0x[0-9a-fA-F]+)$", list("-+0123456789")),
+    (
+        "float",
+        r"(?:[-+]?(?:(?:\.[0-9]+|[0-9]+\.[0-9]*)(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+|\.(?:inf|Inf|INF))"
+        r"|\.(?:nan|NaN|NAN))$",
+        list("-+0123456789."),
+    ),
+)
+for _tag, _pattern, _first in _CORE_SCALARS:
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
+_TAGS = {f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")}
+
+
+def parse_yaml(text: bytes, name: str) -> Document:
+    """Parse one YAML document.
+
+    Args:
+        text: of the file.
+        name: what to call it in messages.
+
+    Raises:
+        YamlInvalid: it is no single YAML document, or has duplicate keys, aliases, tags, keys that are not text.
+    """
+    if len(text) > MAX_BYTES:
+        raise YamlInvalid(
+            name,
+            found=f"{len(text)} bytes",
+            expected=f"a configuration of at most {MAX_BYTES} bytes",
+            remedy="is this the right file?",
+        )
+    lines: dict[Location, int] = {}
+    try:
+        _refuse_bombs(text, name)
+        loader = _Loader(text)
+        try:
+            node = loader.get_single_node()
+            tree = None if node is None else _convert(loader, node, (), name, lines)
+        finally:
+            loader.dispose()
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise YamlInvalid(
+            f"{name}:{mark.line + 1 if mark else '?'}",
+            found=error.problem or error.context or "broken YAML",
+            expected="one YAML document",
+            remedy="mind indentation, colons and quotes",
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise YamlInvalid(
+            name,
+            found=f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else 'nesting too deep'}",
+            expected="one YAML document in UTF-8",
+            remedy="is this the right file?",
+        ) from error
+    return Document(name, tree, lines)
+
+
+def _refuse_bombs(text: bytes, name: str) -> None:
+    """A few lines of aliases can unfold to gigabytes, and deep nesting takes minutes."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        alias = isinstance(event, yaml.AliasEvent)
+        if alias or depth > MAX_DEPTH:
+            mark = event.start_mark
+            raise YamlInvalid(
+                f"{name}:{mark.line + 1 if mark else '?'}",
+                found="an alias (*name)" if alias else f"more than {MAX_DEPTH} lists in lists",
+                expected="plain values",
+                remedy="write the value out" if alias else "is this the right file?",
+            )
+
+
+def read_bytes(path: Path) -> bytes:
+    """Bytes of a configuration file.
+
+    Raises:
+        ConfigurationMissing: there is no such file, or it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigurationMissing(
+            str(path),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="a readable file",
+            remedy="check the name and the folder it is meant from",
+        ) from error
+
+
+def read_model(document: Document, model: type[Model]) -> Model:
+    """Check a document against its schema.
+
+    Raises:
+        SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest known key.
+    """
+    try:
+        # By way of JSON, where a list may become a tuple and a word an enum although everything else is strict.
+        return model.model_validate_json(json.dumps(document.tree))
+    except ValidationError as error:
+        raise _mismatch(document, [_fault(item, model) for item in error.errors(include_url=False)]) from error
+
+
+def _mismatch(document: Document, faults: list[Fault]) -> SchemaMismatch:
+    # A list counts as empty when its items are wrong; what is wrong inside says enough.
+    inner = [f for f in faults if not any(g.path[: len(f.path)] == f.path and g.path != f.path for g in faults)]
+    return SchemaMismatch(**describe(document, inner), remedy="correct the file; `drivegain init` shows every key")
+
+
+def describe(document: Document, faults: list[Fault]) -> dict[str, str]:
+    """Subject, found and expected of an error that carries some faults; several are listed one a line."""
+    if len(faults) == 1:
+        only = faults[0]
+        return {"subject": document.where(only.path), "found": only.found, "expected": only.expected}
+    shown = [f"\n  {document.where(f.path)}: found {f.found}; expected {f.expected}" for f in faults[:MAX_SHOWN]]
+    more = f"\n  and {len(faults) - MAX_SHOWN} more" if len(faults) > MAX_SHOWN else ""
+    return {"subject": document.name, "found": f"{len(faults)} faults{''.join(shown)}{more}", "expected": "none"}
+
+
+def spell(path: Location) -> str:
+    """A path as people write it: axes[3].limits.velocity_deg_s (counted from 0)."""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
+    return text.lstrip(".") or "the whole file"
+
+
+def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]) -> Any:
+    """A node as plain Python, noting lines and refusing what YAML allows and a configuration must not."""
+    line = node.start_mark.line + 1
+    lines[path] = line
+    if node.tag not in _TAGS:
+        raise YamlInvalid(
+            f"{name}:{line}: {spell(path)}",
+            found=f"tag {node.tag.removeprefix('tag:yaml.org,2002:')}",
+            expected="plain text, numbers, lists and mappings",
+            remedy="remove the tag",
+        )
+    if isinstance(node, yaml.MappingNode):
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            key = loader.construct_object(key_node) if isinstance(key_node, yaml.ScalarNode) else None
+            if not isinstance(key, str):
+                raise YamlInvalid(
+                    f"{name}:{key_node.start_mark.line + 1}: {spell(path)}",
+                    found=f"key {key_node.value!r}",
+                    expected="a key that is text",
+                    remedy="quote it if it is meant so",
+                )
+            if key in mapping:
+                raise YamlInvalid(
+                    f"{name}:{key_node.start_mark.line + 1}: {spell((*path, key))}",
+                    found=f"duplicate key {key!r}, first on line {lines[*path, key]}",
+                    expected="each key once",
+                    remedy="remove one of them",
+                )
+            mapping[key] = _convert(loader, value_node, (*path, key), name, lines)
+            lines[*path, key] = key_node.start_mark.line + 1
+        return mapping
+    if isinstance(node, yaml.SequenceNode):
+        return [_convert(loader, child, (*path, i), name, lines) for i, child in enumerate(node.value)]
+    return loader.construct_object(node)
+
+
+def _fault(item: Any, model: type[BaseModel]) -> Fault:
+    """A validation error of pydantic as found and expected."""
+    path: Location = tuple(item["loc"])
+    if item["type"] == "extra_forbidden":
+        known = _known_keys(model, path[:-1])
+        near = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
+        hint = f"{near[0]} (did you mean that?)" if near else f"one of {', '.join(known)}"
+        return Fault(path, f"unknown key {path[-1]!r}", hint)
+    if item["type"] == "missing":
+        return Fault(path, "nothing", "this key, it is required")
+    expected = re.sub(r"^(Input|Value) should (be|have) |^Value error, ", "", item["msg"])
+    return Fault(path, _show(item["input"]), expected)
+
+
+def _show(value: Any) -> str:
+    kind = {str: "text", bool: "truth value", int: "integer", float: "number", list: "list", dict: "mapping"}
+    text = json.dumps(value)
+    return f"{kind.get(type(value), 'nothing')} {text if len(text) <= 60 else text[:57] + '...'}"
+
+
+def _known_keys(model: type[BaseModel], path: Location) -> list[str]:
+    """Keys that the schema has at a path; list positions and names of a free mapping are passed over."""
+    current = model
+    for part in path:
+        if isinstance(part, str) and part in current.model_fields:
+            current = _nested(current.model_fields[part].annotation) or current
+    return list(current.model_fields)
+
+
+def _nested(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    found = (_nested(argument) for argument in get_args(annotation))
+    return next((model for model in found if model is not None), None)

@@ -1,0 +1,320 @@
+"""The main job from end to end on a simulated cell, over the same driver that a real one is recorded with.
+
+This file and the simulate verb are the only ones that may read a simulation file: the truth is looked at to judge the
+result, after it stands.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from daq.apply import Proposal, apply, propose
+from daq.calibration_file import as_document, save
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation
+from daq.controller_write import Written
+from daq.errors import UsageError
+from daq.fit import Fit, calibration_of, close_loop, fit
+from daq.plan import Plan, plan
+from daq.plan_file import save_plan
+from daq.record import Recorded, network_of, record
+from daq.report.gains import plot_gains
+from daq.report.residual import plot_residual
+from daq.report.torque import plot_torques
+from daq.resources import shipped_configurations
+from drivers.bus import open_bus
+from drivers.scan import FoundNode
+from drivers.simulated.cell import SimulatedCell
+from ident.calibration import Calibration
+from ident.effects.effect import along
+from ident.identify import Identification
+from ident.observation import decimate_rows
+from ident.signals import signals
+
+PLANS = ("a", "b", "c")
+RUNS = (
+    ("bare-1", None, "a"),
+    ("loaded-1", "disc", "a"),
+    ("bare-2", None, "b"),
+    ("loaded-2", "disc", "b"),
+    ("unused", "disc", "c"),
+)
+"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last is held out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What may be chosen of a demonstration.
+
+    Attributes:
+        out: folder that it fills; files of an earlier demonstration in it are replaced.
+        simulation: file of the simulated cell.
+        seed: of plans, noise and significance test.
+        duration_s: of each run [s].
+    """
+
+    out: Path
+    simulation: Path
+    seed: int
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Telling:
+    """Whom to tell what is being done.
+
+    Attributes:
+        step: a new step begins, in words.
+        progress: done, total and a remark within it.
+    """
+
+    step: Callable[[str], None]
+    progress: Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that the demonstration found.
+
+    Attributes:
+        cell: declared.
+        nodes: found on the bus.
+        plans: made.
+        recorded: logs.
+        fitted: with the effects that were found.
+        calibration: as saved.
+        truth: true gain by axis.
+        proposal, written: what the controller file would get, and what its copy got.
+    """
+
+    cell: Cell
+    nodes: tuple[FoundNode, ...]
+    plans: tuple[Plan, ...]
+    recorded: tuple[Recorded, ...]
+    fitted: Fit
+    calibration: Calibration
+    truth: dict[str, float]
+    proposal: Proposal
+    written: Written | None
+
+
+def shipped_simulation(name: str = "demo") -> Path:
+    """A simulation file that comes with drivegain."""
+    return shipped_configurations() / "simulation" / f"{name}.yaml"
+
+
+def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Telling) -> Outcome:
+    """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
+
+    Args:
+        settings: what may be chosen.
+        now: wall clock with time zone.
+        telling: whom to tell.
+
+    Raises:
+        DaqError, DriverError, IdentificationError: whatever a real cell could raise.
+    """
+    cell_file = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(cell_file)
+    out = settings.out
+    logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
+    _make_room(out, logs)
+    telling.step("scan the bus")
+    nodes = _scan(settings, cell)
+    telling.step("plan exciting moves")
+    plans = tuple(_plan(settings, cell, index, telling) for index in range(len(PLANS)))
+    recorded = []
+    for index, (name, payload, plan_name) in enumerate(RUNS):
+        telling.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+        recorded.append(_record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling))
+    telling.step("identify all gains and parameters")
+    fitted = fit(logs[:-1], holdout=logs[-1:])
+    telling.step("look for what the model lacks")
+    fitted = close_loop(fitted, settings.seed, lambda step: telling.progress(0, 0, step))
+    calibration = calibration_of(fitted, now())
+    save(calibration, out / "calibration.yaml")
+    telling.step("write the calibration to a copy of the controller file")
+    proposal, written = _write_back(cell, calibration, out, now())
+    telling.step("draw the pictures")
+    spec = load_simulation(settings.simulation)
+    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+    draw(fitted, calibration, truth, out)
+    return Outcome(cell, nodes, plans, tuple(recorded), fitted, calibration, truth, proposal, written)
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The outcome as `summary.json` holds it."""
+    before, after = outcome.fitted.identification, outcome.fitted.final
+    effects = outcome.calibration.effects
+    first = effects[0] if effects else None
+    paper = outcome.fitted.paper
+    return {
+        "gains": [
+            {
+                "axis": gain.axis,
+                "nameplate": gain.nameplate,
+                "identified": gain.value,
+                "std_percent": gain.std_percent,
+                "truth": outcome.truth[gain.axis],
+                "error_percent": 100.0 * (gain.value / outcome.truth[gain.axis] - 1.0),
+                "paper_tls": None if paper is None else float(paper.gains[index]),
+            }
+            for index, gain in enumerate(outcome.calibration.gains)
+        ],
+        "effect": None if first is None else {"name": first.name, "axis": first.axis},
+        "effects": as_document(outcome.calibration)["effects"],
+        "error_before_percent": _total(before),
+        "error_after_percent": _total(after),
+        "error_before_percent_axes": _axes(before),
+        "error_after_percent_axes": _axes(after),
+        "plans": [{"moves": len(plan.moves), "condition": plan.condition} for plan in outcome.plans],
+        "logs": [
+            {
+                "log": run.path.name,
+                "samples": run.log.samples,
+                "lost_cycles": run.log.lost_cycles,
+                "valid": run.log.valid,
+            }
+            for run in outcome.recorded
+        ],
+        "controller_diff": outcome.proposal.diff,
+        "applied": outcome.written is not None,
+    }
+
+
+def draw(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
+    """Torques of the unused run (paper Fig. 2), residual before and after each effect, and the gains.
+
+    Raises:
+        OSError: from the file system.
+    """
+    final = fitted.final
+    names = fitted.cell.axis_names
+    rows = final.holdout if final.holdout is not None else final.training.only(final.training.run == 0)
+    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
+    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
+    which = "a run not used in the fit" if final.holdout is not None else "the first run of the fit"
+    plot_torques(out / "torques.png", rows.time_s, measured, predicted, names, title=f"Joint torques of {which}")
+    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
+    before = fitted.identification
+    for step in fitted.steps:
+        if step.accepted is not None:
+            _draw_effect(before, step.after, names, out)
+            before = step.after
+
+
+def _draw_effect(before: Identification, after: Identification, names: tuple[str, ...], out: Path) -> None:
+    placed = after.effects[-1]
+    index = after.held_out[0] if after.held_out else 0
+    rows_before = before.holdout if before.holdout is not None else before.training
+    rows_after = after.holdout if after.holdout is not None else after.training
+    chosen = rows_after.run == index
+    data = after.datasets[index]
+    seen = signals(after.model, data, after.training, after.estimate)
+    variable, velocity = (
+        decimate_rows(data, rows_after.conditioning, column[None])[0]
+        for column in (along(placed.effect.abscissa, seen, placed.axis), data.velocity_rad_s[placed.axis])
+    )
+    use = rows_after.use[placed.axis, chosen]
+    residuals = (
+        np.where(use, identification.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
+        for identification, rows in ((before, rows_before), (after, rows_after))
+    )
+    name = names[placed.axis]
+    plot_residual(
+        out / f"residual-{name}-{placed.effect.name}.png",
+        rows_after.time_s[chosen],
+        *residuals,
+        variable=variable,
+        variable_label=placed.effect.abscissa.value,
+        velocity_rad_s=velocity,
+        title=f"{name}: {placed.effect.name}, run {data.name}",
+    )
+
+
+def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
+    if out.exists() and not out.is_dir():
+        raise UsageError(str(out), found="a file", expected="a folder", remedy="choose another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    for log in logs:
+        log.unlink(missing_ok=True)
+        log.with_name(log.name + ".part").unlink(missing_ok=True)
+    for picture in out.glob("residual-*.png"):
+        picture.unlink()
+
+
+def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
+    bus = open_bus(bus_address(cell))
+    try:
+        with SimulatedCell(load_simulation(settings.simulation), bus), network_of(cell) as network:
+            nodes = network.scan()
+            network.check_identities()
+            return nodes
+    finally:
+        bus.shutdown()
+
+
+def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
+    exchanges = 200
+    made = plan(
+        cell,
+        seed=10 * settings.seed + index,
+        duration_s=settings.duration_s,
+        exchanges=exchanges,
+        progress=lambda done, value: telling.progress(done, exchanges, f"plan {PLANS[index]}, condition {value:.0f}"),
+    )
+    save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
+    return made
+
+
+def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, telling: Telling) -> Recorded:
+    name, payload, _ = RUNS[index]
+    spec = load_simulation(settings.simulation, payload)
+    declared = {candidate.name: candidate.payload for candidate in cell.payloads}
+    bus = open_bus(bus_address(cell))
+    try:
+        # Another noise in every run, as another day would bring; the plant is the same.
+        with SimulatedCell(replace(spec, seed=spec.seed + 100 * settings.seed + index), bus):
+            return record(
+                cell_file,
+                cell,
+                moves,
+                settings.out / f"{name}.mcap",
+                payload=None if payload is None else declared[payload],
+                operator="demo",
+                granted_by="the demonstration: a simulated cell",
+                run_id=f"demo-{settings.seed}-{name}",
+                progress=lambda done, total: telling.progress(done, total, "moves"),
+            )
+    finally:
+        bus.shutdown()
+
+
+def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) -> tuple[Proposal, Written | None]:
+    source = cell.controller_path
+    if cell.controller is None or source is None:
+        raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
+    target = out / "controller.yaml"
+    shutil.copyfile(source, target)
+    keys = dict(zip(cell.axis_names, cell.controller.gains, strict=True))
+    proposal = propose(calibration, target, keys, cell=cell.name, configuration_sha256=cell.digest)
+    return proposal, None if proposal.refusals else apply(proposal, now)
+
+
+def _total(identification: Identification) -> float | None:
+    error = identification.holdout_error
+    return None if error is None else error.total
+
+
+def _axes(identification: Identification) -> list[float] | None:
+    error = identification.holdout_error
+    return None if error is None else list(error.axes)

@@ -1,0 +1,257 @@
+"""Everything that can go wrong between a file and a screen, and the exit code of every error of the three packages.
+
+DaqError
+├── UsageError                  the command asks for what cannot be done                      exit 2
+│   ├── OutputExists            a file would be overwritten
+│   └── PlanUnfit               no moves within these limits excite every parameter
+├── CalibrationRefused          a gate of the write-back is closed                            exit 3
+│   ├── CalibrationEdited       calibration.yaml was changed by hand
+│   ├── ControllerUnfit         the controller file cannot be read, or lacks a gain's key
+│   ├── ControllerChanged       the controller file is not the one that the diff was shown for
+│   ├── ControllerBusy          somebody else is writing the controller file
+│   └── BackupMissing           there is nothing to roll back to
+├── DataError                   a recording cannot be used                                    exit 4
+│   ├── CalibrationMissing      there is no such calibration file
+│   ├── CalibrationUnreadable   it is none, of another version, or broken
+│   ├── LogUnreadable
+│   │   ├── LogMissing          there is no such log
+│   │   ├── LogForeign          not MCAP, or not a log of a cell
+│   │   ├── LogTruncated        the end is missing: power loss, a killed recorder, a broken copy
+│   │   ├── LogCorrupt          a checksum or a length does not fit
+│   │   └── LogIncomplete       cell configuration, readback or run metadata are not in the log
+│   ├── TableUnfit              a CSV file of another controller
+│   │   ├── TableMissing        there is no such file
+│   │   ├── TableEmpty          it has no rows
+│   │   ├── TableTruncated      its last row is incomplete
+│   │   ├── TableColumns        it has other columns than the description says
+│   │   ├── TableNotNumeric     a field is not a finite number
+│   │   └── TimeNotUniform      its time column has gaps or jumps
+│   ├── LogsDiffer              logs of different cells, or of different configurations of one
+│   └── RunUnfit
+│       ├── RunInvalid          the recorder itself marked it invalid
+│       ├── CyclesLost          SYNC cycles are missing
+│       ├── ClockImplausible    the time stamps show another rate than was asked for
+│       ├── CurrentSaturated    a limit acted in too large a part of the run
+│       └── PositionImplausible far outside the joint limits: deg for rad, or a wrong drive train
+├── ConfigurationError          a configuration file is wrong                                 exit 6
+│   ├── ConfigurationMissing    there is no such file
+│   ├── YamlInvalid             not YAML, a duplicate key, an alias
+│   ├── SchemaMismatch          unknown key, missing key, wrong type
+│   └── ConfigurationInconsistent  each value is well-formed, together they describe no cell
+└── OutputFailed                the disk is full, the folder is read-only                     exit 1
+
+drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from pathlib import Path
+
+from drivers.errors import DriverError
+from ident.errors import IdentificationError
+
+
+class ExitCode(IntEnum):
+    """What the shell, a scheduled job or a PLC sees of the outcome."""
+
+    OK = 0
+    UNEXPECTED = 1
+    USAGE = 2
+    CALIBRATION_REFUSED = 3
+    DATA_UNFIT = 4
+    DEVICE_FAULT = 5
+    CONFIGURATION = 6
+
+
+class DaqError(Exception):
+    """Root of the tree: what it is about, what was found, what was expected, and what to do."""
+
+    def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
+        super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
+        self.subject = subject
+        self.found = found
+        self.expected = expected
+        self.remedy = remedy
+
+
+class UsageError(DaqError):
+    """The command asks for what cannot be done."""
+
+
+class OutputExists(UsageError):
+    """A file would be overwritten."""
+
+
+class PlanUnfit(UsageError):
+    """No moves within these limits and this time excite every parameter."""
+
+
+class CalibrationRefused(DaqError):
+    """A gate of the write-back is closed; nothing was written."""
+
+
+class CalibrationEdited(CalibrationRefused):
+    """A calibration file is not what was fitted."""
+
+
+class ControllerUnfit(CalibrationRefused):
+    """The controller file cannot be read, or lacks a gain's key."""
+
+
+class ControllerChanged(CalibrationRefused):
+    """The controller file is not the one that the diff was shown for."""
+
+
+class ControllerBusy(CalibrationRefused):
+    """Somebody else is writing the controller file."""
+
+
+class BackupMissing(CalibrationRefused):
+    """There is nothing to roll back to."""
+
+
+class DataError(DaqError):
+    """A recording cannot be used."""
+
+
+class CalibrationMissing(DataError):
+    """There is no such calibration file, or it cannot be read."""
+
+
+class CalibrationUnreadable(DataError):
+    """Not a calibration file, of another version, or broken."""
+
+
+class LogUnreadable(DataError):
+    """A log cannot be read."""
+
+
+class LogMissing(LogUnreadable):
+    """There is no such log."""
+
+
+class LogForeign(LogUnreadable):
+    """Not MCAP, or not a log of a cell."""
+
+
+class LogTruncated(LogUnreadable):
+    """The end is missing."""
+
+
+class LogCorrupt(LogUnreadable):
+    """A checksum or a length does not fit."""
+
+
+class LogIncomplete(LogUnreadable):
+    """Something that a log must carry is not in it."""
+
+
+class TableUnfit(DataError):
+    """A CSV file of another controller cannot be imported."""
+
+
+class TableMissing(TableUnfit):
+    """There is no such file."""
+
+
+class TableEmpty(TableUnfit):
+    """The file has no rows."""
+
+
+class TableTruncated(TableUnfit):
+    """The last row is incomplete."""
+
+
+class TableColumns(TableUnfit):
+    """The file has other columns than the description says."""
+
+
+class TableNotNumeric(TableUnfit):
+    """A field is not a finite number."""
+
+
+class TimeNotUniform(TableUnfit):
+    """The time column has gaps or jumps."""
+
+
+class LogsDiffer(DataError):
+    """Logs of different cells, or of different configurations of one."""
+
+
+class RunUnfit(DataError):
+    """A log can be read, and its samples cannot be used."""
+
+
+class RunInvalid(RunUnfit):
+    """The recorder itself marked the run invalid."""
+
+
+class CyclesLost(RunUnfit):
+    """SYNC cycles are missing; they are never interpolated."""
+
+
+class ClockImplausible(RunUnfit):
+    """The time stamps show another rate than was asked for."""
+
+
+class CurrentSaturated(RunUnfit):
+    """A limit acted in too large a part of the run."""
+
+
+class PositionImplausible(RunUnfit):
+    """Positions far outside the joint limits."""
+
+
+class ConfigurationError(DaqError):
+    """A configuration file is wrong."""
+
+
+class ConfigurationMissing(ConfigurationError):
+    """There is no such file."""
+
+
+class YamlInvalid(ConfigurationError):
+    """Not YAML, a duplicate key, or an alias."""
+
+
+class SchemaMismatch(ConfigurationError):
+    """Unknown key, missing key, or wrong type."""
+
+
+class ConfigurationInconsistent(ConfigurationError):
+    """Each value is well-formed; together they describe no cell."""
+
+
+class OutputFailed(DaqError):
+    """The disk is full, or the folder is read-only."""
+
+    @classmethod
+    def of(cls, path: Path, error: OSError) -> OutputFailed:
+        """What the file system said when a file was written whole or not at all."""
+        return cls(
+            str(path),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="a folder that can be written, with room",
+            remedy="nothing was changed; free space or rights, or choose another folder",
+        )
+
+
+EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
+    (UsageError, ExitCode.USAGE),
+    (CalibrationRefused, ExitCode.CALIBRATION_REFUSED),
+    (DataError, ExitCode.DATA_UNFIT),
+    (ConfigurationError, ExitCode.CONFIGURATION),
+    (OutputFailed, ExitCode.UNEXPECTED),
+    (IdentificationError, ExitCode.DATA_UNFIT),
+    (DriverError, ExitCode.DEVICE_FAULT),
+)
+"""Exit code of every error class with a cause that a user can act on; the first that fits wins."""
+
+
+def exit_code(kind: type[BaseException]) -> ExitCode | None:
+    """Exit code of an exception class, None when it is none of ours."""
+    for root, code in EXIT_CODES:
+        if issubclass(kind, root):
+            return code
+    return None

@@ -1,0 +1,239 @@
+"""CSV files of other controllers become the same logs.
+
+A log holds int32. Where the files hold angles, the count is chosen for each axis as the smallest power of two with
+which the largest value still fits, so half a count, the rounding, is at most 4.7e-10 of that value; a power of two
+scales without a rounding of its own. raw = round(value / count).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from math import ceil, log2, pi
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import bundle, load_cell
+from daq.configuration.importing import ImportDescription, PositionUnit, Side, TimeColumn, load_import
+from daq.conversion import check_limits, scaling
+from daq.csv_table import TableFile, columns, read_table
+from daq.errors import ConfigurationInconsistent, PositionImplausible, TableColumns, TableNotNumeric, TimeNotUniform
+from daq.log.metadata import RunInfo, RunStatistics
+from daq.log.readback import AxisReadback, Readback
+from daq.log.writer import LogContent, LogWriter
+from drivers.sample import Sample
+from ident.payload import Payload
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+LARGEST_RAW = 2**31 - 1
+SMALLEST_MOTION = 0.02
+"""Share of a joint's range that at least one joint moves in any run worth importing."""
+TIME_TOLERANCE = 0.5
+"""Share of a period by which a time stamp may be off."""
+
+
+def import_csv(
+    description: Path, data: Path, out: Path, *, software: str, cell_path: Path | None = None
+) -> RunStatistics:
+    """Make a log of the files that a description names. The same input gives the same bytes: no clock is asked.
+
+    Args:
+        description: the import description.
+        data: folder of the CSV files.
+        out: the log to write; on any error it is not there.
+        software: name and version to put into the log.
+        cell_path: another cell file than the description's.
+
+    Raises:
+        ConfigurationError: description or cell are wrong, or contradict each other.
+        TableUnfit, PositionImplausible: the files cannot be used.
+        OutputExists, OutputFailed: the log cannot be written.
+    """
+    wanted = load_import(description)
+    path = cell_path or wanted.cell
+    cell = load_cell(path)
+    _check_cell(wanted, cell, description)
+    sources = {} if not isinstance(wanted.rate, TimeColumn) else {wanted.rate.columns.file: None}
+    names = dict.fromkeys((wanted.position.file, wanted.current.file, *sources))
+    files = {name: read_table(data / name, wanted.table) for name in names}
+    position, current = (
+        columns(files[wanted.position.file], wanted.position),
+        columns(files[wanted.current.file], wanted.current),
+    )
+    _check_lengths(files)
+    rate_hz = _rate_hz(wanted, files)
+    counts, count_rad = _counts(wanted, cell, position, files[wanted.position.file])
+    raw, unit = quantise(current * wanted.current_factor)
+    readback = Readback(
+        tuple(
+            AxisReadback(axis.name, float(unit[i]), None if count_rad is None else float(count_rad[i]))
+            for i, axis in enumerate(cell.axes)
+        )
+    )
+    scale = scaling(cell, readback)
+    joint_rad = scale.joint_position(counts)
+    check_limits(str(data / wanted.position.file), joint_rad, cell)
+    _check_motion(str(data / wanted.position.file), joint_rad, cell)
+    digests = {name: hashlib.sha256("\n".join(file.rows).encode()).hexdigest() for name, file in files.items()}
+    run = RunInfo(
+        run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
+        rate_hz=rate_hz,
+        payload=_payload(wanted, cell),
+        operator=wanted.operator,
+        software=software,
+        started_wall_ns=0,
+        started_monotonic_ns=0,
+        origin=f"imported as {wanted.name} from " + ", ".join(f"{name} ({d[:12]})" for name, d in digests.items()),
+    )
+    content = LogContent(run, bundle(path), readback, cell.axis_names)
+    opened = False
+    try:
+        # No sample is lost by a crash of an import, so no clock is needed to flush in time.
+        with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0) as log:
+            opened = True
+            for sample in _samples(counts, raw, rate_hz):
+                log.write(sample)
+    except BaseException:
+        if opened:
+            log.part.unlink(missing_ok=True)
+        raise
+    return log.statistics
+
+
+def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Integers of at most 31 bits and, for each column, the power of two that they count.
+
+    Args:
+        values: finite numbers, shape (k, n).
+
+    Returns:
+        raw, shape (k, n), and quantum, shape (n,), with |values − raw · quantum| ≤ quantum / 2 and
+        quantum ≤ 2 / (2³¹ − 1) of the largest magnitude of the column.
+    """
+    largest = np.abs(values).max(axis=0)
+    exponent = [ceil(log2(top / LARGEST_RAW)) if top > 1e-200 else -30 for top in largest.tolist()]
+    quantum = np.ldexp(1.0, np.array(exponent))
+    return np.rint(values / quantum).astype(np.int64), quantum
+
+
+def _counts(
+    wanted: ImportDescription, cell: Cell, position: FloatArray, file: TableFile
+) -> tuple[IntArray, FloatArray | None]:
+    """Motor counts, and the motor angle of a count [rad]; None where the counts are the cell's own."""
+    if wanted.position_unit is PositionUnit.COUNTS:
+        fractional = np.argwhere(position != np.rint(position))
+        if fractional.size or np.abs(position).max() > LARGEST_RAW:
+            row, column = fractional[0] if fractional.size else np.argwhere(np.abs(position) > LARGEST_RAW)[0]
+            raise TableNotNumeric(
+                f"{file.path}:{file.first_line + row}, column {wanted.position.columns[column]}",
+                found=f"{position[row, column]!r}",
+                expected="a whole number of encoder counts of at most 31 bits",
+                remedy="correct `unit` in the import description",
+            )
+        return position.astype(np.int64), None
+    angle_rad = position * (pi / 180.0) if wanted.position_unit is PositionUnit.DEG else position
+    if wanted.side is Side.JOINT:
+        offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
+        angle_rad = (angle_rad - offset_rad) @ cell.ratio.T
+    return quantise(angle_rad)
+
+
+def _samples(counts: IntArray, raw: IntArray, rate_hz: float) -> Sequence[Sample]:
+    time_ns = np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64).tolist()
+    silent = (0,) * counts.shape[1]
+    rows = zip(time_ns, counts.tolist(), raw.tolist(), strict=True)
+    return [Sample(k, t, tuple(q), tuple(v), silent) for k, (t, q, v) in enumerate(rows)]
+
+
+def _rate_hz(wanted: ImportDescription, files: dict[str, TableFile]) -> float:
+    """The rate that the description states, or that the time column shows.
+
+    Raises:
+        TimeNotUniform: a time stamp is more than half a period from where it should be.
+    """
+    if not isinstance(wanted.rate, TimeColumn):
+        return wanted.rate
+    file = files[wanted.rate.columns.file]
+    time_s = columns(file, wanted.rate.columns)[:, 0] * wanted.rate.unit.seconds
+    time_s = time_s - time_s[0]
+    period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    wrong = np.abs(np.diff(time_s) - period_s) > TIME_TOLERANCE * period_s
+    if period_s <= 0.0 or wrong.any():
+        row = int(np.argmax(wrong))
+        raise TimeNotUniform(
+            f"{file.path}:{file.first_line + row + 1}, column {wanted.rate.columns.columns[0]}",
+            found=f"{time_s[min(row + 1, len(time_s) - 1)] - time_s[row]:.6g} s after the sample before",
+            expected=f"{period_s:.6g} s, the same between all samples",
+            remedy="samples are missing or doubled: cut the recording there; or state rate_hz if the stamps are coarse",
+        )
+    return float((len(time_s) - 1) / time_s[-1])
+
+
+def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
+    if wanted.payload is None:
+        return None
+    matches = [p for p in cell.payloads if p.name == wanted.payload and wanted.mounting in {None, p.mounting}]
+    if len(matches) == 1:
+        return matches[0].payload
+    known = ", ".join(f"{p.name} at {p.mounting}" for p in cell.payloads) or "none"
+    raise ConfigurationInconsistent(
+        f"import description {wanted.name!r}",
+        found=f"payload {wanted.payload!r}, mounting {wanted.mounting!r}",
+        expected=f"one of the cell's ({known})",
+        remedy="name payload and mounting as in the cell file",
+    )
+
+
+def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> None:
+    n = len(cell.axes)
+    if len(wanted.position.columns) != n:
+        raise ConfigurationInconsistent(
+            f"{description}: position.columns",
+            found=f"{len(wanted.position.columns)} columns",
+            expected=f"{n}, one for each axis of cell {cell.name!r}",
+            remedy="correct the description, or choose the cell with --cell",
+        )
+    for axis in cell.axes:
+        if axis.gain_unit != f"Nm/{wanted.current_unit}":
+            raise ConfigurationInconsistent(
+                f"{description}: current.unit",
+                found=f"{wanted.current_unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
+                expected=f"current in {axis.gain_unit.removeprefix('Nm/')!r}",
+                remedy="state that unit, and `factor` to convert the numbers of the file to it",
+            )
+    if wanted.position_unit is PositionUnit.COUNTS and any(a.counts_per_revolution is None for a in cell.axes):
+        raise ConfigurationInconsistent(
+            f"{description}: position.unit",
+            found="counts, and axes without counts_per_revolution",
+            expected="counts_per_revolution for each axis of the cell",
+            remedy="add it to the cell file",
+        )
+    _payload(wanted, cell)
+
+
+def _check_lengths(files: dict[str, TableFile]) -> None:
+    lengths = {name: len(file.rows) for name, file in files.items()}
+    if len(set(lengths.values())) > 1:
+        raise TableColumns(
+            ", ".join(str(file.path) for file in files.values()),
+            found=" and ".join(f"{length} rows in {name}" for name, length in lengths.items()),
+            expected="as many in each",
+            remedy="one of them ends early, or they are of different runs; export them again",
+        )
+
+
+def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
+    """Radians taken for degrees shrink all motion 57 times; limits do not see that."""
+    ranges = [axis.limits.position[1] - axis.limits.position[0] for axis in cell.axes]
+    share = np.ptp(joint_rad, axis=0) / np.array(ranges)
+    if share.max() < SMALLEST_MOTION:
+        raise PositionImplausible(
+            name,
+            found=f"motion over at most {100.0 * share.max():.2g} % of any joint's range",
+            expected=f"at least {100.0 * SMALLEST_MOTION:g} % on one joint",
+            remedy="most likely radians were taken for degrees, or joint for motor side; correct the description",
+        )

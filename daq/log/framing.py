@@ -1,0 +1,188 @@
+"""The records of an MCAP file, every byte under a checksum before it is believed.
+
+The file may be truncated, bit-flipped or made to harm: every length is compared with what the file can hold before
+memory is taken, and a record is parsed from its own bytes alone. (The `mcap` package's readers follow lengths inside
+records and leave attachments unchecked.)
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, TypeVar
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+
+from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated
+
+MAGIC = b"\x89MCAP0\r\n"
+LARGEST_RECORD = 64 * 2**20
+"""Bytes; our chunks hold 200 ms."""
+LARGEST_CHUNK = 64 * 2**20
+
+Record = TypeVar("Record", bound=McapRecord)
+_PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
+    (Opcode.HEADER, Header.read),
+    (Opcode.SCHEMA, Schema.read),
+    (Opcode.CHANNEL, Channel.read),
+    (Opcode.ATTACHMENT, Attachment.read),
+    (Opcode.METADATA, Metadata.read),
+    (Opcode.CHUNK, Chunk.read),
+)
+
+
+class RecordFile:
+    """Iterates over the records of the data section; afterwards `sha256` is that of the whole file.
+
+    Raises (while iterating):
+        LogMissing, LogForeign, LogTruncated, LogCorrupt: with the offset in the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Store the path."""
+        self.path = path
+        self.sha256 = ""
+
+    def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
+        """Offset and record; those that only index others are passed over."""
+        try:
+            with self.path.open("rb") as stream:
+                yield from self._records(stream, self.path.stat().st_size)
+        except OSError as error:
+            raise LogMissing(
+                str(self.path),
+                found=(error.strerror or type(error).__name__).lower(),
+                expected="a log (.mcap)",
+                remedy="check the name",
+            ) from error
+
+    def _records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+        self._check_ends(stream, size)
+        digest = hashlib.sha256(MAGIC)
+        crc = zlib.crc32(MAGIC)
+        offset = stream.seek(len(MAGIC))
+        in_data = True
+        while offset < size - len(MAGIC):
+            head = stream.read(9)
+            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, size)
+            if length > min(size - len(MAGIC) - offset - 9, LARGEST_RECORD):
+                raise self.corrupt(offset, f"a record of {length} bytes", "one that fits the file")
+            body = stream.read(length)
+            digest.update(head)
+            digest.update(body)
+            if opcode == Opcode.DATA_END and in_data:
+                self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
+                crc, in_data = 0, False
+            elif opcode == Opcode.FOOTER and not in_data:
+                crc = zlib.crc32(body[:16], zlib.crc32(head, crc))
+                self._check_crc(offset, "summary", _parse(Footer.read, body, self, offset).summary_crc, crc)
+                offset += 9 + length
+                break
+            else:
+                crc = zlib.crc32(body, zlib.crc32(head, crc))
+                if in_data:
+                    yield from self._record(offset, opcode, body)
+            offset += 9 + length
+        else:
+            raise self.corrupt(offset, "no footer", "one before the end")
+        if offset != size - len(MAGIC):
+            raise self.corrupt(offset, f"{size - len(MAGIC) - offset} bytes behind the footer", "none")
+        digest.update(MAGIC)
+        self.sha256 = digest.hexdigest()
+
+    def _record(self, offset: int, opcode: int, body: bytes) -> Iterator[tuple[int, McapRecord]]:
+        if opcode == Opcode.ATTACHMENT:
+            stored = int.from_bytes(body[-4:], "little")
+            self._check_crc(offset, "attachment", stored, zlib.crc32(body[:-4]))
+        for known, read in _PARSERS:
+            if opcode == known:
+                yield offset, _parse(read, body, self, offset)
+
+    def _check_ends(self, stream: BinaryIO, size: int) -> None:
+        start = stream.read(len(MAGIC))
+        if start != MAGIC[: len(start)] or (size < len(MAGIC) and size > 0):
+            raise LogForeign(
+                str(self.path),
+                found=f"first bytes {start!r}",
+                expected="an MCAP file",
+                remedy="is this the right file?",
+            )
+        stream.seek(max(0, size - len(MAGIC)))
+        if size < 2 * len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
+            raise LogTruncated(
+                str(self.path),
+                found=f"{size} bytes without the closing mark",
+                expected="a finished log",
+                remedy="the recorder was killed or the copy broke off; copy or record it again",
+            )
+
+    def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
+        # 0 means "not computed" in MCAP; our logs always compute, and without it a flipped bit would pass for data.
+        if stored == 0 or stored != computed:
+            found = "no checksum" if stored == 0 else f"checksum {stored:#010x} and contents of {computed:#010x}"
+            raise self.corrupt(offset, f"{what} with {found}", "contents that fit their checksum")
+
+    def corrupt(self, offset: int, found: str, expected: str) -> LogCorrupt:
+        """The error for a place of this file."""
+        return LogCorrupt(
+            f"{self.path}, byte {offset}",
+            found=found,
+            expected=expected,
+            remedy="the file was damaged after it was written; copy it again from where it was recorded",
+        )
+
+    def definition(self, offset: int, opcode: int, body: bytes) -> McapRecord:
+        """A schema or channel that stands inside the chunk at an offset."""
+        if opcode == Opcode.SCHEMA:
+            schema: Schema = _parse(Schema.read, body, self, offset)
+            return schema
+        channel: Channel = _parse(Channel.read, body, self, offset)
+        return channel
+
+    def unpack(self, offset: int, chunk: Chunk) -> bytes:
+        """Contents of a chunk.
+
+        Raises:
+            LogForeign: another compression than zstd.
+            LogCorrupt: too large, broken, or not what its checksum says.
+        """
+        size = chunk.uncompressed_size
+        if size > LARGEST_CHUNK:
+            raise self.corrupt(offset, f"a chunk of {size} bytes", f"at most {LARGEST_CHUNK}")
+        if chunk.compression not in {"zstd", ""}:
+            raise LogForeign(
+                str(self.path),
+                found=f"chunks in {chunk.compression!r}",
+                expected="zstd",
+                remedy="convert the file with a tool for MCAP",
+            )
+        data = chunk.data
+        if chunk.compression == "zstd":
+            try:
+                claimed = zstandard.frame_content_size(data)
+                if claimed > size:
+                    raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as it says itself")
+                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+            except zstandard.ZstdError as error:
+                raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
+        if len(data) != size:
+            raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as it says itself")
+        self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))
+        return data
+
+
+def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int) -> Record:
+    """A record from its own bytes alone."""
+    stream = BytesIO(body)
+    try:
+        return read(ReadDataStream(stream))
+    except (McapError, struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error

@@ -1,0 +1,176 @@
+"""The messages of a log: their definitions, and their CDR bytes.
+
+CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to its own size, counted
+from behind the encapsulation. A sequence is its length and its elements, a string ends with NUL and counts it. With the
+number of axes fixed, an AxisSamples message has a constant size, so numpy reads a chunk of them at once.
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.event import CellEvent, EventKind
+from drivers.sample import Sample
+
+SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
+SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
+JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
+LARGEST_AXES = 32
+"""As many as bits in `missing`."""
+
+_SEPARATOR = "=" * 80 + "\n"
+_TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+DEFINITIONS = {
+    SAMPLES_SCHEMA: """\
+# One SYNC cycle of a cell, as the amplifiers sent it.
+uint64 cycle                      # number of the SYNC
+builtin_interfaces/Time stamp     # of the SYNC
+int32[] position_counts           # motor side, encoder counts
+int32[] current_raw               # current-loop reference, unit of the drive profile
+uint16[] statusword               # CiA 402 object 6041h
+uint32 missing                    # bit i: axis i did not answer, its values repeat the last known ones
+"""
+    + _TIME,
+    EVENTS_SCHEMA: """\
+# Something that happened in a cell, before the sample of the same stamp.
+builtin_interfaces/Time stamp
+int16 axis                        # from 0, -1 is the whole cell
+string kind                       # emcy, nmt, state, sample lost, move start, move end, ...
+uint32 code                       # EMCY code, NMT state, statusword, number of the move or of the cycle, by kind
+string text                       # for people
+"""
+    + _TIME,
+    JOINTS_SCHEMA: """\
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+"""
+    + _SEPARATOR
+    + "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    + _TIME,
+}
+"""Full ros2msg definitions by schema name, with the definitions they refer to."""
+
+_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian
+_EVENT = struct.Struct("<4siIh2x")
+WHOLE_CELL = -1
+
+
+def sample_struct(axes: int) -> struct.Struct:
+    """Layout of an AxisSamples message of so many axes, encapsulation first."""
+    padding = "2x" if axes % 2 else ""  # uint16[] of odd length leaves `missing` unaligned
+    return struct.Struct(f"<4sQiII{axes}iI{axes}iI{axes}H{padding}I")
+
+
+def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
+    """CDR of one sample; struct.error when a value does not fit its type, or the axes not the layout."""
+    axes = len(sample.position_counts)
+    seconds, nanoseconds = divmod(sample.time_ns, 1_000_000_000)
+    return layout.pack(
+        _ENCAPSULATION,
+        sample.cycle,
+        seconds,
+        nanoseconds,
+        axes,
+        *sample.position_counts,
+        axes,
+        *sample.current_raw,
+        axes,
+        *sample.statusword,
+        sample.missing,
+    )
+
+
+@functools.cache
+def sample_dtype(axes: int) -> np.dtype[np.void]:
+    """A whole MCAP message record (opcode, length, 22 bytes of message header) of an AxisSamples message, for numpy."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+        ("encapsulation", "<u4"),
+        ("cycle", "<u8"),
+        ("seconds", "<i4"),
+        ("nanoseconds", "<u4"),
+        ("positions", "<u4"),
+        ("position_counts", "<i4", (axes,)),
+        ("currents", "<u4"),
+        ("current_raw", "<i4", (axes,)),
+        ("statuswords", "<u4"),
+        ("statusword", "<u2", (axes,)),
+    ]
+    if axes % 2:
+        fields.append(("padding", "<u2"))
+    fields.append(("missing", "<u4"))
+    return np.dtype(fields)
+
+
+ENCAPSULATION_WORD = int.from_bytes(_ENCAPSULATION, "little")
+
+
+def event_bytes(event: CellEvent) -> bytes:
+    """CDR of one event."""
+    seconds, nanoseconds = divmod(event.time_ns, 1_000_000_000)
+    axis = WHOLE_CELL if event.axis is None else event.axis
+    head = _EVENT.pack(_ENCAPSULATION, seconds, nanoseconds, axis)
+    kind = _string(event.kind.value)
+    return head + kind + b"\0" * (-len(kind) % 4) + struct.pack("<I", event.code) + _string(event.text)
+
+
+def event_from_bytes(data: bytes) -> CellEvent:
+    """The event in some CDR.
+
+    Raises:
+        ValueError, struct.error: the bytes are no CellEvent of this software.
+    """
+    head, seconds, nanoseconds, axis = _EVENT.unpack_from(data)
+    if head != _ENCAPSULATION:
+        raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
+    kind, end = _string_from(data, _EVENT.size)
+    end += -end % 4
+    (code,) = struct.unpack_from("<I", data, end)
+    text, _ = _string_from(data, end + 4)
+    time_ns = seconds * 1_000_000_000 + nanoseconds
+    return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
+
+
+def _string(text: str) -> bytes:
+    data = text.replace("\0", " ").encode() + b"\0"
+    return struct.pack("<I", len(data)) + data
+
+
+def _string_from(data: bytes, start: int) -> tuple[str, int]:
+    """A string and the position behind it."""
+    (length,) = struct.unpack_from("<I", data, start)
+    end = start + 4 + length
+    text = data[start + 4 : end]
+    if len(text) != length or text[-1:] != b"\0":
+        raise ValueError(f"a string of {length} bytes that does not end")
+    return text[:-1].decode("utf-8"), end
+
+
+def joint_state_prefix(names: Sequence[str]) -> bytes:
+    """What every JointState of these joints has between its stamp and its positions."""
+    data = bytearray(struct.pack("<I", 1) + b"\0")  # empty frame_id
+    for word in (None, *(name.encode() + b"\0" for name in names)):
+        data += b"\0" * (-len(data) % 4)  # the stamp before it is 8 bytes long, so alignment counts from here too
+        data += struct.pack("<I", len(names) if word is None else len(word)) + (word or b"")
+    return bytes(data)
+
+
+def joint_state_bytes(prefix: bytes, time_ns: int, position: Sequence[float]) -> bytes:
+    """CDR of a JointState with positions [rad] alone."""
+    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
+    data = bytearray(struct.pack("<iI", seconds, nanoseconds) + prefix)
+    data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(position))
+    data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(position)}d", *position)
+    return _ENCAPSULATION + bytes(data) + struct.pack("<II", 0, 0)

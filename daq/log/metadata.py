@@ -1,0 +1,149 @@
+"""Who recorded what, with which load, and how it went: the metadata of a log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from ident.payload import PAYLOAD_PARAMETERS, Payload
+
+RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
+VERSION = "1"
+"""Of the log's contract; a reader refuses a higher one."""
+
+
+class Role(Enum):
+    """What a run is for."""
+
+    UNLOADED = "unloaded"
+    LOADED = "loaded"
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """What is known when a recording starts.
+
+    Attributes:
+        run_id: unique; given by the caller.
+        rate_hz: samples a second, exactly as asked of SYNC.
+        payload: what was mounted, None without load.
+        operator: who stands for it.
+        software: name and version of the recorder.
+        started_wall_ns: Unix time of the start [ns].
+        started_monotonic_ns: the monotonic clock at the same moment [ns]; a clock jump shows in the difference.
+        origin: where the samples came from: "recorded", or the import's sources.
+    """
+
+    run_id: str
+    rate_hz: float
+    payload: Payload | None
+    operator: str
+    software: str
+    started_wall_ns: int
+    started_monotonic_ns: int
+    origin: str = "recorded"
+
+    @property
+    def role(self) -> Role:
+        """Loaded or unloaded."""
+        return Role.UNLOADED if self.payload is None else Role.LOADED
+
+
+@dataclass(frozen=True, slots=True)
+class RunStatistics:
+    """What is known when a recording ends.
+
+    Attributes:
+        samples: cycles in the log.
+        lost_cycles: cycles that are not.
+        missing: samples in which the axis did not answer, one number an axis.
+        valid: whether the recorder stands for the run.
+        reason: why not.
+    """
+
+    samples: int
+    lost_cycles: int
+    missing: tuple[int, ...]
+    valid: bool
+    reason: str = ""
+
+
+def run_record(info: RunInfo) -> dict[str, str]:
+    """The metadata `drivegain.run`."""
+    payload = info.payload
+    return {
+        "version": VERSION,
+        "run_id": info.run_id,
+        "rate_hz": repr(info.rate_hz),
+        "role": info.role.value,
+        "payload": "" if payload is None else payload.name,
+        "mounting": "" if payload is None else payload.mounting,
+        "payload_known": "{}" if payload is None else json.dumps(payload.known, sort_keys=True),
+        "operator": info.operator,
+        "software": info.software,
+        "started_wall_ns": str(info.started_wall_ns),
+        "started_monotonic_ns": str(info.started_monotonic_ns),
+        "origin": info.origin,
+    }
+
+
+def run_from_record(record: Mapping[str, str]) -> RunInfo:
+    """What `run_record` wrote.
+
+    Raises:
+        KeyError: an entry is missing.
+        ValueError: an entry is not what it must be.
+    """
+    if record["version"] != VERSION:
+        raise ValueError(f"version {record['version']!r} of the log contract; this software reads {VERSION}")
+    payload = None
+    if Role(record["role"]) is Role.LOADED:
+        known = json.loads(record["payload_known"])
+        if not isinstance(known, dict) or not known.keys() <= set(PAYLOAD_PARAMETERS):
+            raise ValueError(f"known payload parameters {record['payload_known']!r}")
+        payload = Payload(record["payload"], record["mounting"], {key: float(value) for key, value in known.items()})
+    rate_hz = float(record["rate_hz"])
+    if not 0.0 < rate_hz < 1e6:
+        raise ValueError(f"sampling rate {record['rate_hz']!r}")
+    return RunInfo(
+        run_id=record["run_id"],
+        rate_hz=rate_hz,
+        payload=payload,
+        operator=record["operator"],
+        software=record["software"],
+        started_wall_ns=int(record["started_wall_ns"]),
+        started_monotonic_ns=int(record["started_monotonic_ns"]),
+        origin=record["origin"],
+    )
+
+
+def statistics_record(statistics: RunStatistics) -> dict[str, str]:
+    """The metadata `drivegain.statistics`."""
+    return {
+        "samples": str(statistics.samples),
+        "lost_cycles": str(statistics.lost_cycles),
+        "missing": json.dumps(statistics.missing),
+        "valid": json.dumps(statistics.valid),
+        "reason": statistics.reason,
+    }
+
+
+def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
+    """What `statistics_record` wrote.
+
+    Raises:
+        KeyError: an entry is missing.
+        ValueError: an entry is not what it must be.
+    """
+    missing, valid = json.loads(record["missing"]), json.loads(record["valid"])
+    if not isinstance(valid, bool) or not isinstance(missing, list) or not all(isinstance(m, int) for m in missing):
+        raise ValueError(f"missing {record['missing']!r}, valid {record['valid']!r}")
+    return RunStatistics(
+        samples=int(record["samples"]),
+        lost_cycles=int(record["lost_cycles"]),
+        missing=tuple(missing),
+        valid=valid,
+        reason=record["reason"],
+    )

@@ -1,0 +1,295 @@
+"""A log into arrays: every chunk of samples is one `frombuffer`, no Python loop over messages."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
+from numpy.typing import NDArray
+
+from daq.errors import LogForeign, LogIncomplete
+from daq.log.framing import RecordFile
+from daq.log.message import (
+    ENCAPSULATION_WORD,
+    EVENTS_SCHEMA,
+    EVENTS_TOPIC,
+    LARGEST_AXES,
+    SAMPLES_SCHEMA,
+    SAMPLES_TOPIC,
+    event_from_bytes,
+    sample_dtype,
+)
+from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_from_record, statistics_from_record
+from daq.log.readback import NAME as READBACK
+from daq.log.readback import Readback, readback_from_bytes
+from drivers.event import CellEvent
+
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampleBlock:
+    """Samples of k cycles, in the order of the log.
+
+    Attributes:
+        cycle: number of the SYNC, shape (k,), uint64.
+        time_ns: of the SYNC [ns], shape (k,), int64.
+        position_counts, current_raw: shape (k, n), int32.
+        statusword: shape (k, n), uint16.
+        missing: bit i for axis i, shape (k,), uint32.
+    """
+
+    cycle: NDArray[np.uint64]
+    time_ns: NDArray[np.int64]
+    position_counts: NDArray[np.int32]
+    current_raw: NDArray[np.int32]
+    statusword: NDArray[np.uint16]
+    missing: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True)
+class LogHead:
+    """What stands before the samples.
+
+    Attributes:
+        run: who, what and when.
+        readback: what the amplifiers said.
+        files: all attachments by name; the cell's bundle is among them.
+    """
+
+    run: RunInfo
+    readback: Readback
+    files: Mapping[str, bytes]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Log:
+    """A whole log.
+
+    Attributes:
+        path, digest: of the file; sha256, hex.
+        head: what stands before the samples.
+        samples: all of them.
+        events: in the order of the log.
+        statistics: what the recorder said at the end.
+    """
+
+    path: Path
+    digest: str
+    head: LogHead
+    samples: SampleBlock
+    events: tuple[CellEvent, ...]
+    statistics: RunStatistics
+
+
+class LogReader:
+    """One pass over a log in bounded memory: iterate over blocks, then ask for the rest.
+
+    Raises (while iterating):
+        LogUnreadable: one of its kinds, with the place in the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Store the path."""
+        self.path = path
+        self.events: list[CellEvent] = []
+        self._file = RecordFile(path)
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._attachments: dict[str, bytes] = {}
+        self._metadata: dict[str, dict[str, str]] = {}
+
+    def __iter__(self) -> Iterator[SampleBlock]:
+        """Blocks of samples; events are collected on the way."""
+        for offset, record in self._file:
+            if isinstance(record, Attachment):
+                self._attachments[record.name] = record.data
+            elif isinstance(record, Metadata):
+                self._metadata[record.name] = record.metadata
+            elif isinstance(record, Header) and record.profile != "ros2":
+                raise self._foreign(f"profile {record.profile!r}", "ros2")
+            elif isinstance(record, Chunk):
+                yield from self._chunk(offset, self._file.unpack(offset, record))
+            else:
+                self._define(record)
+
+    @property
+    def digest(self) -> str:
+        """sha256 of the file, once the iteration has ended."""
+        return self._file.sha256
+
+    @property
+    def head(self) -> LogHead:
+        """What stands before the samples; whole once the first block has come.
+
+        Raises:
+            LogIncomplete: the log lacks it, or it is unreadable.
+        """
+        try:
+            run = run_from_record(self._metadata[RUN])
+            readback = readback_from_bytes(self._attachments[READBACK])
+        except (KeyError, ValueError) as error:
+            raise self._incomplete(error, f"metadata {RUN!r} and attachment {READBACK!r}") from error
+        return LogHead(run, readback, self._attachments)
+
+    @property
+    def statistics(self) -> RunStatistics:
+        """What the recorder said at the end, once the iteration has ended.
+
+        Raises:
+            LogIncomplete: the log lacks it, or it is unreadable.
+        """
+        try:
+            return statistics_from_record(self._metadata[STATISTICS])
+        except (KeyError, ValueError) as error:
+            raise self._incomplete(error, f"metadata {STATISTICS!r}") from error
+
+    def _chunk(self, offset: int, data: bytes) -> Iterator[SampleBlock]:
+        """Samples of a chunk: at once when it holds nothing else, else picked one by one."""
+        start = self._definitions(offset, data)
+        if start == len(data):
+            return
+        head = self._message_head(offset, data, start)
+        if self._topic(head[2]) == SAMPLES_TOPIC:
+            count, rest = divmod(len(data) - start, 9 + head[1])
+            axes = self._axes(offset, head[1])
+            if not rest:
+                records = np.frombuffer(data, dtype=sample_dtype(axes), count=count, offset=start)
+                same = (records["opcode"] == Opcode.MESSAGE) & (records["length"] == head[1])
+                if np.all(same & (records["channel"] == head[2])):
+                    yield self._block(offset, records, axes)
+                    return
+        yield from self._mixed(offset, data, start)
+
+    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[SampleBlock]:
+        """A chunk of events and viewers' topics, or one that another tool has packed anew."""
+        samples: list[bytes] = []
+        while start < len(data):
+            opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
+            record = data[start : start + 9 + length]
+            start += 9 + length
+            if opcode != Opcode.MESSAGE:
+                continue
+            topic = self._topic(channel)
+            if topic == SAMPLES_TOPIC:
+                samples.append(record)
+            elif topic == EVENTS_TOPIC:
+                try:
+                    self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
+                except (ValueError, struct.error) as error:
+                    raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
+        if samples:
+            axes = self._axes(offset, len(samples[0]) - 9)
+            dtype = sample_dtype(axes)
+            if any(len(sample) != dtype.itemsize for sample in samples):
+                raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
+            yield self._block(offset, np.frombuffer(b"".join(samples), dtype=dtype), axes)
+
+    def _definitions(self, offset: int, data: bytes) -> int:
+        """Take the schemas and channels at the start of a chunk; position of the first message."""
+        start = 0
+        while start < len(data) and data[start] != Opcode.MESSAGE:
+            end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
+            if end > len(data):
+                raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")
+            if data[start] in {Opcode.SCHEMA, Opcode.CHANNEL}:
+                self._define(self._file.definition(offset, data[start], data[start + 9 : end]))
+            start = end
+        return start
+
+    def _define(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            schema = self._schemas.get(record.schema_id)
+            expected = {SAMPLES_TOPIC: SAMPLES_SCHEMA, EVENTS_TOPIC: EVENTS_SCHEMA}.get(record.topic)
+            name = schema.name if schema else "no schema"
+            if expected and (record.message_encoding != "cdr" or name != expected):
+                raise self._foreign(f"{record.topic} as {name} in {record.message_encoding!r}", f"{expected} in 'cdr'")
+            self._channels[record.id] = record
+
+    def _message_head(self, offset: int, data: bytes, start: int) -> tuple[int, int, int, int, int, int]:
+        if start + _MESSAGE_HEAD.size > len(data):
+            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
+        opcode, length, channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
+        if start + 9 + length > len(data):
+            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
+        return opcode, length, channel, sequence, log_time, publish_time
+
+    def _topic(self, channel: int) -> str:
+        known = self._channels.get(channel)
+        return known.topic if known else ""
+
+    def _axes(self, offset: int, length: int) -> int:
+        """Number of axes of samples of this length."""
+        for axes in range(1, LARGEST_AXES + 1):
+            if sample_dtype(axes).itemsize == 9 + length:
+                return axes
+        raise self._file.corrupt(offset, f"a sample of {length} bytes", f"1 to {LARGEST_AXES} axes")
+
+    def _block(self, offset: int, records: NDArray[np.void], axes: int) -> SampleBlock:
+        counts = [records[name] == axes for name in ("positions", "currents", "statuswords")]
+        if not (np.all(counts) and np.all(records["encapsulation"] == ENCAPSULATION_WORD)):
+            raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
+        return SampleBlock(
+            cycle=records["cycle"].astype(np.uint64),
+            time_ns=records["seconds"].astype(np.int64) * 1_000_000_000 + records["nanoseconds"],
+            position_counts=records["position_counts"].astype(np.int32),
+            current_raw=records["current_raw"].astype(np.int32),
+            statusword=records["statusword"].astype(np.uint16),
+            missing=records["missing"].astype(np.uint32),
+        )
+
+    def _foreign(self, found: str, expected: str) -> LogForeign:
+        return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
+
+    def _incomplete(self, error: Exception, expected: str) -> LogIncomplete:
+        found = f"none ({error.args[0]!r})" if isinstance(error, KeyError) else str(error)
+        return LogIncomplete(
+            str(self.path), found=found, expected=expected, remedy="record or import the run again with this software"
+        )
+
+
+def read_log(path: Path) -> Log:
+    """Read a whole log.
+
+    Raises:
+        LogUnreadable: one of its kinds, with the place in the file.
+    """
+    reader = LogReader(path)
+    blocks = list(reader)
+    head, statistics = reader.head, reader.statistics
+    if not blocks:
+        raise LogIncomplete(
+            str(path), found="no samples", expected=f"some on {SAMPLES_TOPIC}", remedy="record or import the run again"
+        )
+    widths = {block.position_counts.shape[1] for block in blocks}
+    if widths != {len(head.readback.axes)}:
+        raise LogIncomplete(
+            str(path),
+            found=f"samples of {', '.join(map(str, sorted(widths)))} axes",
+            expected=f"{len(head.readback.axes)}, as in its readback",
+            remedy="record or import the run again",
+        )
+    count = sum(len(block.cycle) for block in blocks)
+    if count != statistics.samples:
+        raise LogIncomplete(
+            str(path),
+            found=f"{count} samples",
+            expected=f"{statistics.samples}, as its recorder counted",
+            remedy="another tool may have cut the log; take the original",
+        )
+    samples = SampleBlock(
+        cycle=np.concatenate([block.cycle for block in blocks]),
+        time_ns=np.concatenate([block.time_ns for block in blocks]),
+        position_counts=np.concatenate([block.position_counts for block in blocks]),
+        current_raw=np.concatenate([block.current_raw for block in blocks]),
+        statusword=np.concatenate([block.statusword for block in blocks]),
+        missing=np.concatenate([block.missing for block in blocks]),
+    )
+    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics)

@@ -1,0 +1,248 @@
+"""Samples into a log that survives a crash: at most 200 ms are ever in memory alone."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from io import BufferedWriter
+from pathlib import Path
+from types import TracebackType
+
+from mcap.writer import CompressionType, Writer
+
+from daq.errors import OutputExists, OutputFailed
+from daq.log.message import (
+    DEFINITIONS,
+    EVENTS_SCHEMA,
+    EVENTS_TOPIC,
+    JOINTS_SCHEMA,
+    JOINTS_TOPIC,
+    SAMPLES_SCHEMA,
+    SAMPLES_TOPIC,
+    event_bytes,
+    joint_state_bytes,
+    joint_state_prefix,
+    sample_bytes,
+    sample_struct,
+)
+from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_record, statistics_record
+from daq.log.readback import NAME as READBACK
+from daq.log.readback import Readback, readback_bytes
+from drivers.event import CellEvent
+from drivers.sample import Sample
+
+FLUSH_NS = 200_000_000
+"""Of recorded or of wall time, whichever comes first."""
+JOINT_STATE_NS = 20_000_000
+CHUNK_BYTES = 4 * 2**20
+"""Never reached in 200 ms; a chunk ends with a flush."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogContent:
+    """What stands at the start of a log.
+
+    Attributes:
+        run: who, what and when.
+        files: the cell's bundle: configuration, drive profiles, URDF.
+        readback: what the amplifiers said.
+        joint_names: for viewers, one for each axis.
+    """
+
+    run: RunInfo
+    files: Mapping[str, bytes]
+    readback: Readback
+    joint_names: tuple[str, ...]
+
+
+class LogWriter:
+    """Writes one log; a context manager.
+
+    The log is `PATH.part` until the block ends without an error; then it is finished, synced and renamed. After an
+    error the `.part` keeps everything up to that moment.
+
+    Raises (on entry and later):
+        OutputExists: the log, or a `.part` of the same name, is there already.
+        OutputFailed: the file system refuses.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        content: LogContent,
+        joint_position: Callable[[tuple[int, ...]], Sequence[float]],
+        clock_ns: Callable[[], int],
+    ) -> None:
+        """Store the arguments.
+
+        Args:
+            path: of the finished log.
+            content: what stands at its start.
+            joint_position: joint positions [rad] of some motor counts, for /joint_states.
+            clock_ns: monotonic clock, for the flush by wall time.
+        """
+        self.path = path
+        self.part = path.with_name(path.name + ".part")
+        self._content = content
+        self._joint_position = joint_position
+        self._clock_ns = clock_ns
+        self._axes = len(content.readback.axes)
+        self._layout = sample_struct(self._axes)
+        self._prefix = joint_state_prefix(content.joint_names)
+        self._held: list[tuple[int, int, bytes]] = []
+        self._samples = 0
+        self._lost = 0
+        self._missing = [0] * self._axes
+        self._last_cycle: int | None = None
+        self._flushed_recorded_ns = self._flushed_wall_ns = 0
+        self._joint_state_due_ns = 0
+        self._verdict = (True, "")
+
+    def __enter__(self) -> LogWriter:
+        """Open the file and write all that stands before the first sample."""
+        if self.path.exists():
+            raise OutputExists(
+                str(self.path),
+                found="a file of that name",
+                expected="none",
+                remedy="choose another name, or move it away",
+            )
+        try:
+            self._stream: BufferedWriter = self.part.open("xb")
+        except FileExistsError as error:
+            raise OutputExists(
+                str(self.part),
+                found="an unfinished log of that name",
+                expected="none",
+                remedy="its recorder still runs or was killed; move the file away to keep what it holds",
+            ) from error
+        except OSError as error:
+            raise self._failed(error) from error
+        try:
+            self._open()
+        except OSError as error:
+            self._stream.close()
+            self.part.unlink(missing_ok=True)
+            raise self._failed(error) from error
+        return self
+
+    def write(self, sample: Sample) -> None:
+        """Append one sample.
+
+        Raises:
+            ValueError: it does not fit the log: other number of axes, or a value outside its type.
+            OutputFailed: the file system refuses.
+        """
+        try:
+            data = sample_bytes(self._layout, sample)
+        except struct.error as error:
+            raise ValueError(f"{sample} does not fit a log of {self._axes} axes: {error}") from error
+        self._count(sample)
+        wall_ns = self._clock_ns()
+        if self._samples == 1:
+            self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
+            self._joint_state_due_ns = sample.time_ns
+        elif sample.time_ns - self._flushed_recorded_ns >= FLUSH_NS or wall_ns - self._flushed_wall_ns >= FLUSH_NS:
+            self.flush()
+            self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
+        try:
+            self._mcap.add_message(
+                self._samples_channel, sample.time_ns, data, sample.time_ns, sample.cycle & 0xFFFFFFFF
+            )
+        except OSError as error:
+            raise self._failed(error) from error
+        if sample.time_ns >= self._joint_state_due_ns:
+            self._joint_state_due_ns = sample.time_ns + JOINT_STATE_NS
+            state = joint_state_bytes(self._prefix, sample.time_ns, self._joint_position(sample.position_counts))
+            self._held.append((self._joints_channel, sample.time_ns, state))
+
+    def event(self, event: CellEvent) -> None:
+        """Append one event."""
+        self._held.append((self._events_channel, event.time_ns, event_bytes(event)))
+
+    def conclude(self, valid: bool, reason: str = "") -> None:
+        """Say whether the run may be used; it is valid unless told otherwise."""
+        self._verdict = (valid, reason)
+
+    @property
+    def statistics(self) -> RunStatistics:
+        """So far."""
+        return RunStatistics(self._samples, self._lost, tuple(self._missing), *self._verdict)
+
+    def flush(self) -> None:
+        """Put everything into the file.
+
+        Samples get chunks of their own, so that a reader takes a whole chunk at once; the rest follows in another.
+        """
+        try:
+            self._mcap.flush()
+            for channel, time_ns, data in self._held:
+                self._mcap.add_message(channel, time_ns, data, time_ns)
+            self._held.clear()
+            self._mcap.flush()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Finish and rename after success; keep the `.part` after an error."""
+        try:
+            with self._stream:
+                self.flush()
+                if error is not None:
+                    return
+                self._mcap.add_metadata(STATISTICS, statistics_record(self.statistics))
+                self._mcap.finish()
+                self._stream.flush()
+                os.fsync(self._stream.fileno())
+            self.part.rename(self.path)
+            _sync_folder(self.path.parent)
+        except OSError as failure:
+            raise self._failed(failure) from (error or failure)
+
+    def _open(self) -> None:
+        # Data CRCs protect attachments and metadata too, which stand outside chunks.
+        self._mcap = Writer(
+            self._stream,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._mcap.start(profile="ros2", library=self._content.run.software)
+        started_ns = self._content.run.started_wall_ns
+        for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
+            self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
+        self._mcap.add_metadata(RUN, run_record(self._content.run))
+        self._samples_channel = self._channel(SAMPLES_TOPIC, SAMPLES_SCHEMA)
+        self._events_channel = self._channel(EVENTS_TOPIC, EVENTS_SCHEMA)
+        self._joints_channel = self._channel(JOINTS_TOPIC, JOINTS_SCHEMA)
+        self._mcap.flush()
+
+    def _channel(self, topic: str, schema: str) -> int:
+        identifier = self._mcap.register_schema(schema, "ros2msg", DEFINITIONS[schema].encode())
+        return self._mcap.register_channel(topic, "cdr", identifier)
+
+    def _count(self, sample: Sample) -> None:
+        self._samples += 1
+        if self._last_cycle is not None:
+            self._lost += max(0, sample.cycle - self._last_cycle - 1)
+        self._last_cycle = sample.cycle
+        if sample.missing:
+            for axis in range(self._axes):
+                self._missing[axis] += sample.missing >> axis & 1
+
+    def _failed(self, error: OSError) -> OutputFailed:
+        return OutputFailed.of(self.part, error)
+
+
+def _sync_folder(folder: Path) -> None:
+    """A rename is on the disk only when its folder is."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,195 @@
+"""One run: a plan's moves made by the cell, every sample of them in a log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.configuration import cell as declared
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_file import bundle
+from daq.conversion import Scaling, scaling
+from daq.errors import ConfigurationInconsistent
+from daq.log.metadata import RunInfo, RunStatistics
+from daq.log.readback import readback_of_drives
+from daq.log.writer import LogContent, LogWriter
+from daq.plan import Plan, path_of
+from daq.version import software
+from drivers.event import CellEvent, EventKind
+from drivers.motion import execute
+from drivers.move import AxisLimits, MotionPermission, Move, synchronised_move
+from drivers.network import CanopenNetwork
+from drivers.pacing import LockstepSync, Pacing, TimedSync
+from drivers.stream import StreamStatistics, SyncStream
+from ident.payload import Payload
+
+FloatArray = NDArray[np.float64]
+
+ROUNDING = 1.001
+"""Whole counts may ask a drive for this much more than a limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """Where the times come from [ns]."""
+
+    wall_ns: Callable[[], int] = time.time_ns
+    monotonic_ns: Callable[[], int] = time.monotonic_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A finished recording: its log, what the log holds and what the bus did."""
+
+    path: Path
+    log: RunStatistics
+    stream: StreamStatistics
+
+
+def network_of(cell: Cell) -> CanopenNetwork:
+    """The amplifiers of a cell; use it as a context manager.
+
+    Raises:
+        ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
+    """
+    return CanopenNetwork(bus_address(cell), drive_axes(cell))
+
+
+def record(
+    cell_file: Path,
+    cell: Cell,
+    plan: Plan,
+    out: Path,
+    *,
+    payload: Payload | None,
+    operator: str,
+    granted_by: str | None,
+    run_id: str,
+    clocks: Clocks | None = None,
+    progress: Callable[[int, int], None] = lambda _move, _moves: None,
+) -> Recorded:
+    """Make a plan's moves and log every sample.
+
+    Args:
+        cell_file: of the cell; it goes into the log with all it refers to.
+        cell: what it says.
+        plan: the moves.
+        out: log to write; must not exist.
+        payload: what is mounted, None without load.
+        operator: who stands for the recording.
+        granted_by: who allows the motion; None refuses it.
+        run_id: unique.
+        clocks: wall and monotonic time.
+        progress: told the moves done and their number.
+
+    Raises:
+        ConfigurationInconsistent, OutputExists, OutputFailed: see daq/errors.py.
+        DriverError: from the bus; the axes were stopped, the log stays unfinished (`.part`).
+    """
+    clocks = clocks or Clocks()
+    with network_of(cell) as network:
+        network.prepare()
+        readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
+        scale = scaling(cell, readback)
+        run = RunInfo(
+            run_id=run_id,
+            rate_hz=1e6 / _sync(cell).period_us,
+            payload=payload,
+            operator=operator,
+            software=software(),
+            started_wall_ns=clocks.wall_ns(),
+            started_monotonic_ns=clocks.monotonic_ns(),
+        )
+        content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
+        with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
+            done = 0
+
+            def on_event(event: CellEvent) -> None:
+                nonlocal done
+                log.event(event)
+                if event.kind is EventKind.MOVE_END:
+                    done += 1
+                    progress(done, len(plan.moves))
+
+            stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
+            first = next(stream)
+            log.write(first)
+            permission = None if granted_by is None else MotionPermission(granted_by, motor_limits(cell, scale))
+            moves = motor_moves(cell, plan, scale, first.position_counts)
+            with closing(execute(network, stream, moves, permission)) as samples:
+                for sample in samples:
+                    log.write(sample)
+            log.conclude(*_verdict(stream.statistics))
+        return Recorded(out, log.statistics, stream.statistics)
+
+
+def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
+    """What each motor may do so that no joint can leave its limits by one motor alone [counts].
+
+    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). That each joint keeps its own
+    limits is checked where joints are spoken of: in the plan.
+    """
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
+    forwards, backwards = np.maximum(cell.ratio, 0.0), np.minimum(cell.ratio, 0.0)
+    low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
+    high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
+    turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
+    velocity = turns @ np.array([axis.limits.velocity for axis in cell.axes])
+    acceleration = turns @ np.array([axis.limits.acceleration for axis in cell.axes])
+    return tuple(
+        AxisLimits(int(np.floor(least)), int(np.ceil(most)), float(fast), float(hard))
+        for least, most, fast, hard in zip(low, high, velocity, acceleration, strict=True)
+    )
+
+
+def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
+    """A plan's joint trapezoids as the motors make them: R is linear, and all axes share the ramps [counts]."""
+    moves = []
+    here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
+    for planned in plan.moves:
+        path = path_of(cell, here_rad, planned)
+        target_rad = np.array(planned.target_rad)
+        target = tuple(
+            int(count) for count in np.rint(cell.ratio @ (target_rad - scale.offset_rad) / scale.rad_per_count)
+        )
+        speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
+        ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
+        # The motors' own limits for this move: the fastest trapezoid within them is the joints' one.
+        exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
+        dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
+        moves.append(synchronised_move(here, target, exact, dwell))
+        here_rad, here = target_rad, target
+    return tuple(moves)
+
+
+def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
+    """Whether a run may be used: a loss that nobody has explained makes it invalid."""
+    losses = {
+        "missing answers": statistics.missing,
+        "late answers": statistics.late,
+        "answers of wrong length": statistics.wrong_length,
+    }
+    found = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
+    return not found, found
+
+
+def _sync(cell: Cell) -> declared.Sync:
+    if cell.sync is None:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}", found="no `sync`", expected="its period and pacing", remedy="complete the cell file"
+        )
+    return cell.sync
+
+
+def _pacing(cell: Cell, run: RunInfo, clocks: Clocks) -> Pacing:
+    sync = _sync(cell)
+    if sync.pacing is declared.Pacing.LOCKSTEP:
+        return LockstepSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)
+    return TimedSync(sync.period_us * 1000, clocks.monotonic_ns)

@@ -1,0 +1,137 @@
+"""What all pictures share: size, colours and the way to the disk. No pyplot: it keeps figures in a global list."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from daq.atomic_file import replace_file
+
+FloatArray = NDArray[np.float64]
+
+# Okabe and Ito, "Color Universal Design" (2008): told apart by colour-blind readers and in grey print.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+PURPLE = "#CC79A7"
+SKY = "#56B4E9"
+BLACK = "#000000"
+GREY = "#7F7F7F"
+
+DPI = 130
+_PANEL_IN = (5.6, 2.0)
+_TITLE_AND_LEGEND_IN = 1.1
+
+
+def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
+    """A figure of small multiples that share their horizontal axis, filled row by row.
+
+    Args:
+        count: number of panels.
+        columns: panels side by side, at most.
+        title: says what the picture shows.
+    """
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
+    places: list[Axes] = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
+    for unused in places[count:]:
+        unused.set_axis_off()
+    for position, place in enumerate(places[:count]):
+        _plain(place)
+        # In a last row that is not full, the panel above the gap is the lowest of its column.
+        place.tick_params(labelbottom=position >= count - columns)
+    return figure, places[:count]
+
+
+def grid(rows: int, widths: tuple[float, ...], title: str, height_in: float) -> tuple[Figure, list[list[Axes]]]:
+    """A figure whose rows share their vertical axis and whose columns share their horizontal one.
+
+    Args:
+        rows: number of rows.
+        widths: relative width of each column.
+        title: says what the picture shows.
+        height_in: of one row [inch].
+    """
+    figure = _figure(title, 2 * _PANEL_IN[0], height_in * rows + _TITLE_AND_LEGEND_IN)
+    places = figure.subplots(
+        rows, len(widths), sharex="col", sharey=True, squeeze=False, gridspec_kw={"width_ratios": widths}
+    )
+    for place in places.flat:
+        _plain(place)
+    return figure, [list(row) for row in places]
+
+
+def _figure(title: str, width_in: float, height_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=11)
+    return figure
+
+
+def legend_below(figure: Figure, *places: Axes) -> None:
+    """One legend for all panels, outside of them, so that it covers no data."""
+    pairs = [pair for place in places for pair in zip(*place.get_legend_handles_labels(), strict=True)]
+    named = {label: handle for handle, label in reversed(pairs)}
+    figure.legend(
+        list(reversed(named.values())),
+        list(reversed(named)),
+        loc="outside lower center",
+        ncols=len(named),
+        frameon=False,
+        fontsize=9,
+        markerscale=1.5,
+    )
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    """Draw a figure and put it at `path` whole; the same figure gives the same bytes.
+
+    Raises:
+        OSError: from the file system.
+    """
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=DPI, metadata={"Software": None})
+    replace_file(path, drawn.getvalue())
+
+
+def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tuple[FloatArray, FloatArray]:
+    """Few enough points to draw, with every peak kept: minimum and maximum of each stretch, in their order of time.
+
+    Args:
+        time_s: shape (k,).
+        columns: shape (k,); NaN where there is nothing to show.
+        points: of the result, at most.
+
+    Returns:
+        times and values, both of the same length.
+    """
+    stretch = -(-2 * len(time_s) // points)
+    if stretch <= 2:
+        return time_s, columns
+    whole = len(time_s) // stretch * stretch
+    blocks = columns[:whole].reshape(-1, stretch)
+    empty = np.isnan(blocks)
+    lowest = np.where(empty, np.inf, blocks).argmin(axis=1)
+    highest = np.where(empty, -np.inf, blocks).argmax(axis=1)
+    # A stretch that has a gap must show it: its later point becomes NaN and the line is broken there.
+    picked = np.sort(np.stack([lowest, highest], axis=1), axis=1) + stretch * np.arange(len(blocks))[:, None]
+    values = columns[picked]
+    values[empty.any(axis=1), 1] = np.nan
+    return (
+        np.concatenate([time_s[picked.ravel()], time_s[whole:]]),
+        np.concatenate([values.ravel(), columns[whole:]]),
+    )
+
+
+def _plain(place: Axes) -> None:
+    place.grid(visible=True, color="#DDDDDD", linewidth=0.6)
+    place.set_axisbelow(True)
+    place.spines[["top", "right"]].set_visible(False)
+    place.tick_params(labelsize=8)

@@ -1,0 +1,52 @@
+"""What happens in a cell besides samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+
+class EventKind(Enum):
+    """What a CellEvent tells; its code says more."""
+
+    EMCY = "emcy"
+    EMCY_RESET = "emcy reset"
+    NMT = "nmt"
+    STATE = "state"
+    FOLLOWING_ERROR = "following error"
+    LIMIT = "limit"
+    HEARTBEAT_LOST = "heartbeat lost"
+    SAMPLE_LOST = "sample lost"
+    BUS = "bus"
+    MOVE_START = "move start"
+    MOVE_END = "move end"
+    STOP = "stop"
+    STOP_UNCONFIRMED = "stop unconfirmed"
+
+
+@dataclass(frozen=True, slots=True)
+class CellEvent:
+    """One event of the cell.
+
+    Attributes:
+        time_ns: in the time of the samples [ns]: the SYNC it came after.
+        axis: index of the axis from 0, or None when it concerns the whole cell.
+        kind: what happened.
+        code: EMCY error code, NMT state, statusword, number of the move or of the cycle, by kind.
+        text: for a person.
+    """
+
+    time_ns: int
+    axis: int | None
+    kind: EventKind
+    code: int
+    text: str
+
+
+EventSink = Callable[[CellEvent], None]
+"""Receives events in the order in which they happen, before the sample of their cycle is handed out."""
+
+
+def discard(event: CellEvent) -> None:
+    """An EventSink for those who want samples alone."""

@@ -1,0 +1,220 @@
+"""The one reader of a bus: sends, receives, and hands every frame that is no PDO to whom it concerns.
+
+There is no receiving thread: whoever waits for something (an SDO answer, a heartbeat, the answers to a SYNC) reads the
+bus while waiting. See docs/decisions/0002-stream-owns-the-bus.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+import can
+from canopen.emcy import EmcyError
+
+from drivers.bus import BusAddress, bus_errors, open_bus, send_burst
+from drivers.errors import BusError, NmtRefused
+from drivers.event import CellEvent, EventKind
+from drivers.sdo import Clock, ObjectAccess, PumpedSdoClient, SdoPolicy
+
+SYNC_COB_ID = 0x080
+_EMCY, _SDO_ANSWER, _HEARTBEAT = 0x080, 0x580, 0x700
+_BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
+
+
+class NmtState(IntEnum):
+    """State in a heartbeat (CiA 301)."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+    def __str__(self) -> str:
+        return self.name.replace("_", "-")
+
+
+class NmtCommand(IntEnum):
+    """Command of the NMT master (CiA 301)."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+
+
+def nmt_name(state: int | None) -> str:
+    """Name of an NMT state for a person."""
+    if state is None:
+        return "nothing"
+    return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
+
+
+class Link:
+    """An open bus and what its nodes last said about themselves.
+
+    Attributes:
+        nmt: last NMT state of each node that sent a heartbeat.
+        heard_ns: when it did, by the clock.
+        answered: nodes that sent any SDO answer.
+    """
+
+    def __init__(
+        self,
+        address: BusAddress,
+        policy: SdoPolicy,
+        clock: Clock,
+        opener: Callable[[BusAddress], can.BusABC] = open_bus,
+    ) -> None:
+        self.address = address
+        self.clock = clock
+        self.policy = policy
+        self.nmt: dict[int, int] = {}
+        self.heard_ns: dict[int, int] = {}
+        self.answered: set[int] = set()
+        self._opener = opener
+        self._bus: can.BusABC | None = None
+        self._clients: dict[int, list[PumpedSdoClient]] = {}
+        self._access: dict[tuple[int, SdoPolicy], ObjectAccess] = {}
+        self._events: deque[tuple[int, EventKind, int, str]] = deque()
+
+    def open(self) -> None:
+        """Open the bus.
+
+        Raises:
+            BusError: it cannot be opened.
+        """
+        self._bus = self._opener(self.address)
+
+    def close(self) -> None:
+        """Close the bus; nothing happens when it is closed already."""
+        if self._bus is not None:
+            self._bus.shutdown()
+        self._bus = None
+
+    @property
+    def bus(self) -> can.BusABC:
+        """The open bus.
+
+        Raises:
+            BusError: it is not open.
+        """
+        if self._bus is None:
+            raise BusError(str(self.address), "is not open; use the network as a context manager")
+        return self._bus
+
+    def send(self, messages: Sequence[can.Message]) -> None:
+        """Send frames in their order.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        with bus_errors(self.address):
+            send_burst(self.bus, messages)
+
+    def pump(self, timeout_s: float) -> None:
+        """Handle one frame, waiting for it at most ``timeout_s``, or with 0 all that have already come.
+
+        Raises:
+            BusError: the bus has gone, or is off.
+        """
+        with bus_errors(self.address):
+            message = self.bus.recv(timeout_s)
+            while message is not None:
+                self.dispatch(message)
+                message = self.bus.recv(0.0) if timeout_s == 0 else None
+
+    def wait(self, seconds: float) -> None:
+        """Handle frames for a time.
+
+        Raises:
+            BusError: the bus has gone, or is off.
+        """
+        deadline = self.clock() + round(seconds * 1e9)
+        while (left_ns := deadline - self.clock()) > 0:
+            self.pump(left_ns * 1e-9)
+
+    def dispatch(self, message: can.Message) -> bool:
+        """Take note of a frame; tells whether it was a heartbeat, EMCY or SDO answer.
+
+        Raises:
+            BusError: an error frame says that the controller went off the bus.
+        """
+        if message.is_error_frame:
+            if message.arbitration_id & _BUS_OFF:
+                raise BusError(str(self.address), "bus-off: the CAN controller disconnected itself; check the wiring")
+            return True
+        service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
+        if message.is_extended_id or message.is_remote_frame or node_id == 0:
+            return False
+        if service == _HEARTBEAT and message.data:
+            self._note_heartbeat(node_id, message.data[0] & 0x7F)
+        elif service == _EMCY and len(message.data) == 8:
+            self._note_emcy(node_id, message.data)
+        elif service == _SDO_ANSWER:
+            self.answered.add(node_id)
+            for client in self._clients.get(node_id, ()):
+                client.receive(message.data)
+        else:
+            return False
+        return True
+
+    def _note_heartbeat(self, node_id: int, state: int) -> None:
+        previous = self.nmt.get(node_id)
+        self.nmt[node_id] = state
+        self.heard_ns[node_id] = self.clock()
+        if previous != state:
+            text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
+            self._events.append((node_id, EventKind.NMT, state, text))
+
+    def _note_emcy(self, node_id: int, data: bytearray) -> None:
+        code, register = int.from_bytes(data[:2], "little"), data[2]
+        # CiA 301: codes 00xxh say that an error has gone.
+        kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
+        description = EmcyError(code, register, bytes(data[3:]), 0.0).get_desc() or "unnamed"
+        text = f"EMCY {code:04X}h {description}, error register {register:02X}h, data {data[3:].hex()}"
+        self._events.append((node_id, kind, code, text))
+
+    def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
+        """Events since the last call, in their order; of nodes that are no axes of ours, with axis None."""
+        if not self._events:
+            return ()
+        taken, self._events = self._events, deque()
+        return tuple(
+            CellEvent(time_ns, node_ids.index(node) if node in node_ids else None, kind, code, f"node {node}: {text}")
+            for node, kind, code, text in taken
+        )
+
+    @property
+    def has_events(self) -> bool:
+        """Whether take_events would return something."""
+        return bool(self._events)
+
+    def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
+        """Access to the object dictionary of a node, with the link's policy or another."""
+        policy = policy or self.policy
+        if (node_id, policy) not in self._access:
+            client = PumpedSdoClient(node_id, self.send, self.pump, self.clock, policy)
+            self._clients.setdefault(node_id, []).append(client)
+            self._access[node_id, policy] = ObjectAccess(node_id, client, policy)
+        return self._access[node_id, policy]
+
+    def command_nmt(self, node_id: int, command: NmtCommand) -> int:
+        """Send an NMT command; node 0 means all. Returns when, by the clock [ns]."""
+        now = self.clock()
+        self.send((can.Message(arbitration_id=0, is_extended_id=False, data=bytes((command, node_id))),))
+        return now
+
+    def confirm_nmt(self, node_id: int, state: NmtState, since_ns: int, within_s: float) -> None:
+        """Wait for a heartbeat with this state that was read after ``since_ns``, by the clock.
+
+        Raises:
+            NmtRefused: none came in time; canopen would have believed the command.
+        """
+        deadline = self.clock() + round(within_s * 1e9)
+        while self.heard_ns.get(node_id, since_ns - 1) < since_ns or self.nmt[node_id] != state:
+            left_ns = deadline - self.clock()
+            if left_ns <= 0:
+                found = self.nmt.get(node_id) if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+                raise NmtRefused(node_id, str(state), nmt_name(found), within_s)
+            self.pump(left_ns * 1e-9)

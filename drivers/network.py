@@ -1,0 +1,342 @@
+"""The amplifiers of one cell on one bus: found, checked, set up for recording and moving, given back as they were."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from types import TracebackType
+from typing import Self
+
+import can
+
+from drivers.axis import Axis, Identity
+from drivers.bus import BusAddress, open_bus
+from drivers.errors import DriverError, IdentityMismatch, MappingRefused, StateRefused
+from drivers.link import SYNC_COB_ID, Link, NmtCommand, NmtState
+from drivers.mapping import (
+    CONTROLWORD,
+    NOT_VALID,
+    PDOS,
+    SETPOINT_PDOS,
+    STATUSWORD,
+    Direction,
+    PdoRecord,
+    feedback_entries,
+    pack,
+    read_record,
+    records,
+    restore,
+    switch_off,
+    write_record,
+)
+from drivers.profile import ObjectEntry
+from drivers.scan import FoundNode, read_identity, require, scan
+from drivers.sdo import Clock, SdoPolicy
+from drivers.state import FAULT_RESET_SEQUENCE, Goal, State, decode, next_command
+
+HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
+MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
+MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
+PROFILE_POSITION_MODE = 1
+_POWERLESS_STATES = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.UNKNOWN)
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """How long the cell may take [s].
+
+    Attributes:
+        answer_s: until every node answered the search.
+        nmt_s: until a heartbeat confirms an NMT state.
+        mode_s: until 6061h shows the mode asked for.
+        disable_s: until an axis is without power when the network closes.
+    """
+
+    answer_s: float = 1.0
+    nmt_s: float = 2.0
+    mode_s: float = 1.0
+    disable_s: float = 2.0
+
+
+DEFAULT_BOUNDS = Bounds()
+DEFAULT_POLICY = SdoPolicy()
+
+
+@dataclass
+class _Original:
+    """What a drive had before we came; filled step by step, so that a half-done set-up can be undone."""
+
+    heartbeat_ms: int | None = None
+    mode: int | None = None
+    pdos: dict[str, PdoRecord] = field(default_factory=dict)
+
+
+class CanopenNetwork:
+    """The axes of a cell. Use as a context manager; leaving it disables all axes and restores all settings.
+
+    Args:
+        address: of the bus.
+        axes: the amplifiers, in the order of the samples' columns.
+        heartbeat_ms: what every node is told to send.
+        bounds, policy: how long to wait.
+        clock: monotonic time [ns].
+        opener: makes the bus of an address.
+    """
+
+    def __init__(
+        self,
+        address: BusAddress,
+        axes: tuple[Axis, ...],
+        *,
+        heartbeat_ms: int = 100,
+        bounds: Bounds = DEFAULT_BOUNDS,
+        policy: SdoPolicy = DEFAULT_POLICY,
+        clock: Clock = time.monotonic_ns,
+        opener: Callable[[BusAddress], can.BusABC] = open_bus,
+    ) -> None:
+        self.axes = axes
+        self.heartbeat_ms = heartbeat_ms
+        self.bounds = bounds
+        self.link = Link(address, policy, clock, opener)
+        self.node_ids = tuple(axis.node_id for axis in axes)
+        self._originals: dict[int, _Original] = {}
+        self._readback: dict[str, object] = {}
+
+    def __enter__(self) -> Self:
+        self.link.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            problems = self._give_back() if self._originals else []
+        finally:
+            self.link.close()
+        if error is not None:
+            for problem in problems:
+                error.add_note(f"while closing the network: {problem}")
+        elif problems:
+            for problem in problems[1:]:
+                problems[0].add_note(str(problem))
+            raise problems[0]
+
+    def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
+        """Who is on the bus; changes nothing.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        return scan(self.link, node_ids, wait_s)
+
+    def check_identities(self) -> tuple[Identity, ...]:
+        """Compare 1018h of every axis with its configuration.
+
+        Raises:
+            NodeMissing: a node does not answer.
+            IdentityMismatch: another amplifier than the configured one.
+            ObjectAccessError: a node does not tell who it is.
+        """
+        require(self.link, self.node_ids, self.bounds.answer_s)
+        return tuple(self._check_identity(axis) for axis in self.axes)
+
+    def _check_identity(self, axis: Axis) -> Identity:
+        found = read_identity(self.link.objects(axis.node_id))
+        expected = axis.identity
+        if expected is None:
+            return found
+        pairs = [
+            ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
+            ("product code 1018h:02", expected.product_code, found.product_code),
+        ]
+        if expected.serial is not None:
+            pairs.append(("serial number 1018h:04", expected.serial, found.serial or 0))
+        for name, want, have in pairs:
+            if want != have:
+                raise IdentityMismatch(axis.node_id, name, want, have)
+        return found
+
+    def prepare(self) -> None:
+        """Set every node up: identity, heartbeat, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
+
+        No axis gets power. The objects' values from before are written back when the network is left.
+
+        Raises:
+            NodeMissing, IdentityMismatch, NmtRefused, MappingRefused, ObjectAccessError, StateRefused, BusError: see
+                drivers/errors.py; what was changed until then is restored on leaving the network.
+        """
+        identities = self.check_identities()
+        for axis in self.axes:
+            original = self._originals.setdefault(axis.node_id, _Original())
+            access = self.link.objects(axis.node_id)
+            if original.heartbeat_ms is None:
+                original.heartbeat_ms = access.read(HEARTBEAT_TIME)
+            access.write(HEARTBEAT_TIME, self.heartbeat_ms)
+        self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
+        for axis, identity in zip(self.axes, identities, strict=True):
+            self.disable(axis)
+            mapped = self._map(axis)
+            self._set_mode(axis)
+            self._readback[axis.name] = self._describe(axis, identity, mapped)
+        self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+
+    def _command_all(self, command: NmtCommand, state: NmtState) -> None:
+        """To each node of ours, not to all of the bus: there may be others on it."""
+        since = {node_id: self.link.command_nmt(node_id, command) for node_id in self.node_ids}
+        for node_id, since_ns in since.items():
+            self.link.confirm_nmt(node_id, state, since_ns, self.bounds.nmt_s)
+
+    def _map(self, axis: Axis) -> tuple[PdoRecord, ...]:
+        node_id = axis.node_id
+        access = self.link.objects(node_id)
+        original = self._originals[node_id]
+        try:
+            feedback = pack(feedback_entries(axis))
+        except ValueError as error:
+            raise MappingRefused(node_id, "TPDO", f"profile {axis.profile.name}: {error}") from error
+        wanted = {
+            Direction.TPDO: records(Direction.TPDO, node_id, feedback),
+            Direction.RPDO: records(Direction.RPDO, node_id, SETPOINT_PDOS),
+        }
+        for direction, pdos in wanted.items():
+            for number in range(PDOS):
+                found = read_record(access, direction, number)
+                if number < len(pdos) and found is None:
+                    raise MappingRefused(node_id, pdos[number].name, "the drive has no such PDO")
+                if found is None:
+                    continue
+                if number < len(pdos):
+                    original.pdos.setdefault(found.name, found)
+                    write_record(access, pdos[number])
+                elif not found.cob_id & NOT_VALID:
+                    original.pdos.setdefault(found.name, found)
+                    switch_off(access, found)  # a drive's default PDOs would come between ours
+        return wanted[Direction.TPDO] + wanted[Direction.RPDO]
+
+    def _set_mode(self, axis: Axis) -> None:
+        access = self.link.objects(axis.node_id)
+        original = self._originals[axis.node_id]
+        if original.mode is None:
+            original.mode = access.read(MODE_OF_OPERATION)
+        access.write(MODE_OF_OPERATION, PROFILE_POSITION_MODE)
+        deadline = self.link.clock() + round(self.bounds.mode_s * 1e9)
+        while (shown := access.read(MODE_DISPLAY)) != PROFILE_POSITION_MODE:
+            if self.link.clock() >= deadline:
+                found = f"mode {shown} in 6061h"
+                raise StateRefused(axis.node_id, "profile position mode (1)", found, access.read(STATUSWORD))
+            self._let_time_pass()
+
+    def ampere_per_unit(self) -> tuple[float, ...]:
+        """Ampere per raw unit of each axis' current object, from the drives' own scale objects.
+
+        Raises:
+            ObjectAccessError: a scale object cannot be read.
+        """
+        return tuple(
+            axis.profile.current_scale.factor * math.prod(map(access.read, axis.profile.current_scale.objects))
+            for axis, access in ((axis, self.link.objects(axis.node_id)) for axis in self.axes)
+        )
+
+    def readback(self) -> dict[str, object]:
+        """What the drives said about themselves during ``prepare``, by axis name, for the log."""
+        return dict(self._readback)
+
+    def _describe(self, axis: Axis, identity: Identity, mapped: tuple[PdoRecord, ...]) -> dict[str, object]:
+        access = self.link.objects(axis.node_id)
+        scale = axis.profile.current_scale
+        values = {str(entry): access.read(entry) for entry in scale.objects}
+        return {
+            "node_id": axis.node_id,
+            "vendor_id": identity.vendor_id,
+            "product_code": identity.product_code,
+            "serial": identity.serial,
+            "profile": axis.profile.name,
+            "scale_objects": values,
+            "ampere_per_unit": scale.factor * math.prod(values.values()),
+            "mode_before": self._originals[axis.node_id].mode,
+            "mapping": [str(record) for record in mapped],
+            "mapping_before": [str(record) for record in self._originals[axis.node_id].pdos.values()],
+        }
+
+    def statuswords(self) -> tuple[int, ...]:
+        """6041h of every axis, by SDO.
+
+        Raises:
+            ObjectAccessError: an axis does not answer.
+        """
+        return tuple(self.link.objects(node_id).read(STATUSWORD) for node_id in self.node_ids)
+
+    def reset_faults(self) -> None:
+        """Reset the faults of all axes that have one; a person's decision, never taken by a recording itself.
+
+        Raises:
+            StateRefused: an axis is still in fault.
+        """
+        for axis in self.axes:
+            access = self.link.objects(axis.node_id)
+            if decode(access.read(STATUSWORD)) is not State.FAULT:
+                continue
+            for command in FAULT_RESET_SEQUENCE:
+                access.write(CONTROLWORD, command)
+                self._let_time_pass()
+            statusword = access.read(STATUSWORD)
+            if decode(statusword) is State.FAULT:
+                raise StateRefused(axis.node_id, "fault reset", str(State.FAULT), statusword)
+
+    def disable(self, axis: Axis) -> None:
+        """Quick stop one axis by SDO, then take its power, and confirm both by its statusword.
+
+        Raises:
+            StateRefused: it did not get there in ``bounds.disable_s``.
+            ObjectAccessError: it does not answer.
+        """
+        access = self.link.objects(axis.node_id)
+        deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
+        goal = Goal.QUICK_STOP
+        while decode(statusword := access.read(STATUSWORD)) not in _POWERLESS_STATES:
+            state = decode(statusword)
+            if self.link.clock() >= deadline:
+                if goal is Goal.SWITCH_ON_DISABLED:
+                    raise StateRefused(axis.node_id, str(State.SWITCH_ON_DISABLED), str(state), statusword)
+                # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE until told (605Ah = 5..8).
+                goal, deadline = Goal.SWITCH_ON_DISABLED, deadline + round(self.bounds.disable_s * 1e9)
+            access.write(CONTROLWORD, next_command(state, goal))
+            self._let_time_pass()
+
+    def _let_time_pass(self) -> None:
+        """One SYNC: a cell that lives in lockstep advances by SYNC alone, and a real one is not disturbed by it."""
+        self.link.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
+        self.link.wait(0.001)
+
+    def _give_back(self) -> list[DriverError]:
+        """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever the one before did."""
+        problems: list[DriverError] = []
+        axes = [axis for axis in self.axes if axis.node_id in self._originals]
+        since_ns = self.link.clock()
+        steps: list[Callable[[], object]] = [partial(self.disable, axis) for axis in axes]
+        steps += [partial(self.link.command_nmt, axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL) for axis in axes]
+        for axis in axes:
+            confirm = partial(
+                self.link.confirm_nmt, axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, self.bounds.nmt_s
+            )
+            steps += [confirm, *self._restoring(axis)]
+        for step in steps:
+            try:
+                step()
+            except DriverError as problem:
+                problems.append(problem)
+        self._originals.clear()
+        return problems
+
+    def _restoring(self, axis: Axis) -> Iterator[Callable[[], object]]:
+        access = self.link.objects(axis.node_id)
+        original = self._originals[axis.node_id]
+        for record in original.pdos.values():
+            yield partial(restore, access, record)
+        if original.mode is not None:
+            yield partial(access.write, MODE_OF_OPERATION, original.mode)
+        if original.heartbeat_ms is not None:
+            yield partial(access.write, HEARTBEAT_TIME, original.heartbeat_ms)

@@ -1,0 +1,190 @@
+"""A whole simulated cell on a CAN bus: n nodes and one plant that advance in lockstep with SYNC."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import can
+import numpy as np
+
+from drivers.simulated.amplifier import AmplifierSet
+from drivers.simulated.effects import build_effect
+from drivers.simulated.effects.lag import Lag
+from drivers.simulated.errors import SpecInvalid
+from drivers.simulated.node import Node
+from drivers.simulated.plant import Plant
+from drivers.simulated.readings import Readings, take
+from drivers.simulated.spec import CellSpec
+from drivers.simulated.tuning import tuned
+
+SYNC_ID = 0x080
+NMT_ID = 0x000
+
+IDLE_S = 0.02
+"""Longest sleep while no frame comes; heartbeats by wall time are as punctual as this."""
+
+
+class SimulatedCell:
+    """A cell that answers on a bus until it is closed.
+
+    Each SYNC (COB-ID 80h) moves the plant by one sync period and is answered with the transmit PDOs, so that a run
+    takes as long as its computing takes, and equal frames give equal answers. SDO, NMT and heartbeats need no SYNC.
+
+    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread. What is
+    mounted is part of the description: for another payload make another cell.
+
+    Attributes:
+        plant: its mechanics (read it when the cell is closed, or between answers).
+        nodes: in the order of the axes.
+        cycles: SYNCs since power-on.
+    """
+
+    def __init__(self, spec: CellSpec, bus: can.BusABC, clock: Callable[[], float] = time.monotonic) -> None:
+        """Build the cell; it is powered on when it begins to serve.
+
+        Args:
+            spec: the truth of the cell.
+            bus: any python-can bus that does not receive its own messages; it stays the caller's to shut down.
+            clock: seconds, for heartbeats while no SYNC comes.
+
+        Raises:
+            SpecInvalid, EffectUnknown: the description is wrong.
+        """
+        ids = [axis.node_id for axis in spec.axes]
+        if len(set(ids)) < len(ids) or not all(1 <= node_id <= 127 for node_id in ids):
+            raise SpecInvalid(f"node ids must differ and lie in 1 to 127, found {ids}")
+        if spec.sync_period_us < 1 or spec.substeps < 1:
+            raise SpecInvalid(
+                f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be at least 1"
+            )
+        _compile(spec)
+        self.plant = Plant(spec)
+        self.cycles = 0
+        lags = tuple(e for e in (build_effect(effect, len(ids)) for effect in spec.effects) if isinstance(e, Lag))
+        self._amplifiers = AmplifierSet(spec, tuned(spec, self.plant), lags)
+        self._amplifiers.prime(self.plant.motor_rad)
+        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
+        self._readings = take(self._amplifiers, self._rated_a)
+        self._enabled = np.zeros(len(ids), dtype=np.int64)
+        self._substeps, self._period_us = spec.substeps, spec.sync_period_us
+        self._bus, self._clock = bus, clock
+        self.nodes = tuple(
+            Node(index, axis, self._amplifiers, self._current_readings, self._send)
+            for index, axis in enumerate(spec.axes)
+        )
+        self._by_id = {node.node_id: node for node in self.nodes}
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
+
+    def __enter__(self) -> SimulatedCell:
+        self._thread = threading.Thread(target=self._serve_and_keep, name="simulated cell", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        # Where both sides failed, the caller's error is most often only that the cell fell silent.
+        if self._failure is not None:
+            raise self._failure from error
+
+    def check(self) -> None:
+        """Raise what ended the cell's thread, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def stop(self) -> None:
+        """Let ``serve_forever`` return; may be called from any thread."""
+        self._stopping.set()
+
+    def serve_forever(self) -> None:
+        """Power on and answer until ``stop`` is called.
+
+        Raises:
+            can.CanError: the bus has gone.
+            FrictionUnsolved: the plant could not be advanced.
+        """
+        wall_s = self._clock()
+        for node in self.nodes:
+            node.boot(wall_s)
+        while not self._stopping.is_set():
+            message = self._bus.recv(IDLE_S)
+            if message is not None and not (
+                message.is_error_frame or message.is_remote_frame or message.is_extended_id
+            ):
+                self._receive(message.arbitration_id, bytes(message.data))
+            wall_s, now_us = self._clock(), self.time_us
+            for node in self.nodes:
+                node.beat(now_us, wall_s)
+
+    @property
+    def time_us(self) -> int:
+        """Plant time since power-on [us]."""
+        return self.cycles * self._period_us
+
+    def _serve_and_keep(self) -> None:
+        try:
+            self.serve_forever()
+        except Exception as error:  # noqa: BLE001 - kept whole and raised again in the thread that owns the cell
+            self._failure = error
+
+    def _receive(self, can_id: int, data: bytes) -> None:
+        if can_id == SYNC_ID:
+            self._advance()
+        elif can_id == NMT_ID:
+            if len(data) >= 2:
+                for node in self.nodes:
+                    if data[1] in (0, node.node_id):
+                        node.command_nmt(data[0], self._clock())
+        elif 0x600 < can_id < 0x680:
+            node_asked = self._by_id.get(can_id - 0x600)
+            if node_asked is not None:
+                node_asked.request(data)
+        else:
+            for node in self.nodes:
+                node.receive_pdo(can_id, data)
+
+    def _advance(self) -> None:
+        plant, amplifiers = self.plant, self._amplifiers
+        for node in self.nodes:
+            node.begin_cycle()
+        loops = amplifiers.loops
+        loops["limited"] = 0
+        if not np.array_equal(loops["enabled"], self._enabled):
+            self._enabled = loops["enabled"].copy()
+            plant.set_brakes(self._enabled == 0)
+        current_a = loops["current_a"]
+        for _ in range(self._substeps):
+            plant.step(current_a)
+            # The loops read the position at the end of the step: a reported current belongs to its reported position.
+            amplifiers.control(plant.motor_rad)
+        self.cycles += 1
+        amplifiers.report()
+        self._readings = take(amplifiers, self._rated_a)
+        now_us = self.time_us
+        for node in self.nodes:
+            node.end_cycle()
+        for node in self.nodes:
+            node.send_sync(now_us)
+
+    def _current_readings(self) -> Readings:
+        return self._readings
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+
+def _compile(spec: CellSpec) -> None:
+    """Let numba compile on a cell that is thrown away: the first SYNC must not wait for it."""
+    plant = Plant(spec)
+    amplifiers = AmplifierSet(spec, tuned(spec, plant), ())
+    plant.step(np.zeros(len(spec.axes)))
+    amplifiers.control(plant.motor_rad)

@@ -1,0 +1,128 @@
+"""A client of the socketcand protocol that notices when its server has gone, and handles frames in bursts.
+
+Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode). Frames to the bus are
+``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of three hexadecimal
+digits is a base one, of eight an extended one. The protocol has neither remote frames nor CAN FD.
+"""
+
+from __future__ import annotations
+
+import re
+import select
+import socket
+from collections import deque
+from collections.abc import Sequence
+
+import can
+
+CONNECT_TIMEOUT_S = 5.0
+_RECEIVE_BYTES = 1 << 16
+_FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]+) ([0-9]+\.?[0-9]*) ([0-9A-Fa-f]*)|([^>]*)) >")
+
+
+def send_line(message: can.Message) -> bytes:
+    """One frame as the protocol's ``send`` command."""
+    if message.is_remote_frame or message.is_fd or message.is_error_frame:
+        raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")
+    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    return f"< send {identifier} {message.dlc:X} {message.data.hex(' ')} >".encode("ascii")
+
+
+class SocketcandBus(can.BusABC):
+    """One end of a bus that a socketcand server keeps.
+
+    Raises:
+        can.CanInitializationError: the server refused the channel.
+        OSError: nobody listens there.
+    """
+
+    def __init__(self, channel: str, host: str, port: int) -> None:
+        self.channel_info = f"socketcand {channel}@{host}:{port}"
+        self._channel = channel
+        self._received: deque[can.Message] = deque()
+        self._buffer = b""
+        self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._expect("hi")
+            self._socket.sendall(f"< open {channel} >".encode("ascii"))
+            self._expect("ok")
+            self._socket.sendall(b"< rawmode >")
+            self._expect("ok")
+            self._socket.settimeout(None)
+            self._parse(self._buffer)
+        except BaseException:
+            self._socket.close()
+            raise
+        super().__init__(channel=channel)
+
+    def _expect(self, word: str) -> None:
+        # Only up to the first '>': behind the last answer frames of the bus may follow at once.
+        while b">" not in self._buffer:
+            chunk = self._socket.recv(_RECEIVE_BYTES)
+            if not chunk:
+                raise can.CanInitializationError(f"{self.channel_info}: closed during the handshake")
+            self._buffer += chunk
+        answer, _, self._buffer = self._buffer.partition(b">")
+        found = answer.strip(b"< ").decode("ascii", "replace")
+        if found != word:
+            raise can.CanInitializationError(f"{self.channel_info}: expected '{word}', the server said '{found}'")
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.send_burst((msg,))
+
+    def send_burst(self, messages: Sequence[can.Message]) -> None:
+        """Send frames in one system call."""
+        try:
+            self._socket.sendall(b"".join(map(send_line, messages)))
+        except OSError as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._received:
+            return self._received.popleft(), False
+        try:
+            if not select.select((self._socket,), (), (), timeout)[0]:
+                return None, False
+            chunk = self._socket.recv(_RECEIVE_BYTES)
+        except (OSError, ValueError) as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+        if not chunk:
+            raise can.CanOperationError(f"{self.channel_info}: the server closed the connection")
+        self._parse(self._buffer + chunk)
+        return (self._received.popleft() if self._received else None), False
+
+    def _parse(self, buffer: bytes) -> None:
+        end = 0
+        for match in _FRAME.finditer(buffer):
+            end = match.end()
+            identifier, seconds, data, other = match.groups()
+            if other is not None:
+                if other.startswith(b"error"):
+                    raise can.CanOperationError(f"{self.channel_info}: {other.decode('ascii', 'replace')}")
+                continue
+            if len(data) % 2:
+                raise can.CanOperationError(f"{self.channel_info}: half a byte in {match.group().decode('ascii')}")
+            self._received.append(
+                can.Message(
+                    timestamp=float(seconds),
+                    arbitration_id=int(identifier, 16),
+                    is_extended_id=len(identifier) != 3,
+                    data=bytearray.fromhex(data.decode("ascii")),
+                    channel=self._channel,
+                )
+            )
+        self._buffer = buffer[end:]
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._socket.close()

@@ -1,0 +1,107 @@
+"""The CiA 402 state machine, pure: what a statusword says, and which controlword leads where.
+
+Source: CiA 402-2 (IEC 61800-7-201), finite state automaton of the power drive system, objects 6040h and 6041h.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum
+
+STATUS_FAULT = 1 << 3
+STATUS_TARGET_REACHED = 1 << 10
+STATUS_INTERNAL_LIMIT = 1 << 11
+STATUS_SETPOINT_ACKNOWLEDGE = 1 << 12  # profile position mode
+STATUS_FOLLOWING_ERROR = 1 << 13  # profile position mode
+
+CONTROL_NEW_SETPOINT = 1 << 4  # profile position mode; acts on its rising edge
+CONTROL_CHANGE_IMMEDIATELY = 1 << 5
+
+
+class State(Enum):
+    """State of one drive; the value is (mask, pattern) of the statusword."""
+
+    NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
+    SWITCH_ON_DISABLED = (0x4F, 0x40)
+    READY_TO_SWITCH_ON = (0x6F, 0x21)
+    SWITCHED_ON = (0x6F, 0x23)
+    OPERATION_ENABLED = (0x6F, 0x27)
+    QUICK_STOP_ACTIVE = (0x6F, 0x07)
+    FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
+    FAULT = (0x4F, 0x08)
+    UNKNOWN = (0x00, 0xFF)
+    """A pattern that the standard does not name; no statusword matches this mask."""
+
+    def __str__(self) -> str:
+        return self.name.replace("_", " ")
+
+
+STATE_BITS = 0x6F
+"""The bits of the statusword that tell the state."""
+
+
+def _match(statusword: int) -> State:
+    for state in State:
+        mask, pattern = state.value
+        if statusword & mask == pattern:
+            return state
+    return State.UNKNOWN
+
+
+_STATES = tuple(_match(bits) for bits in range(STATE_BITS + 1))  # six decodes a SYNC: a table, not a search
+
+
+def decode(statusword: int) -> State:
+    """State that a statusword (6041h) stands for."""
+    return _STATES[statusword & STATE_BITS]
+
+
+class Command(IntEnum):
+    """Bits 0–3 and 7 of the controlword (6040h)."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    DISABLE_OPERATION = 0x07  # the same word: what it does depends on the state (transitions 3 and 5)
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
+
+class Goal(Enum):
+    """Where a drive is to be led."""
+
+    OPERATION_ENABLED = "operation enabled"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    QUICK_STOP = "quick stop"
+
+
+_ENABLING = {
+    State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
+    State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
+    State.SWITCHED_ON: Command.ENABLE_OPERATION,
+    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
+}
+_DISABLING = {
+    # One step at a time: voltage is taken only after the drive has stopped and its brake could close.
+    State.OPERATION_ENABLED: Command.DISABLE_OPERATION,
+    State.SWITCHED_ON: Command.SHUTDOWN,
+}
+_STOPPING = {
+    State.OPERATION_ENABLED: Command.QUICK_STOP,
+    State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
+}
+_WAYS = {Goal.OPERATION_ENABLED: _ENABLING, Goal.SWITCH_ON_DISABLED: _DISABLING, Goal.QUICK_STOP: _STOPPING}
+
+
+def next_command(state: State, goal: Goal) -> Command:
+    """The next command on the way from a state to a goal.
+
+    From FAULT, and from every state that has no way, it is DISABLE VOLTAGE: a fault is left by ``FAULT_RESET_SEQUENCE``
+    alone, so nothing re-enables an axis by itself. It is also a harmless first controlword for the drives that show
+    statusword 0000h until they got one.
+    """
+    return _WAYS[goal].get(state, Command.DISABLE_VOLTAGE)
+
+
+FAULT_RESET_SEQUENCE = (Command.DISABLE_VOLTAGE, Command.FAULT_RESET, Command.DISABLE_VOLTAGE)
+"""Bit 7 acts on its rising edge; the sequence ends in SWITCH ON DISABLED, never in OPERATION ENABLED."""

@@ -1,0 +1,277 @@
+"""The SYNC-grouped stream: one SYNC out, the answers of all axes back, one Sample.
+
+The stream is the only reader of the bus while it runs. A TPDO carries no cycle number, so an answer that comes after
+the next SYNC can be told from that SYNC's own answer only by waiting for both: after a missing frame the stream does
+that, for one cycle, before it believes that the frame was lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from struct import Struct
+
+import can
+
+from drivers.bus import bus_errors
+from drivers.errors import SampleLost
+from drivers.event import CellEvent, EventKind, EventSink, discard
+from drivers.link import SYNC_COB_ID
+from drivers.mapping import Direction, feedback_entries, layout, pack, records
+from drivers.network import CanopenNetwork
+from drivers.pacing import LockstepSync, Pacing
+from drivers.sample import Sample
+from drivers.watch import Watch
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatistics:
+    """What has become of the frames so far; a run is sound when all but the first two are zero.
+
+    Attributes:
+        cycles: SYNCs sent.
+        frames: answers used.
+        missing: answers that did not come in their cycle.
+        late: answers that came in a later cycle, where that could be known.
+        duplicate: second answers of an axis to one SYNC.
+        surplus: PDOs that no axis of the cell was told to send, or that came before the first SYNC.
+        wrong_length: answers that are not as long as the mapping says; they count as missing too.
+        skipped_periods: periods without a SYNC because the schedule slipped.
+    """
+
+    cycles: int = 0
+    frames: int = 0
+    missing: int = 0
+    late: int = 0
+    duplicate: int = 0
+    surplus: int = 0
+    wrong_length: int = 0
+    skipped_periods: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Slot:
+    """Where the values of one TPDO go."""
+
+    axis: int
+    bit: int
+    length: int
+    layout: Struct
+    columns: tuple[int, ...]
+
+
+def _slots(network: CanopenNetwork) -> dict[int, _Slot]:
+    """The slot of each COB-ID; column = field × axes + axis, with fields position, current, statusword."""
+    slots: dict[int, _Slot] = {}
+    axes = len(network.axes)
+    for number, axis in enumerate(network.axes):
+        entries = feedback_entries(axis)
+        pdos = pack(entries)
+        for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True):
+            form = layout(pdo)
+            columns = tuple(entries.index(entry) * axes + number for entry in pdo)
+            slots[record.cob_id] = _Slot(number, 1 << len(slots), form.size, form, columns)
+    return slots
+
+
+class SyncStream:
+    """An iterator of Samples that never ends by itself; ``next`` raises what must stop a recording.
+
+    Args:
+        network: a prepared network; nobody else may read its bus while the stream is used.
+        pacing: when a SYNC goes out.
+        on_event: gets EMCY, NMT and CiA 402 changes and losses, before the sample of their cycle is returned.
+        max_missing_cycles: so many incomplete cycles in a row are tolerated, counted and marked in their samples.
+
+    Raises (by ``next``):
+        SampleLost: more incomplete cycles in a row than tolerated.
+        DriveFault: an EMCY, a new fault or following error, or a node that left OPERATIONAL.
+        HeartbeatLost: a node is silent for more than two of its periods.
+        BusError: the bus has gone.
+    """
+
+    def __init__(
+        self,
+        network: CanopenNetwork,
+        pacing: Pacing,
+        on_event: EventSink = discard,
+        max_missing_cycles: int = 3,
+    ) -> None:
+        self.network = network
+        self.pacing = pacing
+        self.max_missing_cycles = max_missing_cycles
+        self._link = network.link
+        self._on_event = on_event
+        self._slots = _slots(network)
+        self._axes = len(network.axes)
+        self._all = (1 << len(self._slots)) - 1
+        self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
+        self._outgoing: list[can.Message] = []
+        self._values = [0] * (3 * self._axes)
+        self._seen = 0
+        self._debt = 0
+        self._last_data: dict[int, bytearray] = {}
+        self._incomplete_cycles = 0
+        self._next_sync_ns = 0
+        self._time_ns = 0
+        self._watch = Watch(network, on_event)
+        self._cycles = self._frames = self._missing = self._late = 0
+        self._duplicate = self._surplus = self._wrong_length = self._skipped = 0
+
+    @property
+    def statistics(self) -> StreamStatistics:
+        """Counts up to now."""
+        return StreamStatistics(
+            self._cycles,
+            self._frames,
+            self._missing,
+            self._late,
+            self._duplicate,
+            self._surplus,
+            self._wrong_length,
+            self._skipped,
+        )
+
+    @property
+    def time_ns(self) -> int:
+        """Time of the last SYNC [ns]."""
+        return self._time_ns
+
+    def emit(self, event: CellEvent) -> None:
+        """Put an event of the caller's into the order of the stream's."""
+        self._on_event(event)
+
+    def send(self, messages: Sequence[can.Message]) -> None:
+        """Send frames right before the next SYNC, on which synchronous RPDOs act."""
+        self._outgoing.extend(messages)
+
+    def __iter__(self) -> Iterator[Sample]:
+        return self
+
+    def __next__(self) -> Sample:
+        self.check()
+        return self.advance()
+
+    def check(self) -> None:
+        """Raise the oldest fault that was seen and not raised yet."""
+        if self._watch.faults:
+            raise self._watch.faults.popleft()
+
+    def advance(self) -> Sample:
+        """One cycle whatever the drives' condition is, as stopping them needs; faults wait for the next ``next``.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        with bus_errors(self._link.address):
+            deadline_ns = self._send_sync()
+            self._collect(deadline_ns)
+        return self._finish_cycle()
+
+    def _send_sync(self) -> int:
+        """Send what waits and the SYNC; returns until when its answers may come, by the clock."""
+        pacing, bus = self.pacing, self._link.bus
+        while (message := bus.recv(0.0)) is not None:
+            self._between_cycles(message)
+        now = pacing.clock()
+        if self._cycles == 0:
+            self._next_sync_ns = now
+        if isinstance(pacing, LockstepSync):
+            self._time_ns = pacing.start_ns + self._cycles * pacing.period_ns
+            deadline_ns = now + round(pacing.timeout_s * 1e9)
+        else:
+            while (left_ns := self._next_sync_ns - now) > 0:
+                message = bus.recv(left_ns * 1e-9)
+                if message is not None:
+                    self._between_cycles(message)
+                now = pacing.clock()
+            slipped = (now - self._next_sync_ns) // pacing.period_ns
+            self._skipped += slipped
+            self._time_ns = now
+            deadline_ns = self._next_sync_ns = self._next_sync_ns + (slipped + 1) * pacing.period_ns
+        outgoing, self._outgoing = self._outgoing, []
+        self._link.send((*outgoing, self._sync))
+        self._cycles += 1
+        return deadline_ns
+
+    def _collect(self, deadline_ns: int) -> None:
+        """Receive until all answers are there, or the deadline."""
+        recv, clock, slots, values = self._link.bus.recv, self.pacing.clock, self._slots, self._values
+        last_data = self._last_data
+        debt, seen, everything = self._debt, 0, self._all
+        while seen != everything or debt:
+            left_ns = deadline_ns - clock()
+            if left_ns <= 0:
+                break
+            message = recv(left_ns * 1e-9)
+            if message is None:
+                continue
+            identifier = message.arbitration_id
+            slot = slots.get(identifier)
+            if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+                self._other(message)
+                continue
+            data = message.data
+            if len(data) != slot.length:
+                self._wrong_length += 1
+                continue
+            if seen & slot.bit:
+                if debt & slot.bit:
+                    # The first one was the late answer to an earlier SYNC, this one is ours.
+                    debt &= ~slot.bit
+                    self._late += 1
+                else:
+                    self._duplicate += 1
+                    if last_data.get(identifier) == data:
+                        continue
+                    # The second answer differs: the first may have been a repetition of the cycle before.
+            seen |= slot.bit
+            last_data[identifier] = data
+            for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
+                values[column] = value
+        self._seen = seen
+        # One answer and a debt at the end: the owed frame was lost for good, and the answer is this cycle's.
+        self._debt = everything & ~seen
+
+    def _between_cycles(self, message: can.Message) -> None:
+        """A frame that is read before the next SYNC, and so answers none that is still open."""
+        slot = self._slots.get(message.arbitration_id)
+        if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+            self._other(message)
+        elif self._cycles == 0:
+            self._surplus += 1
+        elif self._debt & slot.bit:
+            self._debt &= ~slot.bit
+            self._late += 1
+        else:
+            self._duplicate += 1
+
+    def _other(self, message: can.Message) -> None:
+        if not self._link.dispatch(message) and 0x180 <= message.arbitration_id < 0x580:
+            self._surplus += 1
+
+    def _finish_cycle(self) -> Sample:
+        axes, values = self._axes, self._values
+        cycle = self._cycles - 1
+        missing = 0
+        if self._seen != self._all:
+            for slot in self._slots.values():
+                if not self._seen & slot.bit:
+                    missing |= 1 << slot.axis
+                    self._missing += 1
+            self._note_missing(cycle, missing)
+        else:
+            self._incomplete_cycles = 0
+        self._frames += self._seen.bit_count()
+        statuswords = tuple(values[2 * axes :])
+        self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords)
+        return Sample(cycle, self._time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
+
+    def _note_missing(self, cycle: int, missing: int) -> None:
+        silent = tuple(axis for axis in range(self._axes) if missing >> axis & 1)
+        self._incomplete_cycles += 1
+        for axis in silent:
+            text = f"no complete answer of {self.network.axes[axis].name} to cycle {cycle}"
+            self._on_event(CellEvent(self._time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
+        if self._incomplete_cycles > self.max_missing_cycles:
+            self._watch.faults.append(SampleLost(cycle, silent))

@@ -1,0 +1,168 @@
+"""From a calibration to torques and currents: the identified model at work, without the rows that it was fitted on."""
+
+from __future__ import annotations
+
+from dataclasses import is_dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.calibration import AcceptedEffect, Calibration
+from ident.dataset import Dataset
+from ident.effects import EFFECTS
+from ident.effects.effect import Effect, at_joints
+from ident.errors import DataUnfit, EffectRefused, ModelError
+from ident.identify import PlacedEffect
+from ident.model import Model
+from ident.payload import PAYLOAD_PARAMETERS, Payload
+from ident.signals import declared_signals, inertia
+
+FloatArray = NDArray[np.float64]
+
+
+def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
+    """W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) with the effects: what the joints need for a motion.
+
+    Args:
+        calibration: parameters, effects and gains.
+        model: the declared model of the same robot.
+        data: the motion, and what is mounted.
+
+    Returns:
+        joint torque [Nm; N for a prismatic joint] at full rate, shape (n, k).
+
+    Raises:
+        ModelError: the calibration speaks of another robot.
+        DataUnfit: it does not know the run's way of mounting the payload.
+        EffectRefused: it holds an effect that does not exist.
+    """
+    gains = _gains(calibration, model)
+    standard = standard_parameters(calibration, model)
+    standard[model.flange] += _payload(calibration, data)
+    run = declared_signals(model, data, standard, gains)
+    torque = model.drive_train.direction.T @ run.motor_torque_nm
+    for accepted in calibration.effects:
+        placed, coefficients = placed_effect(accepted, calibration)
+        columns = coefficients @ placed.effect.columns(run, placed.axis)
+        torque += at_joints(placed.effect, placed.axis, columns[None], model.drive_train)[:, 0]
+    return torque
+
+
+def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
+    """v = (T τ)/g: the current references that the motors need for a motion.
+
+    Args and errors as of `predict_torque`.
+
+    Returns:
+        current references [A] at full rate, shape (n, k).
+    """
+    torque = predict_torque(calibration, model, data)
+    return np.asarray(model.drive_train.to_motor @ torque / _gains(calibration, model)[:, None])
+
+
+def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
+    """Y = V g (eq. 4 through R): joint torque [Nm] from current references [A], both of shape (n, k).
+
+    Raises:
+        ModelError: the calibration has another number of gains.
+    """
+    return np.asarray(model.drive_train.direction.T @ (_gains(calibration, model)[:, None] * current_a))
+
+
+def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
+    """Standard parameters χ_st that move as the identified base parameters do, without payload, shape (c,).
+
+    A base parameter β gathers the columns that depend on its leading one (paper §2.1), W_st χ_st = W β for every χ_st
+    with this β; the simplest one holds β at the leading columns, which name the base parameters, and zero elsewhere.
+
+    Raises:
+        ModelError: a parameter is none of this robot's.
+    """
+    index = {column.name: number for number, column in enumerate(model.columns)}
+    of_effects = {coefficient.name for effect in calibration.effects for coefficient in effect.coefficients}
+    standard = np.zeros(len(index))
+    for parameter in calibration.parameters:
+        if parameter.name in of_effects or ":" in parameter.name:
+            continue
+        leading = parameter.name.split()[0] if parameter.name.split() else ""
+        if leading not in index:
+            raise ModelError(
+                f"the calibration of cell {calibration.cell!r} has a parameter {parameter.name!r}; the model has "
+                f"{model.columns[0].name} to {model.columns[-1].name} of {model.robot.joint_count} joints and no such one"
+            )
+        standard[index[leading]] = parameter.value
+    return standard
+
+
+def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[PlacedEffect, FloatArray]:
+    """The effect that a calibration names, on its axis, and its coefficients, shape (p,).
+
+    Raises:
+        EffectRefused: no such effect, setting, axis or coefficient exists.
+    """
+    axes = tuple(gain.axis for gain in calibration.gains)
+    if accepted.axis not in axes:
+        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
+    placed = PlacedEffect(_rebuilt(accepted), axes.index(accepted.axis))
+    values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
+    expected = tuple(column.name for column in placed.columns)
+    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
+        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
+        raise EffectRefused(f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}")
+    return placed, np.array([values[name] for name in expected])
+
+
+def _rebuilt(accepted: AcceptedEffect) -> Effect:
+    families = {family[0].name: family[0] for family in EFFECTS}
+    if accepted.name not in families:
+        raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
+    known = families[accepted.name]
+    if not is_dataclass(known) or set(accepted.settings) != set(known.settings):
+        found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
+        raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
+    # A file knows one kind of number; an order must be whole.
+    given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
+    if given != accepted.settings:
+        raise EffectRefused(f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers")
+    return replace(known, **given)
+
+
+def _gains(calibration: Calibration, model: Model) -> FloatArray:
+    count = model.robot.joint_count
+    if len(calibration.gains) != count:
+        raise ModelError(f"the calibration has {len(calibration.gains)} gains, the model {count} joints")
+    return np.array([gain.value for gain in calibration.gains])
+
+
+def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
+    payload = data.payload
+    if payload is None:
+        return inertia(None, {})
+    identified: dict[str, float] = {}
+    mountings: set[str] = set()
+    for parameter in calibration.parameters:
+        name, colon, mounting = parameter.name.partition(":")
+        if colon:
+            mountings.add(mounting)
+            if mounting == payload.mounting:
+                identified[name] = parameter.value
+    _check_mounting(payload, identified, mountings, data.name)
+    return inertia(payload, identified)
+
+
+def _check_mounting(payload: Payload, identified: dict[str, float], mountings: set[str], run: str) -> None:
+    if not identified and set(payload.known) != set(PAYLOAD_PARAMETERS):
+        known = ", ".join(sorted(map(repr, mountings))) or "none"
+        raise DataUnfit(
+            run, f"carries mounting {payload.mounting!r}, of which the calibration knows nothing; it knows {known}"
+        )
+    both = sorted(set(identified) & set(payload.known))
+    if both:
+        raise DataUnfit(
+            run,
+            f"says {', '.join(both)} of mounting {payload.mounting!r} beforehand, which the calibration has identified: "
+            "give each way of mounting a name of its own",
+        )
+    foreign = sorted(set(identified) - set(PAYLOAD_PARAMETERS))
+    if foreign:
+        raise DataUnfit(run, f"mounting {payload.mounting!r} has parameters that no payload has: {', '.join(foreign)}")

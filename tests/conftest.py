@@ -1,0 +1,25 @@
+"""What several rooms' tests share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session")
+def checkout() -> Path:
+    """The folder of the checkout."""
+    return CHECKOUT
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder with recordings and EDS files that are not part of the repository."""
+    folder = Path(os.environ.get("DRIVEGAIN_DATA", CHECKOUT.parent / "shared" / "data"))
+    if not (folder / "tx40").is_dir():
+        pytest.skip(f"no real recordings at {folder}: set DRIVEGAIN_DATA to the folder that holds tx40/")
+    return folder

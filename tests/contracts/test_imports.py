@@ -1,0 +1,94 @@
+"""Imports run one way, and a contract that is broken is reported."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("daq", "drivers", "ident")
+FOREIGN_TO_IDENT = (
+    "can",
+    "canopen",
+    "mcap",
+    "pydantic",
+    "yaml",
+    "ruamel",
+    "typer",
+    "rich",
+    "matplotlib",
+    "drivers",
+    "daq",
+)
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """The three packages and their contracts in a folder of their own, to break them there."""
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copyfile(ROOT / "pyproject.toml", tmp_path / "pyproject.toml")
+    return tmp_path
+
+
+def _lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
+    # -c with the folder first on the path: an editable installation must not be looked at instead of the copy.
+    code = (
+        "import sys; sys.path.insert(0, ''); from importlinter.cli import lint_imports_command; lint_imports_command()"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code, "--no-cache"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_contracts_are_kept() -> None:
+    done = _lint_imports(ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "says"),
+    [
+        ("ident/run.py", "import can", "ident is not allowed to import can"),
+        ("ident/run.py", "import drivers.sample", "ident is not allowed to import drivers"),
+        ("drivers/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
+        ("drivers/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
+        ("drivers/profile.py", "import pinocchio", "drivers.profile is not allowed to import pinocchio"),
+        ("daq/errors.py", "import canopen", "daq is not allowed to import canopen"),
+    ],
+)
+def test_a_contract_broken_on_purpose_is_reported(copied: Path, file: str, line: str, says: str) -> None:
+    path = copied / file
+    path.write_text(
+        path.read_text().replace(
+            "from __future__ import annotations\n", f"from __future__ import annotations\n\n{line}\n", 1
+        )
+    )
+    done = _lint_imports(copied)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert says in " ".join(done.stdout.split())
+
+
+def test_the_science_brings_no_bus_no_log_and_no_screen() -> None:
+    """What a program gets into memory that uses `ident` alone, all of its modules imported."""
+    code = (
+        "import importlib, pkgutil, sys, ident\n"
+        "names = [m.name for m in pkgutil.walk_packages(ident.__path__, 'ident.')]\n"
+        "for name in names: importlib.import_module(name)\n"
+        "print(len(names), *sorted({name.partition('.')[0] for name in sys.modules}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    count, *loaded = done.stdout.split()
+    assert int(count) > 5
+    assert "numpy" in loaded
+    assert not set(FOREIGN_TO_IDENT) & set(loaded)

@@ -1,0 +1,71 @@
+"""Calibrations for tests: one that every gate lets through, and hypothesis strategies for any other."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError, Source
+
+NAMEPLATE = (32.96, 32.96, 25.65, -11.52, 18.48, 7.68)
+IDENTIFIED = (33.9, 32.4, 24.2, -9.21, 16.3, 6.79)
+AXES = ("J1", "J2", "J3", "J4", "J5", "J6")
+KEYS = {axis: f"drives.{axis}.gain" for axis in AXES}
+
+
+def demo_calibration() -> Calibration:
+    """Of the demo cell, with the gains of the paper's Table 4 and σ of 0.4 %."""
+    return Calibration(
+        cell="demo",
+        method="ml",
+        gains=tuple(
+            Gain(axis, value, 0.004 * abs(value), "Nm/A", nameplate)
+            for axis, value, nameplate in zip(AXES, IDENTIFIED, NAMEPLATE, strict=True)
+        ),
+        parameters=(Parameter("ZZ1R", 1.25, 0.01, "kg m²"), Parameter("off3", 0.0, 0.02, "Nm")),
+        effects=(
+            AcceptedEffect("load-friction", "J3", {"power": 1.0}, (Parameter("c", 0.12, 0.002, "1"),), 6.1, 3.4, ()),
+        ),
+        relative_error_percent=RelativeError((3.1, 2.8, 3.4, 4.0, 5.5, 4.9), 3.2),
+        holdout_error_percent=RelativeError((3.2, 2.9, 3.5, 4.1, 5.6, 5.0), 3.3),
+        condition=812.0,
+        rows=14400,
+        filter={"position_cutoff_hz": 40.0, "standstill_rad_s": [0.03] * 6},
+        sources=(Source("unloaded", "a" * 64, "unloaded"), Source("loaded", "b" * 64, "loaded with disc")),
+        configuration_sha256="c" * 64,
+        created="2025-01-02T03:04:05+00:00",
+        software="drivegain 0.1.0",
+    )
+
+
+_numbers = st.floats(allow_nan=False, allow_infinity=False)
+_deviations = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
+_texts = st.text(max_size=12)
+_parameters = st.builds(Parameter, _texts, _numbers, _deviations, _texts)
+_errors = st.builds(RelativeError, st.lists(_numbers, max_size=3).map(tuple), _numbers)
+_effects = st.builds(
+    AcceptedEffect,
+    name=_texts,
+    axis=_texts,
+    settings=st.dictionaries(_texts, _numbers, max_size=3),
+    coefficients=st.lists(_parameters, max_size=2).map(tuple),
+    error_before_percent=_numbers,
+    error_after_percent=_numbers,
+    ambiguity=st.lists(_texts, max_size=2).map(tuple),
+)
+calibrations = st.builds(
+    Calibration,
+    cell=_texts,
+    method=st.sampled_from(("ls", "wls", "tls", "ml")),
+    gains=st.lists(st.builds(Gain, _texts, _numbers, _deviations, _texts, _numbers), max_size=4).map(tuple),
+    parameters=st.lists(_parameters, max_size=4).map(tuple),
+    effects=st.lists(_effects, max_size=2).map(tuple),
+    relative_error_percent=_errors,
+    holdout_error_percent=st.none() | _errors,
+    condition=_numbers,
+    rows=st.integers(min_value=0, max_value=10**9),
+    filter=st.dictionaries(_texts, _numbers | st.lists(_numbers, max_size=3), max_size=3),
+    sources=st.lists(st.builds(Source, _texts, _texts, _texts), max_size=2).map(tuple),
+    configuration_sha256=_texts,
+    created=_texts,
+    software=_texts,
+)

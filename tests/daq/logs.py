@@ -1,0 +1,67 @@
+"""Logs for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from daq.configuration.cell_file import bundle
+from daq.log.metadata import RunInfo
+from daq.log.readback import AxisReadback, Readback
+from daq.log.writer import LogContent, LogWriter
+from drivers.event import CellEvent
+from drivers.sample import Sample
+from ident.payload import Payload
+
+START_NS = 1_700_000_000_123_456_789
+DISC = Payload("disc", "flange-a", {"m": 4.59})
+
+
+def content(axes: int, payload: Payload | None = None, files: dict[str, bytes] | None = None) -> LogContent:
+    """The start of a log of so many axes: 1 kHz, 2 mA a unit."""
+    names = tuple(f"J{i + 1}" for i in range(axes))
+    run = RunInfo("run-1", 1000.0, payload, "Ada", "test 1", START_NS, 55)
+    readback = Readback(tuple(AxisReadback(name, 0.002, drive={"serial": 7}) for name in names))
+    return LogContent(run, {"cell.yaml": b"name: x\n"} if files is None else files, readback, names)
+
+
+def demo_content(checkout: Path, payload: Payload | None = None) -> LogContent:
+    """The start of a log of the demo cell."""
+    return content(6, payload, bundle(checkout / "configs/cells/demo.yaml"))
+
+
+def samples(rows: Sequence[Sequence[int]], status: int = 0x1237, missing: int = 0) -> list[Sample]:
+    """One sample a millisecond with these counts; the current is the negative count."""
+    return [
+        Sample(
+            10 + k,
+            START_NS + k * 1_000_000,
+            tuple(row),
+            tuple(-c for c in row),
+            (status,) * len(row),
+            missing,
+        )
+        for k, row in enumerate(rows)
+    ]
+
+
+def joints(counts: Sequence[int]) -> list[float]:
+    """Some joint positions."""
+    return [count * 1e-3 for count in counts]
+
+
+def write(
+    path: Path,
+    start: LogContent,
+    rows: Sequence[Sample],
+    events: Sequence[CellEvent] = (),
+    verdict: tuple[bool, str] = (True, ""),
+) -> Path:
+    """A whole log."""
+    with LogWriter(path, start, joints, clock_ns=lambda: 0) as log:
+        for event in events:
+            log.event(event)
+        for sample in rows:
+            log.write(sample)
+        log.conclude(*verdict)
+    return path

@@ -1,0 +1,413 @@
+"""Writing back: every gate, every failure of the disk, two writers, and the way back."""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import json
+import math
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.apply import Proposal, apply, propose, refused
+from daq.apply_gates import ApplyPolicy, Gate
+from daq.calibration_file import save
+from daq.cli.app import main
+from daq.configuration.cell_file import load_cell
+from daq.controller_write import backups, roll_back
+from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit, exit_code
+from ident.calibration import Calibration, Gain, RelativeError, Source
+from tests.daq.calibrations import AXES, KEYS, demo_calibration
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Path:
+    """A copy of the demo controller's file in a folder of its own."""
+    path = tmp_path / "controllers" / "demo.yaml"
+    path.parent.mkdir()
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
+    return path
+
+
+def _propose(calibration: Calibration, controller: Path, policy: ApplyPolicy | None = None) -> Proposal:
+    return propose(calibration, controller, KEYS, cell="demo", policy=policy)
+
+
+def _with_gain(axis: str, **changes: float) -> Calibration:
+    calibration = demo_calibration()
+    gains = tuple(_changed(gain, changes) if gain.axis == axis else gain for gain in calibration.gains)
+    return replace(calibration, gains=gains)
+
+
+def _changed(gain: Gain, changes: dict[str, float]) -> Gain:
+    return Gain(
+        gain.axis,
+        changes.get("value", gain.value),
+        changes.get("std", gain.std),
+        gain.unit,
+        changes.get("nameplate", gain.nameplate),
+    )
+
+
+def _gates(proposal: Proposal) -> list[tuple[Gate, str]]:
+    return [(refusal.gate, refusal.subject) for refusal in proposal.refusals]
+
+
+def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
+    before = controller.read_bytes()
+    proposal = _propose(demo_calibration(), controller)
+    assert proposal.refusals == ()
+    assert [change.axis for change in proposal.changes] == list(AXES)
+    assert "-    gain: -11.52       # Nm at the joint per A, from the data sheet\n" in proposal.diff
+    assert "+    gain: -9.2100       # Nm at the joint per A, from the data sheet\n" in proposal.diff
+    assert proposal.diff.count("\n+ ") == proposal.diff.count("\n- ") == 6
+    assert controller.read_bytes() == before
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -> None:
+    controller.chmod(0o640)
+    before = controller.read_bytes()
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    expected = before
+    for old, new in ((b"25.65", b"24.2000"), (b"-11.52", b"-9.2100"), (b"18.48", b"16.3000"), (b" 7.68", b" 6.7900")):
+        assert expected.count(old) == 1
+        expected = expected.replace(old, new)
+    expected = expected.replace(b"32.96", b"33.900", 1).replace(b"32.96", b"32.400", 1)
+    assert controller.read_bytes() == expected
+    assert written.backup == controller.parent / "demo.yaml.20250102T030405Z.bak"
+    assert written.backup.read_bytes() == before
+    assert sorted(controller.parent.iterdir()) == sorted([controller, written.backup])
+    assert {stat.S_IMODE(path.stat().st_mode) for path in (controller, written.backup)} == {0o640}
+
+
+def test_applying_twice_changes_nothing_the_second_time(controller: Path) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    again = _propose(demo_calibration(), controller)
+    assert again.diff == ""
+    assert apply(again, NOW) is None
+    assert len(backups(controller)) == 1
+
+
+@pytest.mark.parametrize(
+    ("calibration", "gates"),
+    [
+        (_with_gain("J2", value=32.96 * 1.36), [(Gate.CHANGE, "J2")]),
+        (_with_gain("J2", value=32.96 * 0.64), [(Gate.CHANGE, "J2")]),
+        (_with_gain("J4", value=-11.52 * 1.51), [(Gate.CHANGE, "J4"), (Gate.NAMEPLATE, "J4")]),
+        (_with_gain("J5", nameplate=10.5), [(Gate.NAMEPLATE, "J5")]),
+        (_with_gain("J4", value=9.21), [(Gate.SIGN, "J4")]),
+        (_with_gain("J1", nameplate=-32.96), [(Gate.SIGN, "J1")]),
+        (_with_gain("J6", std=0.031 * 6.79), [(Gate.UNCERTAINTY, "J6")]),
+        (_with_gain("J6", std=0.0), [(Gate.NOT_IDENTIFIED, "J6")]),
+        (_with_gain("J6", std=-0.1), [(Gate.NOT_FINITE, "J6")]),
+        (_with_gain("J3", value=math.nan), [(Gate.NOT_FINITE, "J3")]),
+        (_with_gain("J3", value=math.inf), [(Gate.NOT_FINITE, "J3")]),
+        (_with_gain("J3", value=0.0), [(Gate.NOT_FINITE, "J3")]),
+        (_with_gain("J3", std=math.nan), [(Gate.NOT_FINITE, "J3")]),
+        (_with_gain("J3", nameplate=math.nan), [(Gate.NOT_FINITE, "J3")]),
+        (replace(demo_calibration(), sources=()), [(Gate.SOURCES, "calibration")]),
+        (
+            replace(demo_calibration(), sources=(Source("run.mcap.part", "a" * 64, "unloaded"),)),
+            [(Gate.SOURCES, "log run.mcap.part")],
+        ),
+        (replace(demo_calibration(), sources=(Source("run", "", "unloaded"),)), [(Gate.SOURCES, "log run")]),
+        (replace(demo_calibration(), cell="other"), [(Gate.CELL, "calibration")]),
+        (
+            replace(demo_calibration(), holdout_error_percent=RelativeError((1.0,), math.nan)),
+            [(Gate.NOT_FINITE, "calibration")],
+        ),
+        (
+            replace(demo_calibration(), effects=(replace(demo_calibration().effects[0], error_after_percent=6.1),)),
+            [(Gate.HOLDOUT, "effect load-friction on J3")],
+        ),
+    ],
+)
+def test_each_gate_closes_for_its_own_reason(
+    controller: Path, calibration: Calibration, gates: list[tuple[Gate, str]]
+) -> None:
+    before = controller.read_bytes()
+    proposal = _propose(calibration, controller)
+    assert _gates(proposal) == gates
+    with pytest.raises(CalibrationRefused) as caught:
+        apply(proposal, NOW)
+    for refusal in proposal.refusals:
+        assert refusal.found in str(caught.value)
+    assert exit_code(type(caught.value)) == 3
+    assert controller.read_bytes() == before
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+@pytest.mark.parametrize(
+    "calibration",
+    [
+        _with_gain("J2", value=32.96 * 1.349),
+        _with_gain("J2", value=32.96 * 0.651),
+        _with_gain("J5", nameplate=11.0),
+        _with_gain("J6", std=0.0299 * 6.79),
+        replace(demo_calibration(), holdout_error_percent=None),
+        replace(demo_calibration(), effects=()),
+    ],
+)
+def test_just_inside_its_bound_a_gate_is_open(controller: Path, calibration: Calibration) -> None:
+    assert _propose(calibration, controller).refusals == ()
+
+
+def test_the_policy_moves_the_bounds(controller: Path) -> None:
+    tight = ApplyPolicy(max_change_percent=5.0, max_nameplate_percent=15.0, max_std_percent=0.3)
+    gates = _gates(_propose(demo_calibration(), controller, tight))
+    assert [axis for gate, axis in gates if gate is Gate.CHANGE] == ["J3", "J4", "J5", "J6"]
+    assert [axis for gate, axis in gates if gate is Gate.NAMEPLATE] == ["J4"]
+    assert [axis for gate, axis in gates if gate is Gate.UNCERTAINTY] == list(AXES)
+
+
+def test_all_closed_gates_are_told_at_once(controller: Path) -> None:
+    tight = ApplyPolicy(max_change_percent=5.0)
+    error = refused(_propose(replace(demo_calibration(), cell="other"), controller, tight))
+    assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [True] * 5 + [False]
+
+
+def test_a_configuration_that_changed_since_the_recording_is_refused(controller: Path) -> None:
+    for digest, gates in (("c" * 64, []), ("d" * 64, [(Gate.CONFIGURATION, "calibration")])):
+        proposal = propose(demo_calibration(), controller, KEYS, cell="demo", configuration_sha256=digest)
+        assert _gates(proposal) == gates
+
+
+def test_a_zero_in_the_file_has_no_sign_to_keep(controller: Path) -> None:
+    controller.write_text(controller.read_text().replace("7.68", "0.0"))
+    assert _gates(_propose(demo_calibration(), controller)) == [(Gate.SIGN, "J6")]
+
+
+def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
+    fewer = replace(demo_calibration(), gains=demo_calibration().gains[:5])
+    with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
+        _propose(fewer, controller)
+    with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
+        propose(demo_calibration(), controller, {**KEYS, "J2": "drives.J1.gain"}, cell="demo")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("  J6:", "  J7:", "no key 'J6' in drives"),
+        ("loop: {kp", "loop: kp", None),
+        ("drives:", "drives: [", "no YAML"),
+        ("gain: 7.68", "gain: unknown", "'unknown'"),
+    ],
+)
+def test_a_controller_file_that_does_not_fit_is_refused(controller: Path, old: str, new: str, says: str | None) -> None:
+    controller.write_text(controller.read_text().replace(old, new))
+    with pytest.raises(ControllerUnfit, match=says):
+        _propose(demo_calibration(), controller)
+
+
+def test_a_missing_controller_file_or_a_folder_is_refused(controller: Path) -> None:
+    with pytest.raises(ControllerUnfit, match="no such file"):
+        _propose(demo_calibration(), controller.with_name("none.yaml"))
+    with pytest.raises(ControllerUnfit, match="no regular file"):
+        _propose(demo_calibration(), controller.parent)
+
+
+def test_a_file_changed_since_the_diff_is_refused(controller: Path) -> None:
+    proposal = _propose(demo_calibration(), controller)
+    controller.write_text(controller.read_text() + "# seen by K.\n")
+    changed = controller.read_bytes()
+    with pytest.raises(ControllerChanged):
+        apply(proposal, NOW)
+    assert controller.read_bytes() == changed
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+def test_a_second_writer_is_refused(controller: Path) -> None:
+    proposal = _propose(demo_calibration(), controller)
+    before = controller.read_bytes()
+    lock = controller.parent / ".demo.yaml.lock"
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ControllerBusy):
+            apply(proposal, NOW)
+        assert lock.exists()
+    assert controller.read_bytes() == before
+    # The lock of a writer that was killed is free, whatever its file says.
+    assert apply(proposal, NOW) is not None
+    assert not lock.exists()
+
+
+def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link.yaml"
+    link.symlink_to(controller)
+    written = apply(_propose(demo_calibration(), link), NOW)
+    assert written is not None
+    assert link.is_symlink()
+    assert written.file == controller
+    assert written.backup.parent == controller.parent
+    assert b"-9.2100" in controller.read_bytes()
+    assert roll_back(link, NOW).file == controller
+    assert b"-11.52" in controller.read_bytes()
+
+
+class _Failing:
+    """Stands for a system call and fails on its n-th use, when the disk is full."""
+
+    def __init__(self, call: Callable[..., object], at: int) -> None:
+        self.call, self.at, self.uses = call, at, 0
+
+    def __call__(self, *arguments: object, **options: object) -> object:
+        self.uses += 1
+        if self.uses == self.at:
+            raise OSError(28, "No space left on device")
+        return self.call(*arguments, **options)
+
+
+@pytest.mark.parametrize("name", ["open", "fchmod", "fsync", "replace"])
+def test_whatever_step_fails_the_old_file_stands_and_nothing_is_left(
+    controller: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every use of every system call on the way fails in turn, until one run goes through."""
+    before = controller.read_bytes()
+    failures = 0
+    while True:
+        proposal = _propose(demo_calibration(), controller)
+        failing = _Failing(getattr(os, name), failures + 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, failing)
+            try:
+                written = apply(proposal, NOW)
+            except OSError:
+                written = None
+        if failing.uses <= failures:
+            break
+        failures += 1
+        assert written is None
+        assert controller.read_bytes() == before
+        assert list(controller.parent.iterdir()) == [controller]
+    assert written is not None
+    assert failures >= {"open": 5, "fchmod": 2, "fsync": 4, "replace": 2}[name]
+
+
+def test_a_disk_that_gives_back_something_else_is_noticed(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = controller.read_bytes()
+    proposal = _propose(demo_calibration(), controller)
+    read = Path.read_bytes
+
+    def flipped(path: Path) -> bytes:
+        content = read(path)
+        return content.replace(b"kp: 120.0", b"kp: 120.1") if path.suffix == ".tmp" else content
+
+    monkeypatch.setattr(Path, "read_bytes", flipped)
+    with pytest.raises(ControllerUnfit, match=r"another value at drives\.J1\.loop\.kp"):
+        apply(proposal, NOW)
+    monkeypatch.undo()
+    assert controller.read_bytes() == before
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
+    original = controller.read_bytes()
+    first = apply(_propose(demo_calibration(), controller), NOW)
+    assert first is not None
+    calibrated = controller.read_bytes()
+
+    back = roll_back(controller, NOW + timedelta(minutes=1))
+    assert controller.read_bytes() == original
+    assert back.restored == first.backup
+    assert back.backup.read_bytes() == calibrated
+
+    roll_back(controller, NOW + timedelta(minutes=2))
+    assert controller.read_bytes() == calibrated
+    assert len(backups(controller)) == 3
+
+
+def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    for step in (0, -3600, 0, -7200):
+        roll_back(controller, NOW + timedelta(seconds=step))
+    names = [path.name for path in backups(controller)]
+    assert names == [f"demo.yaml.20250102T030405Z{suffix}.bak" for suffix in ("", "-1", "-2", "-3", "-4")]
+    contents = [path.read_bytes() for path in backups(controller)]
+    assert all(a != b for a, b in itertools.pairwise(contents))
+
+
+def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
+    with pytest.raises(BackupMissing, match="no backup beside it"):
+        roll_back(controller, NOW)
+    # A name that a killed writer kept, and a copy that changes nothing, are no way back either.
+    (controller.parent / "demo.yaml.20250102T030405Z.bak").touch()
+    shutil.copyfile(controller, controller.parent / "demo.yaml.20250102T030406Z.bak")
+    with pytest.raises(BackupMissing, match="same content"):
+        roll_back(controller, NOW)
+
+
+def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
+    before = controller.read_bytes()
+    (controller.parent / "demo.yaml.20250102T030405Z.bak").write_text("drives: [")
+    with pytest.raises(ControllerUnfit, match="no YAML"):
+        roll_back(controller, NOW)
+    assert controller.read_bytes() == before
+
+
+def test_the_command_shows_writes_and_rolls_back(
+    controller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = CONFIGS / "cells" / "demo.yaml"
+    file = tmp_path / "calibration.yaml"
+    save(replace(demo_calibration(), configuration_sha256=load_cell(cell).digest), file)
+    before = controller.read_bytes()
+    command = ["apply", str(file), "--cell", str(cell), "--to", str(controller)]
+
+    assert main(command) == 0
+    shown = capsys.readouterr().out
+    assert "-9.210 ± 0.037" in shown
+    assert "+    gain: -9.2100" in shown
+    assert "nothing was written" in shown
+    assert controller.read_bytes() == before
+
+    assert main([*command, "--json"]) == 0
+    dry = json.loads(capsys.readouterr().out)
+    assert (dry["applied"], dry["refusals"], dry["backup"]) == (False, [], None)
+    assert [change["axis"] for change in dry["changes"]] == list(AXES)
+
+    assert main([*command, "--yes", "--base", "0" * 64]) == 3
+    assert "--base" in capsys.readouterr().err
+    assert controller.read_bytes() == before
+
+    assert main([*command, "--yes", "--max-change-percent", "10", "--json"]) == 3
+    outcome = capsys.readouterr()
+    assert {refusal["gate"] for refusal in json.loads(outcome.out)["refusals"]} == {"change"}
+    assert "J4" in outcome.err
+    assert controller.read_bytes() == before
+
+    assert main([*command, "--yes", "--base", dry["base_sha256"], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["applied"] is True
+    assert b"-9.2100" in controller.read_bytes()
+
+    assert main([*command, "--yes"]) == 0
+    assert "these gains already" in capsys.readouterr().out
+
+    assert main(["rollback", "--to", str(controller)]) == 0
+    assert "Restored" in capsys.readouterr().out
+    assert controller.read_bytes() == before
+
+
+def test_the_command_refuses_another_configuration(
+    controller: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = CONFIGS / "cells" / "demo.yaml"
+    file = tmp_path / "calibration.yaml"
+    save(demo_calibration(), file)
+    command = ["apply", str(file), "--cell", str(cell), "--to", str(controller), "--yes"]
+    assert main(command) == 3
+    assert "--configuration-changed" in capsys.readouterr().err
+    assert main([*command, "--configuration-changed"]) == 0
+    assert b"-9.2100" in controller.read_bytes()

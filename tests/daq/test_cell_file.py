@@ -1,0 +1,160 @@
+"""Cell files: read whole, bundled whole, refused with the reason."""
+
+from __future__ import annotations
+
+import shutil
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.configuration.cell import Pacing
+from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_file import bundle, cell_from_bundle, load_cell
+from daq.configuration.drive import drive_from_text
+from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
+from daq.resources import shipped_configurations
+from drivers.profile import Amplitude, ObjectEntry, TapPoint
+
+
+@pytest.fixture
+def configurations(tmp_path: Path) -> Path:
+    """A copy of the shipped configurations that a test may spoil."""
+    folder = tmp_path / "configs"
+    shutil.copytree(shipped_configurations(), folder)
+    return folder
+
+
+def _spoil(path: Path, old: str, new: str) -> Path:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return path
+
+
+def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    assert cell.name == "demo"
+    assert cell.axis_names == ("J1", "J2", "J3", "J4", "J5", "J6")
+    np.testing.assert_array_equal(cell.ratio[5], [0, 0, 0, 0, 32, 32])
+    assert cell.axes[4].limits.position == (radians(-115), radians(128))
+    assert cell.axes[3].nameplate_gain == -11.52
+    assert cell.axes[0].gain_unit == "Nm/A"
+    assert cell.payloads[0].payload.known == {"m": 4.59}
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing.LOCKSTEP
+    assert cell.controller_path == checkout / "configs/controllers/demo.yaml"
+    profile = cell.axes[0].profile
+    assert profile is not None
+    assert profile.current == ObjectEntry(0x6074, 0, 16, signed=True)
+    assert (profile.amplitude, profile.tap) == (Amplitude.RMS, TapPoint.REFERENCE)
+    assert [axis.node_id for axis in drive_axes(cell)] == [1, 2, 3, 4, 5, 6]
+    assert bus_address(cell).interface == "virtual"
+
+
+def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/tx40.yaml")
+    assert cell.bus is None
+    assert cell.axes[1].zero_offset_rad == radians(-90)
+    assert cell.axes[0].gain_unit == "Nm/Nm(motor, a priori)"
+    with pytest.raises(ConfigurationInconsistent, match="no bus"):
+        bus_address(cell)
+    with pytest.raises(ConfigurationInconsistent, match="without node_id"):
+        drive_axes(cell)
+
+
+def test_a_bundle_is_the_same_cell_without_its_files(checkout: Path) -> None:
+    path = checkout / "configs/cells/demo.yaml"
+    files = bundle(path)
+    assert set(files) == {"cell.yaml", "robot.urdf", "drives/generic-cia402.yaml"}
+    cell, again = load_cell(path), cell_from_bundle({**files, "readback.json": b"{}"})
+    assert again.digest == cell.digest
+    assert again.axes == cell.axes
+    assert again.urdf == cell.urdf
+    assert again.folder is None
+    with pytest.raises(ConfigurationMissing, match=r"robot\.urdf"):
+        cell_from_bundle({name: data for name, data in files.items() if name != "robot.urdf"})
+
+
+def test_the_digest_follows_every_file(configurations: Path) -> None:
+    path = configurations / "cells/demo.yaml"
+    before = load_cell(path).digest
+    _spoil(configurations / "drives/generic-cia402.yaml", "amplitude: rms", "amplitude: peak")
+    assert load_cell(path).digest != before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("    - [32, 0, 0, 0, 0, 0]\n", "", "5 rows"),
+        ("[32, 0, 0, 0, 0, 0]", "[32, 0, 0, 0, 0]", r"rows of 5, 6 numbers; expected 6 × 6"),
+        ("[0, 0, 0, 0, 32, 32]", "[0, 0, 0, 0, 45, 0]", "singular"),
+        ("node_id: 2", "node_id: 1", "1, used 2 times"),
+        ("node_id: 2", "node_id: 128", "1 to 127"),
+        ("node_id: 2\n", "#\n", "axes.1..node_id: found nothing"),
+        ("name: J2", "name: J1", "J1, used 2 times"),
+        ("[-170, 170]", "[170, -170]", "lower limit first"),
+        ("[-170, 170]", "[-2.967, 2.967]", "the numbers of the URDF in rad"),
+        ("[-170, 170]", "[-17000, 17000]", "at most ±720 deg"),
+        ("[-170, 170]", "[-0.05, 0.05]", "a range of at least 0.2 deg"),
+        ("mass_kg: 4.59", "mass_kg: -4.59", "positive mass"),
+        ("gain_nm_per_a: 25.65", "gain_nm_per_a: 0", "not zero"),
+        ("-9.81]", "-9810]", "9810 m/s²"),
+        ("[0.03, 0.03, ", "[0.03, ", "5 speeds"),
+        ("[drives.J1.gain, ", "[", "5 keys"),
+        ("tx40.urdf", "../simulation/demo.yaml", "a URDF of an arm"),
+        ("sync:\n  period_us: 1000\n  pacing: lockstep ", "#", "sampling period"),
+    ],
+)
+def test_a_cell_that_contradicts_itself_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("velocity_deg_s: 200", "velocity_deg: 200", r"axes\[0\].limits.velocity_deg: .*velocity_deg_s"),
+        ("velocity_deg_s: 200", "velocity_deg_s: -200", "greater than 0"),
+        ("pacing: lockstep", "pacing: slowly", "'lockstep' or 'timed'"),
+        ("nameplate_gain_nm_per_a: 25.65", "gain_unit: Nm/A", "nameplate_gain together with gain_unit"),
+        ("mounting: flange-a", "", r"payloads\[0\].mounting: found nothing"),
+    ],
+)
+def test_a_misspelt_cell_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("drive: generic-cia402", "drive: unheard-of", "no file .*generic-cia402"),
+        ("tx40.urdf", "none.urdf", "no such file"),
+    ],
+)
+def test_a_missing_file_is_named(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(ConfigurationMissing, match=message):
+        load_cell(path)
+    with pytest.raises(ConfigurationMissing, match="nowhere"):
+        load_cell(configurations / "nowhere.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("index: 0x6064", "index: 0x64"),
+        ("amplitude: rms", "amplitude: RMS"),
+        ("type: i32}", "type: i64}"),
+        ("tap:", "tip:"),
+    ],
+)
+def test_a_wrong_drive_profile_is_refused(old: str, new: str) -> None:
+    text = (shipped_configurations() / "drives/generic-cia402.yaml").read_text(encoding="utf-8")
+    assert drive_from_text(text.encode(), "x").saturation_bit == 11
+    with pytest.raises(ConfigurationError):
+        drive_from_text(text.replace(old, new, 1).encode(), "x")

@@ -1,0 +1,48 @@
+"""Every error of the three packages has an exit code, and says what to do."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+
+import daq
+import drivers
+import ident
+from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
+from drivers.errors import DriverError, IdentityMismatch
+from drivers.simulated.errors import SdoAbort
+from ident.errors import IdentificationError, RankDeficient
+
+
+def _exceptions() -> set[type[BaseException]]:
+    found: set[type[BaseException]] = set()
+    for package in (daq, drivers, ident):
+        for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+            members = vars(importlib.import_module(module.name)).values()
+            found |= {m for m in members if inspect.isclass(m) and issubclass(m, BaseException)}
+    return {kind for kind in found if kind.__module__.split(".")[0] in {"daq", "drivers", "ident"}}
+
+
+def test_every_exception_class_has_an_exit_code() -> None:
+    kinds = _exceptions()
+    assert {IdentityMismatch, RankDeficient, SchemaMismatch} <= kinds
+    # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, it never reaches a user.
+    unmapped = {kind.__qualname__ for kind in kinds - {DaqError, SdoAbort} if exit_code(kind) is None}
+    assert not unmapped
+
+
+def test_foreign_exceptions_have_none() -> None:
+    assert exit_code(ValueError) is None
+    assert exit_code(DaqError) is None
+
+
+def test_codes_are_those_of_the_command_line_contract() -> None:
+    kinds = (UsageError, CalibrationRefused, IdentificationError, DriverError, SchemaMismatch, OutputFailed)
+    assert [exit_code(kind) for kind in kinds] == [2, 3, 4, 5, 6, 1]
+
+
+def test_an_error_carries_its_evidence() -> None:
+    error = UsageError("here", found="this", expected="that", remedy="do so")
+    assert (error.subject, error.found, error.expected, error.remedy) == ("here", "this", "that", "do so")
+    assert str(error) == "here: found this; expected that; do so"

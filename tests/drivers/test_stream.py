@@ -1,0 +1,276 @@
+"""The stream against frames that are lost, late, doubled, cut and unasked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import BusError, DriveFault, HeartbeatLost, SampleLost
+from drivers.event import CellEvent, EventKind
+from drivers.pacing import LockstepSync, TimedSync
+from drivers.stream import StreamStatistics, SyncStream
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
+
+Prepared = tuple[SyncStream, ScriptedBus, list[CellEvent]]
+
+
+def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
+    """A lockstep (or timed) stream of a prepared network; the position of every axis is its cycle number."""
+    network, bus = cell(axes)
+    events: list[CellEvent] = []
+
+    def count_cycles(cycle: int) -> None:
+        for node in bus.nodes:
+            node.position = cycle
+
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = count_cycles
+        pacing = TimedSync(PERIOD_NS, bus.clock) if timed else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
+        yield SyncStream(network, pacing, events.append), bus, events
+        bus.tamper = lambda message: (message,)
+        for node in bus.nodes:
+            node.beats, node.nmt = True, 5
+
+
+@pytest.fixture
+def lockstep() -> Iterator[Prepared]:
+    yield from prepared()
+
+
+@pytest.fixture
+def timed() -> Iterator[Prepared]:
+    yield from prepared(timed=True)
+
+
+def drop(bus: ScriptedBus, cob_id: int, cycles: range) -> None:
+    bus.tamper = lambda m: () if m.arbitration_id == cob_id and bus.cycle in cycles else (m,)
+
+
+def test_samples_carry_the_syncs_time_and_all_axes(lockstep: Prepared) -> None:
+    stream, _, _ = lockstep
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.cycle for sample in samples] == [0, 1, 2, 3, 4]
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+
+
+def test_a_missing_frame_is_a_bit_and_repeats_the_last_value(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    drop(bus, 0x182, range(2, 3))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
+    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
+    assert [sample.position_counts[0] for sample in samples] == [0, 1, 2, 3, 4]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1)
+    lost = [event for event in events if event.kind is EventKind.SAMPLE_LOST]
+    assert [(event.axis, event.code, event.time_ns) for event in lost] == [(1, 2, samples[2].time_ns)]
+
+
+def test_a_late_frame_is_never_taken_for_the_next_cycles(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    held: list[can.Message] = []
+
+    def hold_one(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x182 and bus.cycle == 2:
+            held.append(message)
+            return ()
+        return (held.pop(), message) if held and message.arbitration_id == 0x182 else (message,)
+
+    bus.tamper = hold_one
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
+    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1, late=1)
+
+
+def test_a_late_frame_between_two_syncs_is_dropped(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    drop(bus, 0x181, range(1, 2))
+    assert [next(stream).missing for _ in range(2)] == [0, 1]
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))
+    sample = next(stream)
+    assert (sample.missing, sample.position_counts[0]) == (0, 2)
+    assert stream.statistics.late == 1
+
+
+def test_a_duplicate_is_counted_and_changes_nothing(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x181 and bus.cycle == 1 else (m,)
+    samples = [next(stream) for _ in range(4)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
+    assert stream.statistics == StreamStatistics(cycles=4, frames=8, duplicate=1)
+
+
+def test_a_duplicate_of_the_last_axis_is_found_before_the_next_sync(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
+    samples = [next(stream) for _ in range(4)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
+    assert stream.statistics.duplicate == 1
+
+
+@pytest.mark.parametrize("length", [0, 7])
+def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> None:
+    stream, bus, _ = lockstep
+
+    def cut(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x181 and bus.cycle == 1:
+            return (can.Message(arbitration_id=0x181, is_extended_id=False, data=message.data[:length]),)
+        return (message,)
+
+    bus.tamper = cut
+    assert [next(stream).missing for _ in range(3)] == [0, 1, 0]
+    assert stream.statistics == StreamStatistics(cycles=3, frames=5, missing=1, wrong_length=1)
+
+
+def test_frames_that_nobody_asked_for_are_surplus(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))  # before the first SYNC
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))  # of a foreign node
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))  # another identifier
+    assert next(stream).position_counts == (1, 1)
+    assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=3)
+
+
+def test_too_many_missing_cycles_in_a_row_end_the_stream(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    drop(bus, 0x182, range(1, 100))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 2, 2, 2, 2]
+    with pytest.raises(SampleLost, match="cycle 4: no answer from axis 2"):
+        next(stream)
+
+
+def test_emcy_is_an_event_then_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.inject(bus.nodes[1].emcy(0x7305))
+    sample = next(stream)
+    emcy = next(event for event in events if event.kind is EventKind.EMCY)
+    assert (emcy.axis, emcy.code, emcy.time_ns) == (1, 0x7305, sample.time_ns)
+    with pytest.raises(DriveFault, match=r"node 2: .*7305h") as fault:
+        next(stream)
+    assert fault.value.emcy_code == 0x7305
+
+
+@pytest.mark.parametrize("following_error", [False, True])
+def test_a_new_fault_is_seen_in_the_sample_and_raised_after_it(lockstep: Prepared, following_error: bool) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.nodes[0].fault(following_error)
+    assert next(stream).statusword[0] & 0x08
+    assert any(event.kind is EventKind.STATE and "FAULT" in event.text for event in events)
+    with pytest.raises(DriveFault, match="FAULT"):
+        next(stream)
+
+
+def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.nodes[0].fault()
+    assert [next(stream).cycle for _ in range(3)] == [0, 1, 2]
+
+
+def test_a_limit_that_acts_is_an_event_alone(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.nodes[0].statusword |= 1 << 11
+    next(stream)
+    bus.nodes[0].statusword &= ~(1 << 11)
+    next(stream)
+    assert [event.text for event in events if event.kind is EventKind.LIMIT] == [
+        "J1: a limit acts",
+        "J1: the limit acts no more",
+    ]
+
+
+def test_heartbeat_loss_is_noticed_within_two_and_a_half_periods(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    for _ in range(100):
+        next(stream)
+        bus.clock.now_ns += PERIOD_NS
+    silent_since = stream.time_ns
+    bus.nodes[1].beats = False
+    with pytest.raises(HeartbeatLost, match="node 2"):
+        for _ in range(1000):
+            next(stream)
+            bus.clock.now_ns += PERIOD_NS
+    lost = next(event for event in events if event.kind is EventKind.HEARTBEAT_LOST)
+    assert lost.axis == 1
+    assert lost.time_ns - silent_since <= 2.5 * stream.network.heartbeat_ms * 1_000_000
+
+
+def test_a_fast_simulation_is_no_heartbeat_loss(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.nodes[0].beats = bus.nodes[1].beats = False
+    begin = bus.clock.now_ns
+    for _ in range(100):  # 100 ms of samples in 25 ms of the clock
+        next(stream)
+    assert bus.clock.now_ns - begin < 2 * stream.network.heartbeat_ms * 1_000_000
+
+
+def test_a_node_that_falls_back_is_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    for _ in range(3):
+        next(stream)
+    bus.inject(can.Message(arbitration_id=0x702, is_extended_id=False, data=b"\x7f"))
+    next(stream)
+    assert events[-1].kind is EventKind.NMT
+    with pytest.raises(DriveFault, match="left OPERATIONAL, is PRE-OPERATIONAL"):
+        next(stream)
+
+
+def test_a_cut_wire_is_a_bus_error(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    next(stream)
+    bus.broken = True
+    with pytest.raises(BusError, match="wire was cut"):
+        next(stream)
+    bus.broken = False
+
+
+def test_timed_syncs_keep_to_the_schedule(timed: Prepared) -> None:
+    stream, _, _ = timed
+    times = [next(stream).time_ns for _ in range(20)]
+    assert [time - times[0] for time in times] == [PERIOD_NS * k for k in range(20)]
+
+
+def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    first = next(stream).time_ns
+    bus.clock.now_ns += round(3.5 * PERIOD_NS)
+    second, third = next(stream), next(stream)
+    assert second.cycle == 1
+    assert stream.statistics.skipped_periods == 2
+    assert (third.time_ns - first) % PERIOD_NS == 0
+
+
+def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    drop(bus, 0x181, range(1, 3))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 1, 1, 0, 0]
+    assert [sample.time_ns - samples[0].time_ns for sample in samples] == [PERIOD_NS * k for k in range(5)]
+
+
+@given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
+def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
+    for stream, bus, _ in prepared():
+        stream.max_missing_cycles = 30
+        bus.tamper = lambda m, bus=bus: () if (bus.cycle, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
+        samples = [next(stream) for _ in range(30)]
+        for sample in samples:
+            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (sample.cycle, cob) in dropped)
+            assert sample.missing == expected
+            for axis in range(2):
+                if not sample.missing >> axis & 1:
+                    assert sample.position_counts[axis] == sample.cycle
+        assert stream.statistics.missing == len(dropped)
+        bus.tamper = lambda m: (m,)
