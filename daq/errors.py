@@ -48,7 +48,7 @@ from __future__ import annotations
 from enum import IntEnum
 from pathlib import Path
 
-from drivers.errors import DriverError
+from drivers.errors import DriverError, MotionRefused
 from ident.errors import IdentificationError
 
 
@@ -244,6 +244,7 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (ConfigurationError, ExitCode.CONFIGURATION),
     (OutputFailed, ExitCode.UNEXPECTED),
     (IdentificationError, ExitCode.DATA_UNFIT),
+    (MotionRefused, ExitCode.USAGE),
     (DriverError, ExitCode.DEVICE_FAULT),
 )
 """Exit code of every error class with a cause that a user can act on; the first that fits wins."""

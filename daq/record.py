@@ -22,9 +22,10 @@ from daq.log.readback import readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.plan import Plan, path_of
 from daq.version import software
-from drivers.event import CellEvent, EventKind
+from drivers.errors import MotionRefused
+from drivers.event import CellEvent, EventKind, EventSink
 from drivers.motion import execute
-from drivers.move import AxisLimits, MotionPermission, Move, synchronised_move
+from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.network import CanopenNetwork
 from drivers.pacing import LockstepSync, Pacing, TimedSync
 from drivers.stream import StreamStatistics, SyncStream
@@ -90,10 +91,14 @@ def record(
         progress: told the moves done and their number.
 
     Raises:
+        MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
         ConfigurationInconsistent, OutputExists, OutputFailed: see daq/errors.py.
-        DriverError: from the bus; the axes were stopped, the log stays unfinished (`.part`).
+        DriverError: from the bus; the axes were stopped. What was recorded until then stays in an unfinished log
+            (`.part`), which no fit reads.
     """
     clocks = clocks or Clocks()
+    if granted_by is None:
+        raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
     with network_of(cell) as network:
         network.prepare()
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
@@ -107,22 +112,33 @@ def record(
             started_wall_ns=clocks.wall_ns(),
             started_monotonic_ns=clocks.monotonic_ns(),
         )
+        early: list[CellEvent] = []
+        sinks: list[EventSink] = [early.append]
+
+        def on_event(event: CellEvent) -> None:
+            sinks[-1](event)
+
+        stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
+        # The first sample tells where the axes stand: what is refused there is refused before a file exists.
+        first = next(stream)
+        permission = MotionPermission(granted_by, motor_limits(cell, scale))
+        moves = motor_moves(cell, plan, scale, first.position_counts)
+        check_moves(first.position_counts, moves, permission, cell.axis_names)
         content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
 
-            def on_event(event: CellEvent) -> None:
+            def keep(event: CellEvent) -> None:
                 nonlocal done
                 log.event(event)
                 if event.kind is EventKind.MOVE_END:
                     done += 1
-                    progress(done, len(plan.moves))
+                    progress(done, len(moves))
 
-            stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
-            first = next(stream)
+            for event in early:
+                keep(event)
+            sinks.append(keep)
             log.write(first)
-            permission = None if granted_by is None else MotionPermission(granted_by, motor_limits(cell, scale))
-            moves = motor_moves(cell, plan, scale, first.position_counts)
             with closing(execute(network, stream, moves, permission)) as samples:
                 for sample in samples:
                     log.write(sample)

@@ -99,9 +99,7 @@ def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Non
     samples = len(run.time_s)
     for label, array in (("position", run.position_rad), ("current", run.current_a)):
         if array.shape != (samples, count):
-            raise DataUnfit(
-                run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: a column an axis"
-            )
+            raise DataUnfit(run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: a column an axis")
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             first = f"the first in sample {bad[0][0]}, axis {bad[0][1] + 1}"

@@ -38,9 +38,13 @@ class PlacedEffect:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Its linear parameters, named after effect and axis."""
+        """Its linear parameters, named after effect, axis and settings: an axis may have cogging of two orders."""
         name, number = self.effect.name, self.axis + 1
-        return tuple(Column(f"{name} {column.name} {number}", column.unit) for column in self.effect.coefficients)
+        settings = ", ".join(f"{key} {value:.6g}" for key, value in self.effect.settings.items())
+        suffix = f" ({settings})" if settings else ""
+        return tuple(
+            Column(f"{name} {column.name} {number}{suffix}", column.unit) for column in self.effect.coefficients
+        )
 
 
 @dataclass(frozen=True, slots=True)

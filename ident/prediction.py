@@ -87,8 +87,8 @@ def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
         leading = parameter.name.split()[0] if parameter.name.split() else ""
         if leading not in index:
             raise ModelError(
-                f"the calibration of cell {calibration.cell!r} has a parameter {parameter.name!r}; the model has "
-                f"{model.columns[0].name} to {model.columns[-1].name} of {model.robot.joint_count} joints and no such one"
+                f"the calibration of cell {calibration.cell!r} has a parameter {parameter.name!r}; the model of "
+                f"{model.robot.joint_count} joints has {', '.join(index)}"
             )
         standard[index[leading]] = parameter.value
     return standard
@@ -160,8 +160,8 @@ def _check_mounting(payload: Payload, identified: dict[str, float], mountings: s
     if both:
         raise DataUnfit(
             run,
-            f"says {', '.join(both)} of mounting {payload.mounting!r} beforehand, which the calibration has identified: "
-            "give each way of mounting a name of its own",
+            f"says {', '.join(both)} of mounting {payload.mounting!r} beforehand, and the calibration has identified "
+            "the same: give each way of mounting a name of its own",
         )
     foreign = sorted(set(identified) - set(PAYLOAD_PARAMETERS))
     if foreign:

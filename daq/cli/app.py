@@ -21,13 +21,28 @@ from daq.cli.residual import RESIDUAL
 from daq.cli.rollback import ROLLBACK
 from daq.cli.scan import SCAN
 from daq.cli.simulate import SIMULATE
+from daq.cli.validate import VALIDATE
 from daq.cli.verb import Verb, printable
 from daq.errors import DaqError, ExitCode, exit_code
 from daq.version import software
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
-VERBS: tuple[Verb, ...] = (DEMO, INIT, SCAN, PLAN, RECORD, INFO, IMPORT, FIT, RESIDUAL, APPLY, ROLLBACK, SIMULATE)
+VERBS: tuple[Verb, ...] = (
+    DEMO,
+    INIT,
+    SCAN,
+    PLAN,
+    RECORD,
+    INFO,
+    IMPORT,
+    FIT,
+    RESIDUAL,
+    VALIDATE,
+    APPLY,
+    ROLLBACK,
+    SIMULATE,
+)
 """In the order of the help."""
 
 

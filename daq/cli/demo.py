@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +15,7 @@ from daq.cli.apply import show as show_proposal
 from daq.cli.progress import Stepper
 from daq.cli.residual import before_after_table, ranking_table
 from daq.cli.scan import scan_rows, scan_table
-from daq.cli.verb import JsonOption, Verb, print_json, printable
+from daq.cli.verb import JsonOption, Verb, json_text, print_json
 from daq.demo import Outcome, Settings, Telling, demonstrate, shipped_simulation, summary
 from daq.errors import OutputFailed
 from daq.report.gain_table import gain_table
@@ -36,8 +35,7 @@ def demo(
         with Stepper() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), Telling(stepper.step, stepper.progress))
         document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}
-        text = json_.dumps(printable(document), indent=2, ensure_ascii=False, allow_nan=False)
-        replace_file(out / "summary.json", (text + "\n").encode())
+        replace_file(out / "summary.json", json_text(document).encode())
     except OSError as error:
         raise OutputFailed.of(out, error) from error
     if json:

@@ -29,9 +29,14 @@ class Verb:
     example: str
 
 
+def json_text(document: Any) -> str:
+    """One JSON document; numbers that JSON cannot say become null."""
+    return json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
 def print_json(document: Any) -> None:
-    """One JSON document on stdout; numbers that JSON cannot say become null."""
-    sys.stdout.write(json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    """One JSON document on stdout."""
+    sys.stdout.write(json_text(document))
 
 
 def printable(text: str) -> str:

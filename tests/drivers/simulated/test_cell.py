@@ -242,3 +242,25 @@ def test_impossible_cells_are_refused() -> None:
             SimulatedCell(replace(spec, axes=(spec.axes[0],) * 6), bus)
         with pytest.raises(SpecInvalid, match="substeps"):
             SimulatedCell(replace(spec, substeps=0), bus)
+
+
+def test_a_controlword_acts_on_the_target_in_the_same_frame(request: pytest.FixtureRequest) -> None:
+    spec = clean_cell()
+    with running(spec, request.node.name) as (_, master):
+        master.set_up(SIX)
+        for step in (
+            (0x1400, 1, "I", 0x80000201),
+            (0x1600, 0, "B", 0),
+            (0x1600, 1, "I", 0x60400010),  # before its target, as CiA 402 maps them
+            (0x1600, 2, "I", 0x607A0020),
+            (0x1600, 0, "B", 2),
+            (0x1400, 1, "I", 0x00000201),
+        ):
+            assert master.write(1, *step) == 0
+        for controlword, target in ((0x06, 0), (0x07, 0), (0x0F, 0), (0x1F, 30_000)):
+            master.send(0x201, struct.pack("<Hi", controlword, target))
+            master.sync()
+        for _ in range(500):
+            answer = master.sync()
+        assert answer[0][0] == pytest.approx(30_000, abs=655)
+        assert answer[0][2] & REACHED

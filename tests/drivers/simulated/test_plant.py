@@ -233,3 +233,16 @@ def test_a_plant_that_cannot_be_advanced_says_so() -> None:
     plant = Plant(clean_cell())
     with pytest.raises(FrictionUnsolved, match="residual"):
         plant.step(np.full(6, np.nan))
+
+
+def test_a_motor_on_another_joint_brakes_that_joint() -> None:
+    spec = clean_cell()
+    ratio = spec.ratio.copy()
+    ratio[[0, 1]] = ratio[[1, 0]]  # motor 1 drives joint 2, motor 2 joint 1
+    plant = Plant(replace(spec, ratio=ratio))
+    plant.set_brakes(np.array([False, True, True, True, True, True]))
+    for _ in range(200):
+        plant.step(np.zeros(6))
+    assert plant.velocity_rad_s[1] != 0.0  # joint 2 falls, for the brake of its motor is open
+    assert plant.velocity_rad_s[0] == 0.0
+    assert plant.motor_rad[0] == pytest.approx(32.0 * plant.position_rad[1])

@@ -1,0 +1,173 @@
+"""A calibration put to the test: what it predicts of a run, beside what was measured, under the filter of the fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.configuration.cell import Cell
+from daq.conversion import load_run
+from daq.errors import CalibrationUnreadable, LogsDiffer
+from daq.plan import model_of
+from ident.calibration import Calibration, RelativeError
+from ident.conditioning import Conditioning
+from ident.dataset import differentiate
+from ident.errors import DataUnfit
+from ident.estimate import relative_error
+from ident.model import Model
+from ident.observation import row_filter, row_masks
+from ident.prediction import measured_torque, predict_torque
+from ident.run import Run
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+class Acquaintance(Enum):
+    """Whether a calibration has met a log, by the log's digest."""
+
+    FIT = "seen by the fit"
+    HOLDOUT = "held out of the fit"
+    NEW = "not seen by the fit"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Validation:
+    """One run under a calibration; arrays are joint-first, decimated rows last.
+
+    Attributes:
+        log: where the run was read.
+        run: its name.
+        digest: of the log (sha256, hex).
+        acquaintance: whether the fit has seen it.
+        same_configuration: the log carries the cell configuration that the calibration was made with.
+        time_s: of each row, since the start of the run, shape (r,).
+        measured_nm: V g with the calibration's gains, shape (n, r).
+        predicted_nm: what the calibration says the joints need, shape (n, r).
+        use: rows of each joint that count, shape (n, r).
+    """
+
+    log: Path
+    run: str
+    digest: str
+    acquaintance: Acquaintance
+    same_configuration: bool
+    time_s: FloatArray
+    measured_nm: FloatArray
+    predicted_nm: FloatArray
+    use: BoolArray
+
+    @property
+    def error(self) -> RelativeError:
+        """‖ρ‖/‖Y‖ of each axis and in total [%]."""
+        return relative_error(self.measured_nm, self.predicted_nm, self.use)
+
+    @property
+    def rows(self) -> int:
+        """Equations that count, of all joints."""
+        return int(np.count_nonzero(self.use))
+
+
+def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None = None) -> tuple[Validation, ...]:
+    """Predict every log with a calibration.
+
+    Args:
+        calibration: with the filter of its fit.
+        logs: of the calibration's cell, at any date.
+        cell: another description of the cell than the one that the logs carry.
+
+    Raises:
+        DataError, ConfigurationError: a log cannot be used.
+        LogsDiffer: a log is of another cell.
+        CalibrationUnreadable: the calibration does not say its filter.
+        IdentificationError: the calibration cannot speak of this run: unknown mounting, effect or parameter.
+    """
+    conditioning = conditioning_of(calibration)
+    validations: list[Validation] = []
+    known: tuple[str, Model] | None = None
+    for log in logs:
+        run, described = load_run(log, cell)
+        _check_cell(calibration, log, described)
+        if known is None or known[0] != described.digest:
+            known = (described.digest, model_of(described))
+        validations.append(_validation(calibration, conditioning, known[1], log, run, described.digest))
+    return tuple(validations)
+
+
+def together(validations: Sequence[Validation]) -> RelativeError:
+    """‖ρ‖/‖Y‖ over the rows of several runs [%]; of the logs of the fit, it is the fit's own figure."""
+    return relative_error(
+        np.concatenate([validation.measured_nm for validation in validations], axis=1),
+        np.concatenate([validation.predicted_nm for validation in validations], axis=1),
+        np.concatenate([validation.use for validation in validations], axis=1),
+    )
+
+
+def conditioning_of(calibration: Calibration) -> Conditioning:
+    """The filters of the fit: a relative error may be compared under the same ones only.
+
+    Raises:
+        CalibrationUnreadable: they are not all there.
+    """
+    expected = Conditioning().document()
+    found = calibration.filter
+    numbers = {name: value for name, value in found.items() if not isinstance(value, list)}
+    speeds = found.get("standstill_rad_s")
+    if not isinstance(speeds, list) or numbers.keys() | {"standstill_rad_s"} != expected.keys():
+        raise CalibrationUnreadable(
+            f"calibration of cell {calibration.cell!r}, filter",
+            found=", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing",
+            expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
+            remedy="fit the logs again with this drivegain",
+        )
+    return Conditioning(
+        position_cutoff_hz=numbers["position_cutoff_hz"],
+        position_order=round(numbers["position_order"]),
+        decimation_cutoff_hz=numbers["decimation_cutoff_hz"],
+        standstill_rad_s=tuple(speeds),
+        standstill_share=numbers["standstill_share"],
+    )
+
+
+def _check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
+    axes = tuple(gain.axis for gain in calibration.gains)
+    if (cell.name, cell.axis_names) != (calibration.cell, axes):
+        raise LogsDiffer(
+            str(log),
+            found=f"cell {cell.name!r} with the axes {', '.join(cell.axis_names)}",
+            expected=f"cell {calibration.cell!r} with the axes {', '.join(axes)}, as in the calibration",
+            remedy="give logs of that cell, or the calibration of this one",
+        )
+
+
+def _validation(
+    calibration: Calibration, conditioning: Conditioning, model: Model, log: Path, run: Run, configuration_sha256: str
+) -> Validation:
+    data = differentiate(run, model.drive_train, conditioning)
+    filter_ = row_filter(data, conditioning)
+    use, _ = row_masks(model.drive_train, data, conditioning)
+    if not use.any():
+        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+    return Validation(
+        log=log,
+        run=run.name,
+        digest=run.digest,
+        acquaintance=_acquaintance(calibration, run.digest),
+        same_configuration=configuration_sha256 == calibration.configuration_sha256,
+        time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
+        measured_nm=filter_(measured_torque(calibration, model, data.current_a)),
+        predicted_nm=filter_(predict_torque(calibration, model, data)),
+        use=use,
+    )
+
+
+def _acquaintance(calibration: Calibration, digest: str) -> Acquaintance:
+    roles = {source.role for source in calibration.sources if source.sha256 == digest}
+    if "fit" in roles:
+        return Acquaintance.FIT
+    return Acquaintance.HOLDOUT if "holdout" in roles else Acquaintance.NEW

@@ -1,0 +1,211 @@
+"""Prediction from a calibration alone: the same torque as the estimate's, and the currents that were recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError
+from ident.dataset import Dataset, differentiate
+from ident.effects.cogging import Cogging
+from ident.effects.load_friction import LoadFriction
+from ident.effects.spring import Spring
+from ident.effects.stribeck import Stribeck
+from ident.errors import DataUnfit, EffectRefused, ModelError
+from ident.estimate import Method
+from ident.identify import Identification, PlacedEffect, identify, with_effects
+from ident.observation import decimate_rows, row_masks
+from ident.payload import Payload
+from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
+from ident.run import Run
+from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth
+
+FloatArray = NDArray[np.float64]
+
+AXES = tuple(f"J{number}" for number in range(1, 7))
+
+
+def _calibration(gains: FloatArray, parameters: tuple[Parameter, ...]) -> Calibration:
+    return Calibration(
+        cell="test",
+        method="wls",
+        gains=tuple(Gain(axis, float(gain), 0.0, "Nm/A", 1.0) for axis, gain in zip(AXES, gains, strict=True)),
+        parameters=parameters,
+        effects=(),
+        relative_error_percent=RelativeError((0.0,) * 6, 0.0),
+        holdout_error_percent=None,
+        condition=1.0,
+        rows=1,
+        filter={},
+        sources=(),
+        configuration_sha256="",
+        created="",
+        software="",
+    )
+
+
+def _of(identification: Identification) -> Calibration:
+    estimate = identification.estimate
+    parameters = tuple(
+        Parameter(column.name, float(value), 0.0, column.unit)
+        for column, value in zip(estimate.unknowns, estimate.parameters, strict=True)
+    )
+    effects = []
+    for placed in identification.effects:
+        names = {column.name for column in placed.columns}
+        coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
+        setting = {name: float(value) for name, value in placed.effect.settings.items()}
+        effects.append(AcceptedEffect(placed.effect.name, AXES[placed.axis], setting, coefficients, 1.0, 1.0))
+    return replace(_calibration(estimate.gains, parameters), effects=tuple(effects))
+
+
+def _largest_difference(identification: Identification) -> float:
+    """Of the two predictions on the decimated rows, relative to the largest torque."""
+    calibration = _of(identification)
+    expected = identification.estimate.predicted_torque(identification.training)
+    rows = [
+        decimate_rows(data, CONDITIONING, predict_torque(calibration, identification.model, data))
+        for data in identification.datasets
+    ]
+    return float(np.max(np.abs(np.concatenate(rows, axis=1) - expected)) / np.max(np.abs(expected)))
+
+
+@pytest.fixture(scope="module")
+def identified(truth: Truth, noisy_runs: tuple[Run, ...]) -> Identification:
+    """One run without load and one with, by the classical identification."""
+    return identify(truth.model, noisy_runs[:2], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
+
+
+def test_the_estimates_own_torque_comes_back(identified: Identification) -> None:
+    assert _largest_difference(identified) < 1e-9
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (PlacedEffect(Spring(), 2),),
+        # Motor 6 turns with two joints; two orders on one motor must not be taken for each other.
+        (PlacedEffect(Cogging(2), 5), PlacedEffect(Stribeck(0.12), 1), PlacedEffect(Cogging(6), 5)),
+    ],
+    ids=["spring", "cogging and stribeck"],
+)
+def test_so_does_that_of_effects(identified: Identification, effects: tuple[PlacedEffect, ...]) -> None:
+    after = with_effects(identified, effects)
+    assert _largest_difference(after) < 1e-9
+    without = replace(_of(after), effects=())
+    with pytest.raises(ModelError, match=effects[0].effect.name):
+        standard_parameters(without, identified.model)
+
+
+def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Identification) -> None:
+    """The fit built its columns with the estimate before the last, so the two agree only as the iteration does."""
+    after = with_effects(identified, (PlacedEffect(LoadFriction(), 1),))
+    assert _largest_difference(after) < 1e-4
+
+
+_seeds = st.integers(min_value=0, max_value=2**32 - 1)
+
+
+@given(seed=_seeds)
+@settings(max_examples=10, deadline=None)
+def test_leading_columns_alone_move_as_all_standard_parameters_do(
+    identified: Identification, truth: Truth, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    motion = _random_motion(identified.datasets[0], rng)
+    standard = rng.normal(size=len(truth.model.columns))
+    base = identified.bare.base
+    named = tuple(
+        Parameter(name, float(value), 0.0, "") for name, value in zip(base.names, base.grouping @ standard, strict=True)
+    )
+    columns = truth.model.regressor(motion, slice(None))
+    expected = np.einsum("jck,c->jk", columns, standard)
+    found = predict_torque(_calibration(GAINS, named), truth.model, motion)
+    assert found == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
+
+
+def _random_motion(like: Dataset, rng: np.random.Generator) -> Dataset:
+    position, velocity, acceleration = rng.normal(size=(3, 6, 50))
+    return replace(
+        like,
+        time_s=np.arange(50.0),
+        position_rad=position,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
+        payload=None,
+    )
+
+
+def test_the_true_parameters_predict_the_recorded_current(
+    identified: Identification, truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
+    base = identified.bare.base
+    values = (*base.grouping @ truth.parameters, *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"))
+    names = (*base.names, *(f"{name}:{MOUNTED.mounting}" for name in PAYLOAD_TRUTH if name != "m"))
+    parameters = tuple(Parameter(name, float(value), 0.0, "") for name, value in zip(names, values, strict=True))
+    calibration = _calibration(GAINS, parameters)
+    for run in clean_runs:
+        data = differentiate(run, truth.model.drive_train, CONDITIONING)
+        _, use = row_masks(truth.model.drive_train, data, CONDITIONING)  # at standstill dry friction is undetermined
+        recorded = decimate_rows(data, CONDITIONING, data.current_a)[use]
+        predicted = decimate_rows(data, CONDITIONING, predict_current(calibration, truth.model, data))[use]
+        assert np.linalg.norm(predicted - recorded) < 2e-3 * np.linalg.norm(recorded)
+        torque = measured_torque(calibration, truth.model, predict_current(calibration, truth.model, data))
+        assert torque == pytest.approx(predict_torque(calibration, truth.model, data), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        (Payload("disc", "upside down", {"m": 4.59}), "'upside down', of which the calibration knows nothing.*'a'"),
+        (Payload("disc", "a", {"m": 4.59, "mx": -0.24}), "says mx of mounting 'a' beforehand"),
+    ],
+)
+def test_a_payload_that_the_calibration_does_not_know(identified: Identification, payload: Payload, words: str) -> None:
+    data = replace(identified.datasets[1], payload=payload)
+    with pytest.raises(DataUnfit, match=words):
+        predict_torque(_of(identified), identified.model, data)
+
+
+def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Identification) -> None:
+    calibration, data = _of(identified), identified.datasets[1]
+    full = dict.fromkeys(PAYLOAD_TRUTH, 0.0)
+    weightless = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", full)))
+    bare = predict_torque(calibration, identified.model, replace(data, payload=None))
+    assert weightless == pytest.approx(bare)
+    heavy = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", {**full, "m": 1.0})))
+    assert np.max(np.abs(heavy - bare)) > 5.0  # a kilogram at the flange of an arm of half a metre
+
+
+STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
+
+
+@pytest.mark.parametrize(
+    ("effect", "words"),
+    [
+        (AcceptedEffect("magic", "J3", {}, (), 1.0, 1.0), "no effect 'magic'; there are .*spring"),
+        (AcceptedEffect("spring", "J9", {}, (STIFFNESS,), 1.0, 1.0), "'J9'; there are J1, J2"),
+        (AcceptedEffect("spring", "J3", {"rest": 1.0}, (STIFFNESS,), 1.0, 1.0), "settings rest; it has none"),
+        (AcceptedEffect("stribeck", "J3", {}, (), 1.0, 1.0), "settings none; it has speed_rad_s"),
+        (AcceptedEffect("cogging", "J3", {"order": 2.5}, (), 1.0, 1.0), "whole"),
+        (AcceptedEffect("spring", "J3", {}, (), 1.0, 1.0), "coefficients none; it needs spring stiffness 3"),
+        (AcceptedEffect("spring", "J4", {}, (STIFFNESS,), 1.0, 1.0), "it needs spring stiffness 4"),
+    ],
+)
+def test_an_effect_that_does_not_exist_is_refused(effect: AcceptedEffect, words: str) -> None:
+    with pytest.raises(EffectRefused, match=words):
+        placed_effect(effect, _calibration(GAINS, ()))
+
+
+def test_a_calibration_of_another_robot_is_refused(identified: Identification) -> None:
+    calibration, data = _of(identified), identified.datasets[0]
+    with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
+        predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)
+    seventh = replace(calibration, parameters=(*calibration.parameters, Parameter("Izz7 + 1.0*Ia7", 1.0, 0.0, "")))
+    with pytest.raises(ModelError, match="'Izz7"):
+        predict_torque(seventh, identified.model, data)

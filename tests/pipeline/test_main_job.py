@@ -1,0 +1,104 @@
+"""The whole way: recorded from a simulated cell by the driver, identified, its undeclared effect named, written back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+
+
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One demonstration with short runs; the full length is `make demo`."""
+    out = tmp_path_factory.mktemp("demo") / "out"
+    assert main(["demo", "--out", str(out), "--duration", "15", "--seed", "2"]) == ExitCode.OK
+    return out
+
+
+def test_the_summary_tells_the_whole_story(demonstration: Path) -> None:
+    summary = json.loads((demonstration / "summary.json").read_text())
+    assert [gain["axis"] for gain in summary["gains"]] == [f"J{number}" for number in range(1, 7)]
+    # Runs of 15 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by the root of that ratio.
+    for gain in summary["gains"]:
+        assert abs(gain["error_percent"]) < 2.5
+        assert gain["error_percent"] == pytest.approx(100 * (gain["identified"] / gain["truth"] - 1))
+    assert summary["effect"] == {"name": "load-friction", "axis": "J3"}
+    assert len(summary["effects"]) == 1
+    assert summary["error_after_percent"] < summary["error_before_percent"]
+    assert summary["error_after_percent_axes"][2] < 0.7 * summary["error_before_percent_axes"][2]
+    assert all(log["valid"] and log["lost_cycles"] == 0 for log in summary["logs"])
+    assert summary["applied"]
+
+
+def test_the_copy_of_the_controller_file_has_the_gains_and_every_comment(demonstration: Path, checkout: Path) -> None:
+    original = (checkout / "configs" / "controllers" / "demo.yaml").read_text()
+    written = (demonstration / "controller.yaml").read_text()
+    calibration = yaml.safe_load((demonstration / "calibration.yaml").read_text())
+    drives = yaml.safe_load(written)["drives"]
+    for gain in calibration["gains"]:
+        assert drives[gain["axis"]]["gain"] == pytest.approx(gain["value"], rel=1e-4)
+    assert [line.partition("#")[2] for line in written.splitlines()] == [
+        line.partition("#")[2] for line in original.splitlines()
+    ]
+
+
+def test_the_pictures_are_there(demonstration: Path) -> None:
+    pictures = {path.name for path in demonstration.glob("*.png")}
+    assert pictures == {"torques.png", "gains.png", "residual-J3-load-friction.png"}
+
+
+def test_a_log_is_enough_to_identify_from(
+    demonstration: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = []
+    for name in ("bare-1", "loaded-1", "bare-2", "loaded-2"):
+        elsewhere.append(tmp_path / f"{name}.mcap")
+        elsewhere[-1].write_bytes((demonstration / f"{name}.mcap").read_bytes())
+    assert main(["fit", *map(str, elsewhere), "--json"]) == ExitCode.OK
+    fitted = json.loads(capsys.readouterr().out)
+    assert {"method", "gains", "parameters", "relative_error_percent", "condition", "rows", "filter", "effects"} <= set(
+        fitted
+    )
+    assert set(fitted["gains"][0]) >= {"axis", "value", "std_percent", "unit", "nameplate", "change_percent"}
+    assert set(fitted["parameters"][0]) >= {"name", "value", "unit", "std_percent"}
+    assert len(fitted["relative_error_percent"]["axes"]) == 6
+    assert fitted["method"] == "ml"
+    assert len(fitted["compared"]["tls"]["gains"]) == 6
+
+
+def test_loaded_logs_alone_are_refused(demonstration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", str(demonstration / "loaded-1.mcap")]) == ExitCode.DATA_UNFIT
+    assert "without load too" in capsys.readouterr().err
+
+
+def test_bare_logs_alone_are_refused(demonstration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", str(demonstration / "bare-1.mcap")]) == ExitCode.DATA_UNFIT
+    assert "weighed payload" in capsys.readouterr().err
+
+
+def test_the_wrong_drive_train_shows_in_the_residual(
+    demonstration: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Numerics pitfall: a coupling that the configuration forgets must not pass unseen."""
+    text = (checkout / "configs" / "cells" / "demo.yaml").read_text()
+    assert "[0, 0, 0, 0, 32, 32]" in text
+    changed = text.replace("[0, 0, 0, 0, 32, 32]", "[0, 0, 0, 0, 0, 32]").replace(
+        "../robots", f"{checkout}/configs/robots"
+    )
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(changed)
+    logs = [str(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
+    assert main(["fit", *logs, "--json"]) == ExitCode.OK
+    right = json.loads(capsys.readouterr().out)["relative_error_percent"]["axes"]
+    code = main(["fit", *logs, "--cell", str(cell), "--json"])
+    streams = capsys.readouterr()
+    if code == ExitCode.OK:
+        wrong = json.loads(streams.out)["relative_error_percent"]["axes"]
+        assert max(wrong[4], wrong[5]) > 2 * max(right[4], right[5])
+    else:
+        assert code == ExitCode.DATA_UNFIT

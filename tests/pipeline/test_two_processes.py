@@ -1,0 +1,103 @@
+"""The verbs against `drivegain simulate` in a process of its own, over the hub on 127.0.0.1."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[Path]:
+    """A cell file whose bus is the simulated cell's hub."""
+    folder = tmp_path_factory.mktemp("cell")
+    configs = checkout / "configs"
+    command = [sys.executable, "-m", "daq", "simulate", str(configs / "simulation" / "clean.yaml"), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=checkout) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            found = re.search(r"socketcand:can0@127\.0\.0\.1:(\d+)", line)
+            assert found, line
+            text = (configs / "cells" / "demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+            bus = f"interface: socketcand\n  channel: can0\n  port: {found.group(1)}"
+            path = folder / "cell.yaml"
+            path.write_text(re.sub(r"interface: virtual.*\n  channel: demo", bus, text))
+            yield path
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(timeout=20) == 0
+
+
+def test_scan_finds_six_amplifiers(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", str(cell), "--json"]) == ExitCode.OK
+    nodes = json.loads(capsys.readouterr().out)["nodes"]
+    assert [(node["node_id"], node["axis"], node["verdict"]) for node in nodes] == [
+        (number, f"J{number}", "ok") for number in range(1, 7)
+    ]
+
+
+def test_plan_record_info_and_the_same_plan_again(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan, log = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+    assert main(["plan", str(cell), "--out", str(plan), "--duration", "8", "--exchanges", "10"]) == ExitCode.OK
+    first = plan.read_bytes()
+    assert main(["plan", str(cell), "--out", str(plan), "--duration", "8", "--exchanges", "10"]) == ExitCode.OK
+    assert plan.read_bytes() == first
+    capsys.readouterr()
+    assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion", "--json"]) == ExitCode.OK
+    recorded = json.loads(capsys.readouterr().out)
+    assert recorded["valid"]
+    assert recorded["lost_cycles"] == 0
+    assert recorded["missing"] == [0] * 6
+    assert not list(tmp_path.glob("*.part"))
+    assert main(["info", str(log), "--json"]) == ExitCode.OK
+    assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion"]) == ExitCode.USAGE
+    assert "file of that name" in capsys.readouterr().err
+
+
+def test_nothing_moves_and_nothing_is_written_without_permission(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan, log = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+    assert main(["plan", str(cell), "--out", str(plan), "--duration", "8", "--exchanges", "0"]) == ExitCode.OK
+    assert main(["record", str(cell), str(plan), "--out", str(log)]) == ExitCode.USAGE
+    assert "--enable-motion" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [plan]
+
+
+def test_a_missing_node_is_named_and_leaves_no_log(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = cell.with_name("other.yaml")
+    other.write_text(cell.read_text().replace("node_id: 6", "node_id: 66"))
+    plan, log = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+    assert main(["plan", str(other), "--out", str(plan), "--duration", "8", "--exchanges", "0"]) == ExitCode.OK
+    code = main(["record", str(other), str(plan), "--out", str(log), "--enable-motion"])
+    assert code == ExitCode.DEVICE_FAULT
+    assert "node 66" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [plan]
+    assert main(["scan", str(other)]) == ExitCode.DEVICE_FAULT
+
+
+def test_another_amplifier_than_configured_is_refused(
+    cell: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = cell.with_name("exchanged.yaml")
+    other.write_text(cell.read_text().replace("serial: 1003", "serial: 9999"))
+    plan, log = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+    assert main(["plan", str(other), "--out", str(plan), "--duration", "8", "--exchanges", "0"]) == ExitCode.OK
+    code = main(["record", str(other), str(plan), "--out", str(log), "--enable-motion"])
+    assert code == ExitCode.DEVICE_FAULT
+    assert "0x270f" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [plan]
