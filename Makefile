@@ -9,14 +9,14 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test check bench wheel lock clean
+.PHONY: help setup demo test check gain-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
-	@echo "make bench   measure, slowly"
+	@echo "make gain-study  errors of the gains over several clean simulated cells (docs/estimators.md); minutes"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
 	@echo "make clean   remove .venv and everything made"
@@ -51,8 +51,8 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: setup
-	$(BIN)/python -m pytest -q -s tests/bench
+gain-study: setup
+	$(BIN)/python -m tests.studies.clean_cells
 
 wheel: setup
 	$(BIN)/python -m pip wheel -qq --no-deps --no-build-isolation --wheel-dir dist .

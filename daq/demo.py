@@ -13,32 +13,25 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from daq.apply import Proposal, apply, propose
 from daq.calibration_file import as_document, save
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import load_cell
 from daq.configuration.simulation import load_simulation
-from daq.controller_write import Written
 from daq.errors import UsageError
 from daq.fit import Fit, calibration_of, close_loop, fit
 from daq.plan import Plan, plan
 from daq.plan_file import save_plan
 from daq.record import Recorded, network_of, record
-from daq.report.gains import plot_gains
-from daq.report.residual import plot_residual
-from daq.report.torque import plot_torques
+from daq.report.fit import draw
 from daq.resources import shipped_configurations
+from daq.write_back.apply import Proposal, apply, propose
+from daq.write_back.controller_write import Written
 from drivers.bus import open_bus
 from drivers.scan import FoundNode
 from drivers.simulated.cell import SimulatedCell
 from ident.calibration import Calibration
-from ident.effects.effect import along
 from ident.identify import Identification
-from ident.observation import decimate_rows
-from ident.signals import signals
 
 PLANS = ("a", "b", "c")
 RUNS = (
@@ -189,56 +182,6 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "controller_diff": outcome.proposal.diff,
         "applied": outcome.written is not None,
     }
-
-
-def draw(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
-    """Torques of the unused run (paper Fig. 2), residual before and after each effect, and the gains.
-
-    Raises:
-        OSError: from the file system.
-    """
-    final = fitted.final
-    names = fitted.cell.axis_names
-    rows = final.holdout if final.holdout is not None else final.training.only(final.training.run == 0)
-    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
-    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
-    which = "a run not used in the fit" if final.holdout is not None else "the first run of the fit"
-    plot_torques(out / "torques.png", rows.time_s, measured, predicted, names, title=f"Joint torques of {which}")
-    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
-    before = fitted.identification
-    for step in fitted.steps:
-        if step.accepted is not None:
-            _draw_effect(before, step.after, names, out)
-            before = step.after
-
-
-def _draw_effect(before: Identification, after: Identification, names: tuple[str, ...], out: Path) -> None:
-    placed = after.effects[-1]
-    index = after.held_out[0] if after.held_out else 0
-    rows_before = before.holdout if before.holdout is not None else before.training
-    rows_after = after.holdout if after.holdout is not None else after.training
-    chosen = rows_after.run == index
-    data = after.datasets[index]
-    seen = signals(after.model, data, after.training, after.estimate)
-    variable, velocity = (
-        decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along(placed.effect.abscissa, seen, placed.axis), data.velocity_rad_s[placed.axis])
-    )
-    use = rows_after.use[placed.axis, chosen]
-    residuals = (
-        np.where(use, identification.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
-        for identification, rows in ((before, rows_before), (after, rows_after))
-    )
-    name = names[placed.axis]
-    plot_residual(
-        out / f"residual-{name}-{placed.effect.name}.png",
-        rows_after.time_s[chosen],
-        *residuals,
-        variable=variable,
-        variable_label=placed.effect.abscissa.value,
-        velocity_rad_s=velocity,
-        title=f"{name}: {placed.effect.name}, run {data.name}",
-    )
 
 
 def _make_room(out: Path, logs: tuple[Path, ...]) -> None:

@@ -32,8 +32,8 @@ class Acquaintance(Enum):
     """Whether a calibration has met a log, by the log's digest."""
 
     FIT = "seen by the fit"
-    HOLDOUT = "held out of the fit"
-    NEW = "not seen by the fit"
+    HOLDOUT = "held out"
+    NEW = "not seen"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

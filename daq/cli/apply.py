@@ -12,14 +12,14 @@ from rich.console import Console
 from rich.syntax import Syntax
 from rich.table import Table
 
-from daq.apply import Proposal, apply, propose, refused
-from daq.apply_gates import ApplyPolicy, GainChange
 from daq.calibration_file import load
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
-from daq.controller_write import Written
 from daq.errors import ConfigurationInconsistent, ControllerChanged, OutputFailed
 from daq.report.gain_table import with_deviation
+from daq.write_back.apply import Proposal, apply, propose, refused
+from daq.write_back.controller_write import Written
+from daq.write_back.gates import ApplyPolicy, GainChange
 
 _DEFAULT = ApplyPolicy()
 

@@ -18,6 +18,7 @@ from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed
 from daq.fit import Fit, calibration_of, fit
+from daq.report.fit import draw
 from daq.report.gain_table import gain_table
 from ident.calibration import Calibration
 from ident.estimate import Method
@@ -36,6 +37,7 @@ HoldoutOption = Annotated[
     typer.Option("--holdout", help="Log that the fit must not see, for the final figure; repeatable."),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
+PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is made.")]
 CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
 
@@ -49,6 +51,7 @@ def fit_verb(
     gains: GainsOption = Gains.FREE,
     holdout: HoldoutOption = None,
     out: OutOption = None,
+    pictures: PicturesOption = None,
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -64,6 +67,8 @@ def fit_verb(
         calibration = calibration_of(fitted, datetime.now(UTC))
     if out is not None:
         save_calibration(calibration, out)
+    if pictures is not None:
+        save_pictures(fitted, calibration, pictures)
     if json:
         print_json({**as_document(calibration), **compared(fitted)})
     else:
@@ -80,6 +85,19 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
         save(calibration, path)
     except OSError as error:
         raise OutputFailed.of(path, error) from error
+
+
+def save_pictures(fitted: Fit, calibration: Calibration, folder: Path) -> None:
+    """Torques, gains, and the residual before and after each effect.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        draw(fitted, calibration, None, folder)
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
 
 
 def compared(fitted: Fit) -> dict[str, Any]:

@@ -12,7 +12,17 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.calibration_file import as_document
-from daq.cli.fit import CellOption, Gains, GainsOption, HoldoutOption, LogsArgument, OutOption, save_calibration
+from daq.cli.fit import (
+    CellOption,
+    Gains,
+    GainsOption,
+    HoldoutOption,
+    LogsArgument,
+    OutOption,
+    PicturesOption,
+    save_calibration,
+    save_pictures,
+)
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
@@ -34,6 +44,7 @@ def residual_verb(
         int, typer.Option(help="Of the significance test; the same seed gives the same verdict.", min=0)
     ] = 0,
     out: OutOption = None,
+    pictures: PicturesOption = None,
     cell: CellOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -50,6 +61,8 @@ def residual_verb(
         calibration = calibration_of(closed, datetime.now(UTC))
     if out is not None:
         save_calibration(calibration, out)
+    if pictures is not None:
+        save_pictures(closed, calibration, pictures)
     if json:
         print_json({**as_document(calibration), **report(closed)})
     else:

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.syntax import Syntax
 
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.controller_write import Written, roll_back
 from daq.errors import OutputFailed
+from daq.write_back.controller_write import Written, roll_back
 
 
 def rollback(

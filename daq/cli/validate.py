@@ -20,7 +20,7 @@ from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed
 from daq.report.torque import plot_torques
-from daq.validate import Acquaintance, Validation, together, validate
+from daq.validate import Acquaintance, Validation, conditioning_of, together, validate
 from ident.calibration import Calibration, RelativeError
 
 
@@ -104,12 +104,15 @@ def show(
 ) -> None:
     """The errors, what they rest on and where the pictures are, for a person."""
     console.print(error_table(calibration, validations))
-    filter_ = ", ".join(f"{name} {value}" for name, value in calibration.filter.items() if not isinstance(value, list))
-    console.print(f"Filter of the fit: {filter_}.")
+    filter_ = conditioning_of(calibration)
+    console.print(
+        f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
+        "fit: a relative error means nothing without them."
+    )
     for validation in validations:
         if not validation.same_configuration:
             console.print(
-                f"{printable(str(validation.log))} carries another cell configuration than the calibration was made with: "
+                f"{printable(str(validation.log))} carries another cell configuration than the logs of the fit: "
                 "look at what has changed.",
                 style="bold",
                 markup=False,
@@ -126,12 +129,12 @@ def error_table(calibration: Calibration, validations: tuple[Validation, ...]) -
     table.add_column("log")
     for heading in (*(gain.axis for gain in calibration.gains), "total"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("")
+    table.add_column("", no_wrap=True)
     for validation in validations:
         table.add_row(Text(printable(validation.run)), *_cells(validation.error), validation.acquaintance.value)
     if len(validations) > 1:
-        table.add_row("together", *_cells(together(validations)), "")
-    table.add_row("fit", *_cells(calibration.relative_error_percent), "as the calibration says")
+        table.add_row("together", *_cells(together(validations)))
+    table.add_row("fit", *_cells(calibration.relative_error_percent))
     return table
 
 

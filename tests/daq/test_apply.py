@@ -16,13 +16,13 @@ from pathlib import Path
 
 import pytest
 
-from daq.apply import Proposal, apply, propose, refused
-from daq.apply_gates import ApplyPolicy, Gate
 from daq.calibration_file import save
 from daq.cli.app import main
 from daq.configuration.cell_file import load_cell
-from daq.controller_write import backups, roll_back
 from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit, exit_code
+from daq.write_back.apply import Proposal, apply, propose, refused
+from daq.write_back.controller_write import backups, roll_back
+from daq.write_back.gates import ApplyPolicy, Gate
 from ident.calibration import Calibration, Gain, RelativeError, Source
 from tests.daq.calibrations import AXES, KEYS, demo_calibration
 

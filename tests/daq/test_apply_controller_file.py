@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from daq.controller_file import ControllerFile, decode
 from daq.errors import ControllerUnfit
-from daq.gain_spelling import spell
+from daq.write_back.controller_file import ControllerFile, decode
+from daq.write_back.gain_spelling import spell
 
 _words = st.text("abcdefghijklmnopqrstuvwxyzé_", min_size=1, max_size=6).filter(
     lambda word: word not in ("y", "n", "no", "on", "off", "yes", "true", "false", "null", "gain")

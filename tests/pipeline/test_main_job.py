@@ -1,4 +1,4 @@
-"""The whole way: recorded from a simulated cell by the driver, identified, its undeclared effect named, written back."""
+"""The whole way: recorded from a simulated cell by the driver, identified, its effect named, written back."""
 
 from __future__ import annotations
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from daq.apply_gates import ApplyPolicy, GainChange, Refusal, calibration_refusals, gain_refusals
-from daq.controller_file import ControllerFile, Scalar, decode, read_bytes
-from daq.controller_write import Written, sha256, write
 from daq.errors import CalibrationRefused, ControllerUnfit
-from daq.gain_spelling import spell
+from daq.write_back.controller_file import ControllerFile, Scalar, decode, read_bytes
+from daq.write_back.controller_write import Written, sha256, write
+from daq.write_back.gain_spelling import spell
+from daq.write_back.gates import ApplyPolicy, GainChange, Refusal, calibration_refusals, gain_refusals
 from ident.calibration import Calibration, Gain
 
 
@@ -97,7 +97,7 @@ def apply(proposal: Proposal, now: datetime) -> Written | None:
 
     Raises:
         CalibrationRefused: a gate is closed, with every one of them.
-        ControllerChanged, ControllerBusy: see `daq.controller_write.write`.
+        ControllerChanged, ControllerBusy: see `daq.write_back.controller_write.write`.
         OSError: from the file system; the file stands as it was.
     """
     if proposal.refusals:

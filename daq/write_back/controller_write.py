@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 
 from daq.atomic_file import replace_file
-from daq.controller_file import decode, read_bytes
 from daq.errors import BackupMissing, ControllerBusy, ControllerChanged
+from daq.write_back.controller_file import decode, read_bytes
 
 _STAMP = "%Y%m%dT%H%M%SZ"
 

@@ -1,0 +1,67 @@
+"""The pictures of a fit: torques as the paper's Fig. 2, the gains, and the residual before and after each effect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from daq.fit import Fit
+from daq.report.gains import plot_gains
+from daq.report.residual import plot_residual
+from daq.report.torque import plot_torques
+from ident.calibration import Calibration
+from ident.effects.effect import along
+from ident.identify import Identification
+from ident.observation import decimate_rows
+from ident.signals import signals
+
+
+def draw(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
+    """Torques of the unused run (paper Fig. 2), residual before and after each effect, and the gains.
+
+    Raises:
+        OSError: from the file system.
+    """
+    final = fitted.final
+    names = fitted.cell.axis_names
+    rows = final.holdout if final.holdout is not None else final.training.only(final.training.run == 0)
+    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
+    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
+    which = "a run not used in the fit" if final.holdout is not None else "the first run of the fit"
+    plot_torques(out / "torques.png", rows.time_s, measured, predicted, names, title=f"Joint torques of {which}")
+    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
+    before = fitted.identification
+    for step in fitted.steps:
+        if step.accepted is not None:
+            _draw_effect(before, step.after, names, out)
+            before = step.after
+
+
+def _draw_effect(before: Identification, after: Identification, names: tuple[str, ...], out: Path) -> None:
+    placed = after.effects[-1]
+    index = after.held_out[0] if after.held_out else 0
+    rows_before = before.holdout if before.holdout is not None else before.training
+    rows_after = after.holdout if after.holdout is not None else after.training
+    chosen = rows_after.run == index
+    data = after.datasets[index]
+    seen = signals(after.model, data, after.training, after.estimate)
+    variable, velocity = (
+        decimate_rows(data, rows_after.conditioning, column[None])[0]
+        for column in (along(placed.effect.abscissa, seen, placed.axis), data.velocity_rad_s[placed.axis])
+    )
+    use = rows_after.use[placed.axis, chosen]
+    residuals = (
+        np.where(use, identification.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
+        for identification, rows in ((before, rows_before), (after, rows_after))
+    )
+    name = names[placed.axis]
+    plot_residual(
+        out / f"residual-{name}-{placed.effect.name}.png",
+        rows_after.time_s[chosen],
+        *residuals,
+        variable=variable,
+        variable_label=placed.effect.abscissa.value,
+        velocity_rad_s=velocity,
+        title=f"{name}: {placed.effect.name}, run {data.name}",
+    )
