@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident.base_parameters import BaseParameters, base_parameters
-from ident.conditioning import Conditioning, Decimator, decimator
+from ident.conditioning import Conditioning
 from ident.dataset import Dataset
 from ident.drive_train import DriveTrain
 from ident.errors import DataUnfit, RankDeficient
 from ident.model import Column, Model
+from ident.rows import chunks, row_filter, row_masks
 from ident.payload import PAYLOAD_PARAMETERS, Payload
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
-
-CHUNK_ROWS = 256
-"""Decimated rows built at once: the regressor of their samples stays in the cache's reach."""
-
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -180,45 +177,6 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     return _with_payloads(observation)
 
 
-def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
-    """Parallel decimation of full-rate columns of a run to the observation's rows: shape (..., k) → (..., r)."""
-    return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
-
-
-def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
-    """The parallel decimation of a run's columns to rows.
-
-    Raises:
-        DataUnfit: the run is too short for it.
-    """
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
-    samples = len(data.time_s)
-    if filter_.rows(samples) < 10:
-        raise DataUnfit(
-            data.name,
-            f"{samples / data.rate_hz:.2g} s are too short to decimate at {conditioning.decimation_cutoff_hz:g} Hz",
-        )
-    return filter_
-
-
-def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
-    """Rows of each joint, and of each motor, that count (Observation.use, .motor_use), both of shape (n, r)."""
-    filter_ = row_filter(data, conditioning)
-    # A row's share of standstill is weighted as the filter weights its samples.
-    window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
-    share = conditioning.standstill_share
-    use = (window((~data.moving).astype(np.float64)) <= share) & (window((~data.valid).astype(np.float64)) == 0.0)
-    motor_still = window((~data.motor_moving).astype(np.float64)) > share
-    # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
-    needed = np.abs(drive_train.to_motor) > 0
-    turned = np.abs(drive_train.direction) > 0
-    motor_use = np.stack([use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))])
-    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
-    for motor in drive_train.coupled:
-        use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
-    return use, motor_use
-
-
 @dataclass(frozen=True, slots=True)
 class _Part:
     standard: FloatArray
@@ -229,17 +187,10 @@ class _Part:
     move: IntArray
 
 
-def _chunks(filter_: Decimator, samples: int) -> Iterator[slice]:
-    rows = filter_.rows(samples)
-    for first in range(0, rows, CHUNK_ROWS):
-        last = min(first + CHUNK_ROWS, rows) - 1
-        yield slice(first * filter_.factor, last * filter_.factor + 2 * filter_.half + 1)
-
-
 def _decimated(model: Model, data: Dataset, conditioning: Conditioning) -> _Part:
     filter_ = row_filter(data, conditioning)
     samples = len(data.time_s)
-    standard = np.concatenate([filter_(model.regressor(data, part)) for part in _chunks(filter_, samples)], axis=2)
+    standard = np.concatenate([filter_(model.regressor(data, part)) for part in chunks(filter_, samples)], axis=2)
     use, motor_use = row_masks(model.drive_train, data, conditioning)
     centres = filter_.centres(samples)
     time_s = data.time_s[centres] - data.time_s[0]

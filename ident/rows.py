@@ -1,0 +1,66 @@
+"""Which rows a run gives: the filter that makes them, the samples behind each, and whether it counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.conditioning import Conditioning, Decimator, decimator
+from ident.dataset import Dataset
+from ident.drive_train import DriveTrain
+from ident.errors import DataUnfit
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+CHUNK_ROWS = 256
+"""Decimated rows built at once: the regressor of their samples stays in the cache's reach."""
+
+
+def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
+    """The parallel decimation of a run's columns to rows.
+
+    Raises:
+        DataUnfit: the run is too short for it.
+    """
+    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    samples = len(data.time_s)
+    if filter_.rows(samples) < 10:
+        raise DataUnfit(
+            data.name,
+            f"{samples / data.rate_hz:.2g} s are too short to decimate at {conditioning.decimation_cutoff_hz:g} Hz",
+        )
+    return filter_
+
+
+def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
+    """Parallel decimation of full-rate columns of a run to the observation's rows: shape (..., k) → (..., r)."""
+    return decimator(data.rate_hz, conditioning.decimation_cutoff_hz)(columns)
+
+
+def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> tuple[BoolArray, BoolArray]:
+    """Rows of each joint, and of each motor, that count (Observation.use, .motor_use), both of shape (n, r)."""
+    filter_ = row_filter(data, conditioning)
+    # A row's share of standstill is weighted as the filter weights its samples.
+    window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
+    share = conditioning.standstill_share
+    use = (window((~data.moving).astype(np.float64)) <= share) & (window((~data.valid).astype(np.float64)) == 0.0)
+    motor_still = window((~data.motor_moving).astype(np.float64)) > share
+    # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
+    needed = np.abs(drive_train.to_motor) > 0
+    turned = np.abs(drive_train.direction) > 0
+    motor_use = np.stack([use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))])
+    # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it turns with.
+    for motor in drive_train.coupled:
+        use &= ~(turned[motor][:, None] & motor_still[motor][None, :])
+    return use, motor_use
+
+
+def chunks(filter_: Decimator, samples: int) -> Iterator[slice]:
+    """Pieces of a run's samples, each with the whole windows of up to CHUNK_ROWS rows."""
+    rows = filter_.rows(samples)
+    for first in range(0, rows, CHUNK_ROWS):
+        last = min(first + CHUNK_ROWS, rows) - 1
+        yield slice(first * filter_.factor, last * filter_.factor + 2 * filter_.half + 1)
