@@ -16,7 +16,8 @@ from daq.atomic_file import replace_file
 from daq.calibration_schema import CalibrationDocument, calibration_of
 from daq.configuration.yaml_file import parse_yaml, read_model
 from daq.errors import CalibrationEdited, CalibrationMissing, CalibrationUnreadable, SchemaMismatch, YamlInvalid
-from ident.calibration import Calibration, Gain, Parameter, RelativeError
+from ident.calibration import Calibration, Gain, Parameter
+from ident.relative_error import RelativeError
 
 VERSION = 1
 _ENVELOPE = ("format", "version", "digests")

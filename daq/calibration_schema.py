@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from daq.configuration.yaml_file import StrictModel
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError, Source
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.relative_error import RelativeError
 
 _Deviation = Annotated[float, Field(ge=0.0)]
 

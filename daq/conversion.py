@@ -29,6 +29,8 @@ LIMIT_MARGIN = 0.05
 """Share of a joint's range by which positions may leave its limits."""
 LARGEST_SATURATED = 0.1
 """Share of the samples of an axis in which a limit may act; they are masked."""
+STEP_TOLERANCE = 0.2
+"""Share of a period by which one time stamp may be nearer to, or further from, the one before."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the rate asked for and the one that the time stamps show."""
 
@@ -112,7 +114,7 @@ def run_from_log(log: Log, cell: Cell) -> Run:
     Raises:
         RunInvalid: its recorder marked it invalid.
         CyclesLost: SYNC cycles are missing.
-        ClockImplausible: the time stamps show another rate.
+        ClockImplausible: the time stamps show another rate, or one of them comes early or late.
         CurrentSaturated: a limit acted in more than a tenth of an axis's samples.
         PositionImplausible: positions far outside the joint limits.
         LogIncomplete: cell and log do not belong together.
@@ -127,7 +129,7 @@ def run_from_log(log: Log, cell: Cell) -> Run:
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)
-    position_rad = scale.joint_position(samples.position_counts)
+    position_rad = scale.joint_position(_positions(log))
     valid = _answered(samples) & ~_saturated(samples, cell)
     _check_saturation(str(log.path), samples, cell)
     check_limits(str(log.path), position_rad, cell, valid)
@@ -184,6 +186,24 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
             )
 
 
+def unwrapped(counts: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Positions of an encoder counter of 32 bits that may have run over, shape (k, n).
+
+    From sample to sample a jump of more than half the range is a wrap: no motor makes 2³¹ counts in one period. The
+    first sample is taken as it is.
+    """
+    # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
+    steps = np.diff(counts.astype(np.int32).view(np.uint32), axis=0).view(np.int32)
+    return np.concatenate((counts[:1].astype(np.int64), steps)).cumsum(axis=0, dtype=np.int64)
+
+
+def _positions(log: Log) -> NDArray[np.int64]:
+    """Motor counts, unwrapped where they are an encoder's and not numbers that an import has scaled, shape (k, n)."""
+    counts = log.samples.position_counts
+    counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
+    return np.where(counter, unwrapped(counts), counts)
+
+
 def _answered(samples: SampleBlock) -> NDArray[np.bool_]:
     """Whether the axis answered the SYNC, shape (k, n)."""
     bits = np.arange(samples.position_counts.shape[1], dtype=np.uint32)
@@ -222,6 +242,7 @@ def _check_cycles(log: Log, rate_hz: float) -> None:
             expected="every SYNC cycle once",
             remedy="record again with less load on the bus and the computer; lost cycles are never interpolated",
         )
+    _check_steps(log, rate_hz)
     duration_s = float(time_ns[-1] - time_ns[0]) * 1e-9
     stamped_hz = (len(cycle) - 1) / duration_s if duration_s > 0.0 else 0.0
     if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
@@ -230,4 +251,20 @@ def _check_cycles(log: Log, rate_hz: float) -> None:
             found=f"time stamps at {stamped_hz:.6g} Hz",
             expected=f"{rate_hz:.6g} Hz, as asked for",
             remedy="was the computer's clock set during the run? record it again",
+        )
+
+
+def _check_steps(log: Log, rate_hz: float) -> None:
+    """Every SYNC in its time: central differences take the samples as evenly spaced."""
+    cycle, period_ns = log.samples.cycle, 1e9 / rate_hz
+    step_ns = np.diff(log.samples.time_ns)
+    off = np.abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns
+    if off.any():
+        first = int(np.argmax(off))
+        raise ClockImplausible(
+            str(log.path),
+            found=f"cycle {cycle[first + 1]} {step_ns[first] * 1e-6:.4g} ms after cycle {cycle[first]} "
+            f"({np.count_nonzero(off)} such steps)",
+            expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
+            remedy="SYNC came late: record again with less load on the computer, or with a longer sync.period_us",
         )

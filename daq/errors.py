@@ -30,7 +30,7 @@ DaqError
 │   └── RunUnfit
 │       ├── RunInvalid          the recorder itself marked it invalid
 │       ├── CyclesLost          SYNC cycles are missing
-│       ├── ClockImplausible    the time stamps show another rate than was asked for
+│       ├── ClockImplausible    the time stamps show another rate than was asked for, or uneven steps
 │       ├── CurrentSaturated    a limit acted in too large a part of the run
 │       └── PositionImplausible far outside the joint limits: deg for rad, or a wrong drive train
 ├── ConfigurationError          a configuration file is wrong                                 exit 6
@@ -62,6 +62,7 @@ class ExitCode(IntEnum):
     DATA_UNFIT = 4
     DEVICE_FAULT = 5
     CONFIGURATION = 6
+    INTERRUPTED = 130
 
 
 class DaqError(Exception):
@@ -192,7 +193,7 @@ class CyclesLost(RunUnfit):
 
 
 class ClockImplausible(RunUnfit):
-    """The time stamps show another rate than was asked for."""
+    """The time stamps show another rate than was asked for, or uneven steps."""
 
 
 class CurrentSaturated(RunUnfit):

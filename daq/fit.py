@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from daq.configuration.cell import Cell
+from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
 from daq.errors import LogsDiffer
-from daq.plan import model_of
 from daq.version import software
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError, Source
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.estimate import Estimate, Method
 from ident.estimators.total_least_squares import tls
 from ident.identify import Identification, Step, close_the_loop, identify
+from ident.relative_error import RelativeError
 from ident.run import Run
 
 

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
+from daq.configuration.cell_model import model_of
 from daq.errors import PlanUnfit
 from drivers.trapezoid import Trapezoid, synchronised
-from ident.drive_train import DriveTrain
-from ident.excitation import Motion, condition, independent_columns, weighted_columns
-from ident.model import Model
-from ident.robot import robot_from_urdf
+from ident.excitation import condition, independent_columns, weighted_columns
+from ident.motion import Motion
 
 FloatArray = NDArray[np.float64]
 
@@ -59,11 +58,6 @@ class Plan:
     condition: float
     duration_s: float
     moves: tuple[PlannedMove, ...]
-
-
-def model_of(cell: Cell) -> Model:
-    """The declared model of a cell."""
-    return Model(robot_from_urdf(cell.urdf, cell.gravity_m_s2), DriveTrain(cell.ratio))
 
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
@@ -188,13 +182,10 @@ class _Draft:
         return duration_of(self.cell, self.moves)
 
 
-def slowed(plan_: Plan, override: float) -> Plan:
-    """The same moves at a share of their speed, as for a first run: times stretch by 1/override."""
-    return replace(
-        plan_,
-        duration_s=plan_.duration_s / override,
-        moves=tuple(
-            replace(move, velocity=move.velocity * override, acceleration=move.acceleration * override**2)
-            for move in plan_.moves
-        ),
+def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
+    """The same ways at a share of their speed, as for a first run; the condition is that of the plan as it was made."""
+    moves = tuple(
+        replace(move, velocity=move.velocity * override, acceleration=move.acceleration * override**2)
+        for move in plan_.moves
     )
+    return replace(plan_, duration_s=duration_of(cell, moves), moves=moves)

@@ -28,6 +28,7 @@ from drivers.motion import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.network import CanopenNetwork
 from drivers.pacing import LockstepSync, Pacing, TimedSync
+from drivers.sample import Sample
 from drivers.stream import StreamStatistics, SyncStream
 from ident.payload import Payload
 
@@ -119,11 +120,12 @@ def record(
             sinks[-1](event)
 
         stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
-        # The first sample tells where the axes stand: what is refused there is refused before a file exists.
-        first = next(stream)
+        # The first samples tell where the axes stand: what is refused there is refused before a file exists.
+        first = until_complete(stream)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        moves = motor_moves(cell, plan, scale, first.position_counts)
-        check_moves(first.position_counts, moves, permission, cell.axis_names)
+        start_counts = first[-1].position_counts
+        moves = motor_moves(cell, plan, scale, start_counts)
+        check_moves(start_counts, moves, permission, cell.axis_names)
         content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
@@ -138,12 +140,26 @@ def record(
             for event in early:
                 keep(event)
             sinks.append(keep)
-            log.write(first)
+            for sample in first:
+                log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
                 for sample in samples:
                     log.write(sample)
             log.conclude(*_verdict(stream.statistics))
         return Recorded(out, log.statistics, stream.statistics)
+
+
+def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
+    """Samples up to the first in which every axis says where it is; before that no move can be planned.
+
+    Raises:
+        SampleLost: there is none within the cycles that the stream tolerates without one.
+        DriverError: from the bus.
+    """
+    samples = [next(stream)]
+    while samples[-1].missing:
+        samples.append(next(stream))  # the stream's own bound on incomplete cycles in a row ends this
+    return tuple(samples)
 
 
 def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
@@ -186,11 +202,14 @@ def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[i
 
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
-    """Whether a run may be used: a loss that nobody has explained makes it invalid."""
+    """Whether a run may be used: whatever the stream cannot explain makes it invalid."""
     losses = {
         "missing answers": statistics.missing,
         "late answers": statistics.late,
         "answers of wrong length": statistics.wrong_length,
+        "answers twice": statistics.duplicate,
+        "PDOs that no axis was told to send": statistics.surplus,
+        "periods without SYNC": statistics.skipped_periods,
     }
     found = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
     return not found, found
@@ -208,4 +227,4 @@ def _pacing(cell: Cell, run: RunInfo, clocks: Clocks) -> Pacing:
     sync = _sync(cell)
     if sync.pacing is declared.Pacing.LOCKSTEP:
         return LockstepSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)
-    return TimedSync(sync.period_us * 1000, clocks.monotonic_ns)
+    return TimedSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
+from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
 from daq.errors import CalibrationUnreadable, LogsDiffer
-from daq.plan import model_of
-from ident.calibration import Calibration, RelativeError
+from ident.calibration import Calibration
 from ident.conditioning import Conditioning
 from ident.dataset import differentiate
 from ident.errors import DataUnfit
-from ident.estimate import relative_error
 from ident.model import Model
-from ident.observation import row_filter, row_masks
 from ident.prediction import measured_torque, predict_torque
+from ident.relative_error import RelativeError, relative_error
+from ident.rows import row_filter, row_masks
 from ident.run import Run
 
 FloatArray = NDArray[np.float64]

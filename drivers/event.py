@@ -18,7 +18,6 @@ class EventKind(Enum):
     LIMIT = "limit"
     HEARTBEAT_LOST = "heartbeat lost"
     SAMPLE_LOST = "sample lost"
-    BUS = "bus"
     MOVE_START = "move start"
     MOVE_END = "move end"
     STOP = "stop"
@@ -30,7 +29,7 @@ class CellEvent:
     """One event of the cell.
 
     Attributes:
-        time_ns: in the time of the samples [ns]: the SYNC it came after.
+        time_ns: in the time of the samples [ns since 1970]: that of the SYNC it came after.
         axis: index of the axis from 0, or None when it concerns the whole cell.
         kind: what happened.
         code: EMCY error code, NMT state, statusword, number of the move or of the cycle, by kind.

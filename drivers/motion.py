@@ -20,6 +20,7 @@ from drivers.sample import Sample
 from drivers.state import (
     CONTROL_CHANGE_IMMEDIATELY,
     CONTROL_NEW_SETPOINT,
+    POWERLESS,
     STATUS_SETPOINT_ACKNOWLEDGE,
     STATUS_TARGET_REACHED,
     Command,
@@ -31,7 +32,6 @@ from drivers.state import (
 from drivers.stream import SyncStream
 
 _LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
-_POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.UNKNOWN)
 _ENABLED = Command.ENABLE_OPERATION
 
 
@@ -44,7 +44,10 @@ class MotionBounds:
         acknowledge_s: from a set-point to bit 12, and from its end to bit 12 cleared.
         settle_s: added to a move's computed duration.
         stop_s: from the quick stop to standstill without power.
-        standstill_cycles: of unchanged position, before power is taken from an axis that stays in QUICK STOP ACTIVE.
+        standstill_cycles, standstill_counts: an axis that stays in QUICK STOP ACTIVE stands, and loses its power, when
+            its position has kept within so many counts for so many cycles. An encoder at rest never shows one count
+            for ever: one of 20 bits a turn flickers by several. 16 counts in 20 cycles of 1 ms are at most
+            800 counts/s, 0.3 deg/s of such a motor, which no brake minds.
         arrival_counts, arrival_fraction: a target that bit 10 calls reached must be as near as this, in counts plus a
             fraction of the distance: it catches a drive whose bit 10 is still that of the move before.
     """
@@ -54,6 +57,7 @@ class MotionBounds:
     settle_s: float = 3.0
     stop_s: float = 3.0
     standstill_cycles: int = 20
+    standstill_counts: int = 16
     arrival_counts: int = 2000
     arrival_fraction: float = 0.05
 
@@ -101,6 +105,8 @@ def execute(
             error.add_note(f"while stopping: {problem}")
         raise
     if problems:
+        for problem in problems[1:]:
+            problems[0].add_note(f"while stopping: {problem}")
         raise problems[0]
     stream.check()  # what happened during the stop
 
@@ -235,6 +241,7 @@ class _Walk:
 
     def stop(self) -> Generator[Sample, None, list[DriverError]]:
         """Quick stop and power off for all axes; returns what could not be confirmed."""
+        self._stream.drop_outgoing()  # a set-point that nobody has seen yet must not start a move now
         self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         try:
             unconfirmed = yield from self._stop_by_pdo()
@@ -252,7 +259,7 @@ class _Walk:
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm it."""
-        still = [0] * len(self._told)
+        still, rest = [0] * len(self._told), list(self._sample.position_counts)
         silent = 0
         powered = list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
@@ -261,14 +268,17 @@ class _Walk:
                 resting = state is State.QUICK_STOP_ACTIVE and still[axis] >= self._bounds.standstill_cycles
                 goal = Goal.SWITCH_ON_DISABLED if resting else Goal.QUICK_STOP
                 self._tell(axis, next_command(state, goal), repeat=cycle % 10 == 0)
-            before, self._sample = self._sample, self._stream.advance()
+            self._sample = self._stream.advance()
             yield self._sample
-            for axis in self._axes:
-                unchanged = before.position_counts[axis] == self._sample.position_counts[axis]
-                still[axis] = still[axis] + 1 if unchanged else 0
+            for axis, position in enumerate(self._sample.position_counts):
+                # Against where it came to rest, not against the cycle before: creeping is no standstill.
+                near = abs(position - rest[axis]) <= self._bounds.standstill_counts
+                known = not self._sample.missing >> axis & 1
+                still[axis] = still[axis] + 1 if near and known else 0
+                rest[axis] = rest[axis] if near else position
             silent = silent + 1 if self._sample.missing else 0
             powered = [
-                axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in _POWERLESS
+                axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
             ]
             if not powered or silent > self._stream.max_missing_cycles:
                 break

@@ -35,13 +35,12 @@ from drivers.mapping import (
 from drivers.profile import ObjectEntry
 from drivers.scan import FoundNode, read_identity, require, scan
 from drivers.sdo import Clock, SdoPolicy
-from drivers.state import FAULT_RESET_SEQUENCE, Goal, State, decode, next_command
+from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 
 HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
-_POWERLESS_STATES = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.UNKNOWN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +253,9 @@ class CanopenNetwork:
             "product_code": identity.product_code,
             "serial": identity.serial,
             "profile": axis.profile.name,
+            # What the recorded current is: without both a gain of this log cannot be compared with another's.
+            "amplitude": axis.profile.amplitude.value,
+            "tap": axis.profile.tap.value,
             "scale_objects": values,
             "ampere_per_unit": scale.factor * math.prod(values.values()),
             "mode_before": self._originals[axis.node_id].mode,
@@ -296,7 +298,7 @@ class CanopenNetwork:
         access = self.link.objects(axis.node_id)
         deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
         goal = Goal.QUICK_STOP
-        while decode(statusword := access.read(STATUSWORD)) not in _POWERLESS_STATES:
+        while decode(statusword := access.read(STATUSWORD)) not in POWERLESS:
             state = decode(statusword)
             if self.link.clock() >= deadline:
                 if goal is Goal.SWITCH_ON_DISABLED:

@@ -1,4 +1,8 @@
-"""When the next SYNC goes out, and what time it stands for."""
+"""When the next SYNC goes out, and what time it stands for.
+
+Samples and events of both pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus the time
+that has passed since, which no setting of the wall clock changes.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +16,12 @@ from drivers.sdo import Clock
 class LockstepSync:
     """The next SYNC goes out when the last one is answered: for a cell whose time is the SYNC itself.
 
+    The samples' time is made up, a period a cycle: that is true of a simulated cell alone.
+
     Attributes:
         period_ns: what one cycle stands for [ns].
         timeout_s: how long one cycle waits for its answers [s of the clock].
-        start_ns: time of cycle 0 [ns].
+        start_ns: wall time of cycle 0 [ns since 1970].
         clock: for the time-out and the heartbeats [ns].
     """
 
@@ -33,10 +39,12 @@ class TimedSync:
 
     Attributes:
         period_ns: of the schedule [ns].
-        clock: whose time the samples carry [ns].
+        start_ns: wall time of the first SYNC [ns since 1970].
+        clock: monotonic; what has passed by it since the first SYNC is added to start_ns [ns].
     """
 
     period_ns: int
+    start_ns: int = 0
     clock: Clock = time.monotonic_ns
 
 

@@ -12,8 +12,9 @@ class Sample:
     Raw counts, converted late: the gain is what is being identified, so no assumed gain is baked into data.
 
     Attributes:
-        cycle: number of the SYNC since the stream began.
-        time_ns: time of the SYNC [ns], not of the frames that answered it.
+        cycle: number of the sampling period since the stream began; a period that had no SYNC leaves a gap.
+        time_ns: time of the SYNC, not of the frames that answered it: wall time at the stream's first SYNC plus the
+            monotonic time since [ns since 1970].
         position_counts: motor-side position of each axis [encoder counts].
         current_raw: signal of the current loop of each axis [unit of the drive profile's current object].
         statusword: CiA 402 object 6041h of each axis.

@@ -9,7 +9,6 @@ from enum import Enum, IntEnum
 
 STATUS_FAULT = 1 << 3
 STATUS_TARGET_REACHED = 1 << 10
-STATUS_INTERNAL_LIMIT = 1 << 11
 STATUS_SETPOINT_ACKNOWLEDGE = 1 << 12  # profile position mode
 STATUS_FOLLOWING_ERROR = 1 << 13  # profile position mode
 
@@ -34,6 +33,9 @@ class State(Enum):
     def __str__(self) -> str:
         return self.name.replace("_", " ")
 
+
+POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.UNKNOWN)
+"""States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does."""
 
 STATE_BITS = 0x6F
 """The bits of the statusword that tell the state."""

@@ -26,7 +26,7 @@ from drivers.watch import Watch
 
 @dataclass(frozen=True, slots=True)
 class StreamStatistics:
-    """What has become of the frames so far; a run is sound when all but the first two are zero.
+    """What has become of the frames so far; a run is sound when all from `missing` to `skipped_periods` are zero.
 
     Attributes:
         cycles: SYNCs sent.
@@ -34,9 +34,10 @@ class StreamStatistics:
         missing: answers that did not come in their cycle.
         late: answers that came in a later cycle, where that could be known.
         duplicate: second answers of an axis to one SYNC.
-        surplus: PDOs that no axis of the cell was told to send, or that came before the first SYNC.
+        surplus: PDOs of an axis of the cell that it was not told to send.
         wrong_length: answers that are not as long as the mapping says; they count as missing too.
         skipped_periods: periods without a SYNC because the schedule slipped.
+        foreign: PDOs that are explained: of nodes that are no axes of the cell, or from before the first SYNC.
     """
 
     cycles: int = 0
@@ -47,6 +48,7 @@ class StreamStatistics:
     surplus: int = 0
     wrong_length: int = 0
     skipped_periods: int = 0
+    foreign: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,7 @@ class SyncStream:
         self._on_event = on_event
         self._slots = _slots(network)
         self._axes = len(network.axes)
+        self._nodes = frozenset(network.node_ids)
         self._all = (1 << len(self._slots)) - 1
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
         self._outgoing: list[can.Message] = []
@@ -113,10 +116,11 @@ class SyncStream:
         self._last_data: dict[int, bytearray] = {}
         self._incomplete_cycles = 0
         self._next_sync_ns = 0
-        self._time_ns = 0
+        self._first_sync_ns = 0
+        self._time_ns = pacing.start_ns
         self._watch = Watch(network, on_event)
         self._cycles = self._frames = self._missing = self._late = 0
-        self._duplicate = self._surplus = self._wrong_length = self._skipped = 0
+        self._duplicate = self._surplus = self._wrong_length = self._skipped = self._foreign = 0
 
     @property
     def statistics(self) -> StreamStatistics:
@@ -130,11 +134,12 @@ class SyncStream:
             self._surplus,
             self._wrong_length,
             self._skipped,
+            self._foreign,
         )
 
     @property
     def time_ns(self) -> int:
-        """Time of the last SYNC [ns]."""
+        """Time of the last SYNC [ns since 1970]; the pacing's start before the first one."""
         return self._time_ns
 
     def emit(self, event: CellEvent) -> None:
@@ -144,6 +149,10 @@ class SyncStream:
     def send(self, messages: Sequence[can.Message]) -> None:
         """Send frames right before the next SYNC, on which synchronous RPDOs act."""
         self._outgoing.extend(messages)
+
+    def drop_outgoing(self) -> None:
+        """Forget the frames that wait for the next SYNC: what they ask for is no longer wanted."""
+        self._outgoing.clear()
 
     def __iter__(self) -> Iterator[Sample]:
         return self
@@ -175,7 +184,7 @@ class SyncStream:
             self._between_cycles(message)
         now = pacing.clock()
         if self._cycles == 0:
-            self._next_sync_ns = now
+            self._first_sync_ns = self._next_sync_ns = now
         if isinstance(pacing, LockstepSync):
             self._time_ns = pacing.start_ns + self._cycles * pacing.period_ns
             deadline_ns = now + round(pacing.timeout_s * 1e9)
@@ -187,7 +196,7 @@ class SyncStream:
                 now = pacing.clock()
             slipped = (now - self._next_sync_ns) // pacing.period_ns
             self._skipped += slipped
-            self._time_ns = now
+            self._time_ns = pacing.start_ns + now - self._first_sync_ns
             deadline_ns = self._next_sync_ns = self._next_sync_ns + (slipped + 1) * pacing.period_ns
         outgoing, self._outgoing = self._outgoing, []
         self._link.send((*outgoing, self._sync))
@@ -239,7 +248,7 @@ class SyncStream:
         if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
             self._other(message)
         elif self._cycles == 0:
-            self._surplus += 1
+            self._foreign += 1
         elif self._debt & slot.bit:
             self._debt &= ~slot.bit
             self._late += 1
@@ -247,12 +256,18 @@ class SyncStream:
             self._duplicate += 1
 
     def _other(self, message: can.Message) -> None:
-        if not self._link.dispatch(message) and 0x180 <= message.arbitration_id < 0x580:
+        if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
+            return
+        ours = not message.is_extended_id and message.arbitration_id & 0x7F in self._nodes
+        if ours and self._cycles:
             self._surplus += 1
+        else:
+            self._foreign += 1
 
     def _finish_cycle(self) -> Sample:
         axes, values = self._axes, self._values
-        cycle = self._cycles - 1
+        # A period that was left out has a number too, so that nobody takes its neighbours for neighbours.
+        cycle = self._cycles - 1 + self._skipped
         missing = 0
         if self._seen != self._all:
             for slot in self._slots.values():
@@ -264,7 +279,7 @@ class SyncStream:
             self._incomplete_cycles = 0
         self._frames += self._seen.bit_count()
         statuswords = tuple(values[2 * axes :])
-        self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords)
+        self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords, missing)
         return Sample(cycle, self._time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
 
     def _note_missing(self, cycle: int, missing: int) -> None:

@@ -30,22 +30,24 @@ class Watch:
         self._network = network
         self._link = network.link
         self._on_event = on_event
-        self._statuswords: tuple[int, ...] = ()
+        self._statuswords = (0,) * len(network.axes)
+        self._unheard = (1 << len(network.axes)) - 1
         self._begun = False
         self._allowed_silence_ns = round(network.heartbeat_ms * 1e6 * HEARTBEAT_PERIODS)
         self._next_heartbeat_check_ns = 0
         self._heard_at: dict[int, tuple[int, int, int]] = {}
 
-    def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...]) -> None:
+    def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
         """See to everything after one cycle.
 
         Args:
             time_ns: of the samples.
             clock_ns: by the clock.
             statuswords: of all axes.
+            missing: bit i is set when axis i did not answer this cycle.
         """
-        if statuswords != self._statuswords:
-            self._note_statuswords(time_ns, statuswords)
+        if self._unheard or statuswords != self._statuswords:
+            self._note_statuswords(time_ns, statuswords, missing)
         if self._link.has_events:
             self._note_events(time_ns)
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
@@ -53,22 +55,26 @@ class Watch:
             self._check_heartbeats(time_ns, clock_ns)
         self._begun = True
 
-    def _note_statuswords(self, time_ns: int, statuswords: tuple[int, ...]) -> None:
+    def _note_statuswords(self, time_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
         before, self._statuswords = self._statuswords, statuswords
         for axis, word in enumerate(statuswords):
-            # Of the first sample everything is news, but a fault from before is not this recording's.
-            changed = (word ^ before[axis]) if before else _WATCHED_BITS
+            first = bool(self._unheard >> axis & 1)
+            if first and missing >> axis & 1:
+                continue  # the word is nobody's yet
+            self._unheard &= ~(1 << axis)
+            # Of an axis's first answer everything is news, but a fault from before is not this recording's.
+            changed = _WATCHED_BITS if first else word ^ before[axis]
             saturation = self._network.axes[axis].profile.saturation_bit
             if changed & _WATCHED_BITS:
                 state = decode(word)
                 text = f"{self._network.axes[axis].name}: {state}, statusword {word:04X}h"
                 self._on_event(CellEvent(time_ns, axis, EventKind.STATE, word, text))
-                if before and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                if not first and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                     self.faults.append(DriveFault(self._network.node_ids[axis], str(state), word))
-                if before and changed & word & STATUS_FOLLOWING_ERROR:
+                if not first and changed & word & STATUS_FOLLOWING_ERROR:
                     self._on_event(CellEvent(time_ns, axis, EventKind.FOLLOWING_ERROR, word, text))
                     self.faults.append(DriveFault(self._network.node_ids[axis], "following error", word))
-            if saturation is not None and (word ^ (before[axis] if before else 0)) >> saturation & 1:
+            if saturation is not None and (word ^ (0 if first else before[axis])) >> saturation & 1:
                 acts = "a limit acts" if word >> saturation & 1 else "the limit acts no more"
                 text = f"{self._network.axes[axis].name}: {acts}"
                 self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ident.relative_error import RelativeError
+
 
 @dataclass(frozen=True, slots=True)
 class Gain:
@@ -46,14 +48,6 @@ class Parameter:
     def std_percent(self) -> float:
         """Relative standard deviation (eq. 11) [%]; inf for a value of zero."""
         return 100.0 * self.std / abs(self.value) if self.value else float("inf")
-
-
-@dataclass(frozen=True, slots=True)
-class RelativeError:
-    """‖ρ‖/‖Y‖ of each axis and of all together [%]; it means nothing without the filter beside it."""
-
-    axes: tuple[float, ...]
-    total: float
 
 
 @dataclass(frozen=True, slots=True)

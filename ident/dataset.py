@@ -11,11 +11,15 @@ from scipy import signal
 from ident.conditioning import Conditioning
 from ident.drive_train import DriveTrain
 from ident.errors import DataUnfit
+from ident.motion import Motion
 from ident.payload import Payload
 from ident.run import Run
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+LONGEST_MOVE_S = 2.0
+"""Two seconds are several times the residual's correlation (lag one about 0.67 at 50 rows a second)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +35,7 @@ class Dataset:
         moving: joint faster than its standstill speed.
         motor_moving: motor of that number faster than the same speed, seen at its own joint's ratio.
         valid: sample may be used.
-        move: number of the move of each sample, shape (k,).
+        move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
         payload: what was mounted, None without load.
     """
 
@@ -47,6 +51,10 @@ class Dataset:
     valid: BoolArray
     move: NDArray[np.int64]
     payload: Payload | None
+
+    def motion(self, part: slice = slice(None)) -> Motion:
+        """Of some of the samples."""
+        return Motion(self.position_rad[:, part], self.velocity_rad_s[:, part], self.acceleration_rad_s2[:, part])
 
 
 def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
@@ -73,6 +81,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     valid = np.ones_like(moving) if run.valid is None else np.ascontiguousarray(run.valid.T[:, 1:-1])
     # One move holds all joints: without a log of moves, they part where every joint stands still.
     move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
+    move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
     return Dataset(
         name=run.name,
         rate_hz=rate,
@@ -84,7 +93,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         moving=moving,
         motor_moving=motor_moving,
         valid=valid,
-        move=np.asarray(move, dtype=np.int64),
+        move=move,
         payload=run.payload,
     )
 
@@ -92,6 +101,13 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
 def _moves(moving: BoolArray) -> NDArray[np.int64]:
     starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
     return np.cumsum(starts, dtype=np.int64)
+
+
+def _parted(move: NDArray[np.int64], longest: int) -> NDArray[np.int64]:
+    """Cut long moves: standard errors and folds rest on many moves, and continuous motion would be a single one."""
+    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
+    return np.cumsum((since % longest) == 0, dtype=np.int64) - 1
 
 
 def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> None:

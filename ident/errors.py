@@ -3,6 +3,7 @@
 IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
+├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data cannot tell some unknowns apart
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
@@ -28,13 +29,24 @@ class DataUnfit(IdentificationError):
         self.reason = reason
 
 
+class TooFewMoves(IdentificationError):
+    """Uncertainty and left-out moves need more of them."""
+
+    def __init__(self, found: int, expected: int) -> None:
+        super().__init__(
+            f"the runs hold {found} separate moves (or stretches of two seconds), expected at least {expected} "
+            "and better 30 a run; record longer"
+        )
+        self.found = found
+        self.expected = expected
+
+
 class RankDeficient(IdentificationError):
     """The data cannot tell some unknowns apart."""
 
-    def __init__(self, reason: str, condition: float, unknowns: tuple[str, ...]) -> None:
-        super().__init__(f"{reason} (condition {condition:.3g}; unknowns involved: {', '.join(unknowns)})")
+    def __init__(self, reason: str, unknowns: tuple[str, ...]) -> None:
+        super().__init__(f"{reason} (unknowns that cannot be told: {', '.join(unknowns)})")
         self.reason = reason
-        self.condition = condition
         self.unknowns = unknowns
 
 

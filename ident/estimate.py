@@ -8,9 +8,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.calibration import RelativeError
 from ident.model import Column
 from ident.observation import Observation
+from ident.relative_error import RelativeError, relative_error
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -37,8 +37,8 @@ class Estimate:
         parameters: their values, shape (p,).
         covariance: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed.
         axis_noise: standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
-        singular_values: of the weighted system that was solved.
-        condition: of the weighted observation matrix, unit-free columns not assumed.
+        singular_values: of the weighted observation matrix W_r (``tls``: of W_tot).
+        condition: of W_r, rows of a joint divided by its residual's deviation (``ls``: not divided), as in Table 5.
         rows: equations used.
         iterations: of an iterative estimator.
     """
@@ -76,18 +76,3 @@ class Estimate:
     def relative_error(self, observation: Observation) -> RelativeError:
         """‖ρ_j‖/‖Y_j‖ of each joint over its used rows, and of all together [%] (paper Table 6)."""
         return relative_error(observation.torque(self.gains), self.predicted_torque(observation), observation.use)
-
-
-def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolArray) -> RelativeError:
-    """‖ρ_j‖/‖Y_j‖ of each joint and of all together [%] (paper Table 6); NaN for a joint without a row that counts.
-
-    Args:
-        measured_nm, predicted_nm: joint torque, shape (n, r).
-        use: rows of each joint that count, shape (n, r).
-    """
-    size = np.sum(measured_nm**2, axis=1, where=use)
-    left = np.sum((measured_nm - predicted_nm) ** 2, axis=1, where=use)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        axes = 100.0 * np.sqrt(left / size)
-        total = 100.0 * np.sqrt(left.sum() / size.sum())
-    return RelativeError(tuple(float(value) for value in axes), float(total))

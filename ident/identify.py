@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.calibration import RelativeError
 from ident.conditioning import Conditioning
 from ident.dataset import Dataset, differentiate
 from ident.effects.effect import Effect
+from ident.effects.torque import effect_torque
 from ident.errors import DataUnfit
 from ident.estimate import Estimate, Method
 from ident.estimators.least_squares import ls, wls
@@ -19,8 +19,9 @@ from ident.estimators.maximum_likelihood import ml
 from ident.estimators.total_least_squares import tls
 from ident.model import Column, Model
 from ident.observation import Observation, observe, require_distinct
+from ident.relative_error import RelativeError
 from ident.run import Run
-from ident.search import Finding, Gates, effect_torque, find
+from ident.search import Finding, Gates, find
 from ident.signals import signals
 
 FloatArray = NDArray[np.float64]
@@ -139,7 +140,7 @@ def identify(
             raise DataUnfit(run.name, f"held out with {mounting}, which no run of the fit carries: it stays unknown")
     bare = observe(model, datasets, conditioning)
     training, rest = _parted(bare, held_out)
-    require_distinct(training)
+    require_distinct(training, gains=fixed_gains is None)
     estimate = estimate_with(method, training, fixed_gains)
     return Identification(model, datasets, training, rest, (), estimate, bare, held_out)
 

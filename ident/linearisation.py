@@ -11,10 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.errors import TooFewMoves
 from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+FEWEST_MOVES = 8
+"""With fewer, leaving one out in turn tells little of the scatter, and folds of moves hold one each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,11 @@ class Linearisation:
     free: IntArray
     scale: FloatArray
 
+    @property
+    def moves(self) -> int:
+        """Number of clusters."""
+        return int(self.cluster.max()) + 1
+
     def whitened(self, torque_nm: FloatArray) -> FloatArray:
         """Motor-side torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra)."""
         columns = np.empty((len(self.motor), torque_nm.shape[1]))
@@ -54,19 +63,11 @@ class Linearisation:
         return columns
 
 
-def motor_torque(observation: Observation) -> tuple[FloatArray, FloatArray]:
-    """The model's torque as each motor must give it, T τ (see DriveTrain): linear part (n, p, r), known part (n, r)."""
-    to_motor = observation.drive_train.to_motor
-    linear = observation.linear()
-    mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
-    return mixed, to_motor @ observation.known()
-
-
 def linearise(
     observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
 ) -> Linearisation:
     """Around given gains [Nm/A], parameters and current noise [A] of each motor."""
-    linear, known = motor_torque(observation)
+    linear, known = observation.motor_torque()
     count = len(gains)
     gamma = 1.0 / gains
     jacobian, residual, currents, motors, clusters, sources = [], [], [], [], [], []
@@ -113,9 +114,14 @@ def jackknife_covariance(problem: Linearisation, unknowns: int) -> FloatArray:
     Args:
         problem: around the estimate.
         unknowns: length of (gains, parameters), free or not.
+
+    Raises:
+        TooFewMoves: their scatter says nothing of the uncertainty.
     """
     order = np.argsort(problem.cluster, kind="stable")
-    moves = int(problem.cluster.max()) + 1
+    moves = problem.moves
+    if moves < FEWEST_MOVES:
+        raise TooFewMoves(moves, FEWEST_MOVES)
     bounds = np.searchsorted(problem.cluster[order], np.arange(moves + 1))
     jacobian, residual = problem.jacobian[order], problem.residual[order]
     hessian = jacobian.T @ jacobian

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.dataset import Dataset
 from ident.drive_train import DriveTrain
-from ident.regressor import LINK_PARAMETERS, rigid_regressor
+from ident.link import LINK_PARAMETERS, LINK_UNITS
+from ident.motion import Motion
+from ident.regressor import rigid_regressor
 from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
@@ -43,8 +44,7 @@ class Model:
             force = "Nm" if joint.kind is JointKind.REVOLUTE else "N"
             rate = "rad/s" if joint.kind is JointKind.REVOLUTE else "m/s"
             inertia = "kg m²" if joint.kind is JointKind.REVOLUTE else "kg"
-            units = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
-            columns += [Column(f"{name}{number}", unit) for name, unit in zip(LINK_PARAMETERS, units, strict=True)]
+            columns += [Column(f"{name}{number}", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)]
             columns += [
                 Column(f"Ia{number}", inertia),
                 Column(f"fv{number}", f"{force}/({rate})"),
@@ -65,14 +65,13 @@ class Model:
         first = 14 * (self.robot.joint_count - 1)
         return slice(first, first + 10)
 
-    def regressor(self, data: Dataset, part: slice) -> FloatArray:
-        """Joint torque per unit of every standard parameter, for a part of the samples.
+    def regressor(self, motion: Motion) -> FloatArray:
+        """Joint torque per unit of every standard parameter.
 
         Returns:
             shape (n, c, k) [Nm or N per unit], time last.
         """
-        position, velocity = data.position_rad[:, part], data.velocity_rad_s[:, part]
-        acceleration = data.acceleration_rad_s2[:, part]
+        position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))

@@ -13,13 +13,15 @@ from ident.conditioning import Conditioning
 from ident.dataset import Dataset
 from ident.drive_train import DriveTrain
 from ident.errors import DataUnfit, RankDeficient
+from ident.link import LINK_PARAMETERS, LINK_UNITS
 from ident.model import Column, Model
+from ident.payload import Payload
 from ident.rows import chunks, row_filter, row_masks
-from ident.payload import PAYLOAD_PARAMETERS, Payload
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -40,7 +42,7 @@ class Observation:
         mounting: index into payloads, −1 without load, shape (r,).
         payloads: one for each mounting.
         payload_columns: for each mounting, its unknown parameters that these data see, as indices of
-            PAYLOAD_PARAMETERS.
+            LINK_PARAMETERS.
         runs: names of the runs.
         conditioning: the filters these rows went through.
     """
@@ -70,9 +72,8 @@ class Observation:
     @property
     def unknowns(self) -> tuple[Column, ...]:
         """χ, then χ_uL of each mounting: name and unit of everything linear that is estimated beside the gains."""
-        payload_units = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
         return self.columns + tuple(
-            Column(f"{PAYLOAD_PARAMETERS[index]}:{payload.mounting}", payload_units[index])
+            Column(f"{LINK_PARAMETERS[index]}:{payload.mounting}", LINK_UNITS[index])
             for payload, indices in zip(self.payloads, self.payload_columns, strict=True)
             for index in indices
         )
@@ -89,8 +90,14 @@ class Observation:
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
             for name, value in payload.known.items():
-                weights[index, PAYLOAD_PARAMETERS.index(name)] = value
+                weights[index, LINK_PARAMETERS.index(name)] = value
         return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
+
+    def motor_torque(self) -> tuple[FloatArray, FloatArray]:
+        """The model's torque as each motor must give it, T τ (DriveTrain): linear part (n, p, r), known part (n, r)."""
+        to_motor, linear = self.drive_train.to_motor, self.linear()
+        mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
+        return mixed, to_motor @ self.known()
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
@@ -190,11 +197,11 @@ class _Part:
 def _decimated(model: Model, data: Dataset, conditioning: Conditioning) -> _Part:
     filter_ = row_filter(data, conditioning)
     samples = len(data.time_s)
-    standard = np.concatenate([filter_(model.regressor(data, part)) for part in chunks(filter_, samples)], axis=2)
+    pieces = [filter_(model.regressor(data.motion(part))) for part in chunks(filter_, samples)]
     use, motor_use = row_masks(model.drive_train, data, conditioning)
     centres = filter_.centres(samples)
     time_s = data.time_s[centres] - data.time_s[0]
-    return _Part(standard, filter_(data.current_a), use, motor_use, time_s, data.move[centres])
+    return _Part(np.concatenate(pieces, axis=2), filter_(data.current_a), use, motor_use, time_s, data.move[centres])
 
 
 def _mountings(datasets: Sequence[Dataset]) -> tuple[Payload, ...]:
@@ -222,30 +229,42 @@ def _with_payloads(observation: Observation) -> Observation:
     for index, payload in enumerate(observation.payloads):
         rows = observation.mounting == index
         triangle = _triangle(observation.flange[:, :, rows], observation.use[:, rows])
-        unknown = tuple(i for i, name in enumerate(PAYLOAD_PARAMETERS) if name not in payload.known)
-        names = tuple(PAYLOAD_PARAMETERS[i] for i in unknown)
+        unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known)
+        names = tuple(LINK_PARAMETERS[i] for i in unknown)
         seen = base_parameters(triangle[:, list(unknown)], names) if unknown else None
         chosen.append(tuple(unknown[i] for i in seen.independent) if seen else ())
     return replace(observation, payload_columns=tuple(chosen))
 
 
-def require_distinct(observation: Observation) -> None:
-    """Refuse rows that cannot tell the payload from the robot.
+def require_distinct(observation: Observation, *, gains: bool) -> None:
+    """Refuse rows that cannot tell their unknowns apart.
+
+    Args:
+        observation: rows of the fit.
+        gains: whether the gains are unknown too.
 
     Raises:
-        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the payload.
+        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the payload, or a
+            motor's current is constant zero.
     """
-    if not observation.payloads:
-        return
-    everything = np.concatenate((observation.linear(), observation.known()[:, None]), axis=1)
-    triangle = _triangle(everything, observation.use)
-    names = (*(column.name for column in observation.unknowns), "known payload")
-    independent = base_parameters(triangle, names).independent
-    if len(independent) < len(names):
-        lost = tuple(name for index, name in enumerate(names) if index not in independent)
-        norms = np.linalg.norm(triangle, axis=0)
-        raise RankDeficient(
-            "payload and robot cannot be told apart: record the same robot without load too",
-            float(np.linalg.cond(triangle / np.where(norms > 0, norms, 1.0))),
-            lost,
-        )
+    parts = [observation.linear()]
+    names = tuple(column.name for column in observation.unknowns)
+    if observation.payloads:
+        parts.append(observation.known()[:, None])
+        names += ("known payload",)
+    lost = _dependent(np.concatenate(parts, axis=1), observation.use, names)
+    if lost:
+        raise RankDeficient("payload and robot cannot be told apart: record the same robot without load too", lost)
+    if gains:
+        for motor, current in enumerate(observation.current):
+            if not np.any(current[observation.motor_use[motor]]):
+                name = f"gain {motor + 1}"
+                raise RankDeficient(
+                    f"the current of motor {motor + 1} is zero throughout: is its channel connected?", (name,)
+                )
+
+
+def _dependent(columns: FloatArray, use: BoolArray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the columns that the ones before them can make up."""
+    independent = base_parameters(_triangle(columns, use), names).independent
+    return tuple(name for index, name in enumerate(names) if index not in independent)

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-PAYLOAD_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
-"""The ten inertial parameters of a link, in the paper's order: inertia about the link frame's origin [kg m²],
-first moments [kg m] and mass [kg]."""
-
 
 @dataclass(frozen=True, slots=True)
 class Payload:
@@ -16,7 +12,7 @@ class Payload:
     Attributes:
         name: of the body.
         mounting: names one way of mounting it; runs that share it share their unknown parameters.
-        known: known inertial parameters by their names in PAYLOAD_PARAMETERS, in the last joint's frame
+        known: known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame
             (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
     """
 

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.dataset import Dataset
 from ident.effects import EFFECTS
-from ident.effects.effect import Effect, at_joints
+from ident.effects.effect import Effect
+from ident.effects.torque import at_joints
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.identify import PlacedEffect
+from ident.link import LINK_PARAMETERS
 from ident.model import Model
-from ident.payload import PAYLOAD_PARAMETERS, Payload
+from ident.payload import Payload
 from ident.signals import declared_signals, inertia
 
 FloatArray = NDArray[np.float64]
@@ -151,7 +153,7 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
 
 
 def _check_mounting(payload: Payload, identified: dict[str, float], mountings: set[str], run: str) -> None:
-    if not identified and set(payload.known) != set(PAYLOAD_PARAMETERS):
+    if not identified and set(payload.known) != set(LINK_PARAMETERS):
         known = ", ".join(sorted(map(repr, mountings))) or "none"
         raise DataUnfit(
             run, f"carries mounting {payload.mounting!r}, of which the calibration knows nothing; it knows {known}"
@@ -163,6 +165,6 @@ def _check_mounting(payload: Payload, identified: dict[str, float], mountings: s
             f"says {', '.join(both)} of mounting {payload.mounting!r} beforehand, and the calibration has identified "
             "the same: give each way of mounting a name of its own",
         )
-    foreign = sorted(set(identified) - set(PAYLOAD_PARAMETERS))
+    foreign = sorted(set(identified) - set(LINK_PARAMETERS))
     if foreign:
         raise DataUnfit(run, f"mounting {payload.mounting!r} has parameters that no payload has: {', '.join(foreign)}")

@@ -23,9 +23,6 @@ from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
-LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
-"""Order of a link's columns: inertia about the frame's origin [kg m²], first moments [kg m], mass [kg]."""
-
 
 def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
     """Columns of the rigid links.

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.linearisation import Linearisation
+from ident.errors import TooFewMoves
+from ident.linearisation import FEWEST_MOVES, Linearisation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -50,8 +51,13 @@ def cut(problem: Linearisation, count: int = 8) -> Folds:
     Args:
         problem: around an estimate.
         count: of folds; fewer where there are fewer moves.
+
+    Raises:
+        TooFewMoves: to leave some out.
     """
-    count = min(count, int(problem.cluster.max()) + 1)
+    if problem.moves < FEWEST_MOVES:
+        raise TooFewMoves(problem.moves, FEWEST_MOVES)
+    count = min(count, problem.moves)
     fold = problem.cluster % count
     hessian, score = problem.jacobian.T @ problem.jacobian, problem.jacobian.T @ problem.residual
     factors, scores = [], []
@@ -77,14 +83,16 @@ class Trial:
         fallen: in-sample fall of ‖e‖² of each motor, shape (n,).
         training_fall: fall of ‖e‖² on the other folds, which may choose among settings, shape (folds,).
         held_out: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n).
-        cluster_scores: Φ⊥ᵀe of each move, shape (clusters, p).
+        score: Φ⊥ᵀe, shape (p,).
+        scatter: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (clusters, p).
     """
 
     coefficients: FloatArray
     fallen: FloatArray
     training_fall: FloatArray
     held_out: FloatArray
-    cluster_scores: FloatArray
+    score: FloatArray
+    scatter: FloatArray
 
 
 def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatArray) -> Trial | None:
@@ -104,12 +112,11 @@ def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatAr
     gram = projected.T @ projected
     if np.any(np.diag(gram) < 1e-6 * np.sum(columns**2, axis=0)):
         return None
-    score = projected * problem.residual[:, None]
-    clusters = int(problem.cluster.max()) + 1
-    by_move = [np.bincount(problem.cluster, part, clusters) for part in score.T]
-    cluster_scores = np.asarray(np.stack(by_move, axis=1), dtype=np.float64)
-    coefficients = np.linalg.solve(gram, score.sum(axis=0))
+    score = projected.T @ problem.residual
+    coefficients = np.linalg.solve(gram, score)
     after = problem.residual - projected @ coefficients
+    by_move = [np.bincount(problem.cluster, part, problem.moves) for part in (projected * after[:, None]).T]
+    scatter = np.asarray(np.stack(by_move, axis=1), dtype=np.float64)
     difference = problem.residual**2 - after**2
     fallen = np.asarray(np.bincount(problem.motor, difference, len(problem.gamma)), dtype=np.float64)
     left = np.empty_like(problem.residual)
@@ -126,4 +133,4 @@ def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatAr
         fitted = np.linalg.solve(schur, drive)
         training_fall[index] = float(drive @ fitted)
         left[rows] = folds.residual[rows] - (inside - j @ moved) @ fitted
-    return Trial(coefficients, fallen, training_fall, folds.square_sum(left), cluster_scores)
+    return Trial(coefficients, fallen, training_fall, folds.square_sum(left), score, scatter)

@@ -2,11 +2,11 @@
 
 The lag-one correlation of a residual is about 0.67, so textbook tests lie. A candidate must pass every gate:
 
-1. cluster Wald, max-T: its score, clustered by move, is larger than the largest of all candidates' in 99 % of
-   draws in which each move's scores keep their size and get a random sign (a wild bootstrap, Cameron et al. 2008);
+1. cluster Wald, max-T: its statistic, clustered by move, is larger than the largest of all candidates' in 99 % of
+   draws in which each move's noise keeps its size and gets a random sign (a wild bootstrap, Cameron et al. 2008);
 2. it is better on at least three quarters of the folds of left-out moves;
-3. it explains at least 3 % of the axis' squared residual;
-4. the axis' error on left-out moves falls by at least 2 %.
+3. it explains at least 3 % of the squared residual of the motor that feels it most;
+4. that motor's error on left-out moves falls by at least 2 %.
 
 Candidates are ranked by left-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from ident.conditioning import Conditioning
 from ident.dataset import Dataset
 from ident.effects import EFFECTS
-from ident.effects.effect import Effect, at_joints
+from ident.effects.effect import Effect
+from ident.effects.torque import effect_torque
 from ident.estimate import Estimate
 from ident.linearisation import linearise
 from ident.model import Model
-from ident.observation import Observation, decimate_rows
+from ident.observation import Observation
 from ident.residual import Folds, Trial, cut, put_to_test
-from ident.signals import Signals, signals
+from ident.signals import signals
 
 FloatArray = NDArray[np.float64]
 
@@ -56,8 +56,8 @@ class Finding:
         coefficients: first estimate of its linear parameters.
         probability: that noise alone makes a candidate this strong somewhere among all.
         folds_better: share of folds on which it lowers the error.
-        explained: share of the axis' squared residual.
-        error_before_percent, error_after_percent: of the axis on left-out moves, ‖e‖/‖v‖ of its current [%].
+        explained: share of the squared residual of the motor that feels it most.
+        error_before_percent, error_after_percent: of that motor on left-out moves, ‖e‖/‖v‖ of its current [%].
         error_fall: relative fall from one to the other.
         held_out_fall: fall of the whole whitened ‖e‖² on left-out moves; the rank.
         passed: whether every gate is open.
@@ -76,21 +76,6 @@ class Finding:
     held_out_fall: float
     passed: bool
     ambiguity: tuple[str, ...] = ()
-
-
-def effect_torque(
-    effect: Effect,
-    axis: int,
-    runs: Sequence[Signals],
-    datasets: Sequence[Dataset],
-    conditioning: Conditioning,
-    model: Model,
-) -> FloatArray:
-    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
-    parts = [
-        decimate_rows(data, conditioning, effect.columns(run, axis)) for run, data in zip(runs, datasets, strict=True)
-    ]
-    return at_joints(effect, axis, np.concatenate(parts, axis=1), model.drive_train)
 
 
 def find(
@@ -141,7 +126,7 @@ def find(
     return _with_ambiguity(folds, tuple(findings), tuple(members for _, members in tried))
 
 
-def _nested(folds: Folds, members: tuple[tuple[Effect, Trial], ...]) -> FloatArray:
+def _nested(members: tuple[tuple[Effect, Trial], ...]) -> FloatArray:
     """‖e‖² of each fold and motor, the setting chosen by the other folds alone."""
     chosen = np.argmax(np.stack([trial.training_fall for _, trial in members]), axis=0)
     return np.stack([members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
@@ -153,12 +138,14 @@ def _judge(
     problem = folds.problem
     best = int(np.argmax([float(trial.fallen.sum()) for _, trial in members]))
     effect, trial = members[best]
-    before, after = folds.square_sum(folds.residual), _nested(folds, members)
+    before, after = folds.square_sum(folds.residual), _nested(members)
     fall = before.sum(axis=1) - after.sum(axis=1)
-    rows = problem.motor == axis
+    # A joint's torque may be another motor's to give (R): the drive in question is the one whose residual falls most.
+    motor = int(np.argmax(trial.fallen))
+    rows = problem.motor == motor
     own, size = float(np.sum(problem.residual[rows] ** 2)), float(np.sum(problem.current[rows] ** 2))
-    explained = float(trial.fallen[axis] / own)
-    error_before, error_after = (float(np.sqrt(part[:, axis].sum() / size)) for part in (before, after))
+    explained = float(trial.fallen[motor] / own)
+    error_before, error_after = (float(np.sqrt(part[:, motor].sum() / size)) for part in (before, after))
     error_fall = 1.0 - error_after / error_before
     folds_better = float(np.mean(fall > 0))
     passed = (
@@ -184,16 +171,15 @@ def _judge(
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all."""
-    clusters = trials[0].cluster_scores.shape[0]
-    signs = rng.choice((-1.0, 1.0), size=(draws, clusters))
+    moves = trials[0].scatter.shape[0]
+    signs = rng.choice((-1.0, 1.0), size=(draws, moves))
     observed, largest = np.empty(len(trials)), np.full(draws, -np.inf)
     for index, trial in enumerate(trials):
-        scores = trial.cluster_scores
-        inverse = np.linalg.pinv(scores.T @ scores)
-        freedom = scores.shape[1]
-        total, drawn = scores.sum(axis=0), signs @ scores
+        # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
+        inverse = np.linalg.pinv(trial.scatter.T @ trial.scatter)
+        freedom, drawn = len(trial.score), signs @ trial.scatter
         # On the scale of −log p, so that candidates with one and with two coefficients compete alike.
-        observed[index] = -stats.chi2.logsf(float(total @ inverse @ total), freedom)
+        observed[index] = -stats.chi2.logsf(float(trial.score @ inverse @ trial.score), freedom)
         largest = np.maximum(largest, -stats.chi2.logsf(np.einsum("dp,pq,dq->d", drawn, inverse, drawn), freedom))
     return np.asarray((1.0 + np.sum(largest[None] >= observed[:, None], axis=1)) / (draws + 1.0))
 
@@ -202,7 +188,7 @@ def _with_ambiguity(
     folds: Folds, findings: tuple[Finding, ...], members: tuple[tuple[tuple[Effect, Trial], ...], ...]
 ) -> tuple[Finding, ...]:
     """Rank, and name for each finding the others that a paired comparison over folds cannot tell from it."""
-    scores = [_nested(folds, family).sum(axis=1) for family in members]
+    scores = [_nested(family).sum(axis=1) for family in members]
     order = sorted(range(len(findings)), key=lambda i: -findings[i].held_out_fall)
     ranked = []
     for index in order:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from ident.dataset import Dataset
 from ident.estimate import Estimate
+from ident.link import LINK_PARAMETERS
 from ident.model import Model
 from ident.observation import Observation
-from ident.payload import PAYLOAD_PARAMETERS, Payload
+from ident.payload import Payload
 
 FloatArray = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ def declared_signals(model: Model, data: Dataset, standard: FloatArray, gains: F
     inertial = np.array([not name.startswith(("Ia", "fv", "fs", "off")) for name in names])
     load, total = [], []
     for first in range(0, len(data.time_s), CHUNK_SAMPLES):
-        columns = model.regressor(data, slice(first, first + CHUNK_SAMPLES))
+        columns = model.regressor(data.motion(slice(first, first + CHUNK_SAMPLES)))
         load.append(np.einsum("jck,c->jk", columns, standard * inertial))
         total.append(np.einsum("jck,c->jk", columns, standard))
     motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
@@ -96,14 +97,14 @@ def declared_signals(model: Model, data: Dataset, standard: FloatArray, gains: F
 
 
 def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
-    """χ_kL and χ_uL of a payload in the order of PAYLOAD_PARAMETERS, shape (10,); zeros without load.
+    """χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without load.
 
     Args:
         payload: what was mounted.
         identified: its unknown parameters by name; those that the data of the fit did not see are left out and zero.
     """
     values = {} if payload is None else {**payload.known, **identified}
-    return np.array([values.get(name, 0.0) for name in PAYLOAD_PARAMETERS])
+    return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])
 
 
 def _identified(payload: Payload | None, observation: Observation, estimate: Estimate) -> dict[str, float]:
@@ -111,6 +112,6 @@ def _identified(payload: Payload | None, observation: Observation, estimate: Est
     for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
         values = estimate.parameters[first : first + len(indices)]
         if payload is not None and other.mounting == payload.mounting:
-            return {PAYLOAD_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
+            return {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
     return {}

@@ -52,7 +52,7 @@ def build_app(verbs: tuple[Verb, ...] = VERBS) -> typer.Typer:
         name="drivegain",
         help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, 2 usage, 3 calibration refused, 4 data unfit, 5 device fault, "
-        "6 configuration.",
+        "6 configuration, 130 interrupted.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

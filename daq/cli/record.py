@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
+from daq.cli.interrupt import interruptible
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
-from daq.errors import UsageError
+from daq.errors import ExitCode, UsageError
 from daq.plan import slowed
 from daq.plan_file import load_plan
 from daq.record import record
@@ -32,22 +33,29 @@ def record_verb(
     speed: Annotated[float, typer.Option(help="Speed override for a first run.", min=0.05, max=1.0)] = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Make the moves of a plan and log every sample; Ctrl-C stops the axes."""
+    """Make the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes."""
     declared = load_cell(cell)
-    moves = slowed(load_plan(plan, declared), speed)
+    moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or getpass.getuser()
-    with progress_bar("recording") as told:
-        done = record(
-            cell,
-            declared,
-            moves,
-            out,
-            payload=mounted(declared, payload),
-            operator=who,
-            granted_by=who if enable_motion else None,
-            run_id=str(uuid.uuid4()),
-            progress=lambda count, total: told(count, total, "moves"),
-        )
+    part = out.with_name(out.name + ".part")
+    earlier = {path for path in (out, part) if path.exists()}
+    try:
+        with interruptible(), progress_bar("recording") as told:
+            done = record(
+                cell,
+                declared,
+                moves,
+                out,
+                payload=mounted(declared, payload),
+                operator=who,
+                granted_by=who if enable_motion else None,
+                run_id=str(uuid.uuid4()),
+                progress=lambda count, total: told(count, total, "moves"),
+            )
+    except KeyboardInterrupt as interrupt:
+        made = next((path for path in (out, part) if path not in earlier and path.exists()), None)
+        typer.echo(_interrupted(interrupt, made, out), err=True)
+        raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     log = done.log
     if json:
         print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
@@ -55,6 +63,18 @@ def record_verb(
     else:
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
+
+
+def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:
+    """What became of the axes and of the recording, in one line."""
+    # What the stop could not confirm is noted on the interrupt on its way up.
+    problems = "; ".join(getattr(interrupt, "__notes__", ()))
+    axes = f"NOT ALL AXES ARE KNOWN TO STAND, press the emergency stop ({problems})" if problems else "axes stopped"
+    if made is None:
+        return f"interrupted: {axes}; nothing was recorded"
+    if made == out:
+        return f"interrupted: {axes}; all moves had been made, and {out} is complete"
+    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit"
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:

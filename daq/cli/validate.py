@@ -21,7 +21,8 @@ from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed
 from daq.report.torque import plot_torques
 from daq.validate import Acquaintance, Validation, conditioning_of, together, validate
-from ident.calibration import Calibration, RelativeError
+from ident.calibration import Calibration
+from ident.relative_error import RelativeError
 
 
 def validate_verb(

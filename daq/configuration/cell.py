@@ -91,7 +91,7 @@ class WeighedPayload:
     Attributes:
         name, mounting: the body, and the one way in which it is mounted.
         mass_kg, mass_tolerance_kg: as weighed [kg].
-        known: further inertial parameters that are known, by their names in ident.payload.PAYLOAD_PARAMETERS.
+        known: further inertial parameters that are known, by their names in ident.link.LINK_PARAMETERS.
     """
 
     name: str

@@ -3,26 +3,36 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import hypot
 from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.configuration.cell import Pacing
 from daq.configuration.cell_schema import AxisModel, CellModel
 from daq.configuration.yaml_file import Document, Fault, describe
 from daq.errors import ConfigurationInconsistent
+from drivers.profile import DriveProfile
 from ident.errors import ModelError
 from ident.robot import JointKind, robot_from_urdf
 
 LARGEST_POSITION_DEG = 720.0
 SMALLEST_RANGE_DEG = 0.2
+SIMULATED_INTERFACES = ("virtual", "socketcand")
+"""Buses on which a simulated cell can be; every other one may have a machine on it."""
 LARGEST_CONDITION = 1e8
 """Of R; above it, joint positions cannot be told from motor positions."""
 
 
-def check(document: Document, model: CellModel, urdf: str) -> None:
+def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile]) -> None:
     """Refuse a cell that contradicts itself.
+
+    Args:
+        document: the cell file, for the lines.
+        model: what it says.
+        urdf: text of its robot.
+        profiles: of its drives, by name.
 
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
@@ -31,6 +41,7 @@ def check(document: Document, model: CellModel, urdf: str) -> None:
         *_robot_faults(model, urdf),
         *_ratio_faults(model),
         *_bus_faults(model),
+        *_sync_faults(model, profiles),
         *_axis_faults(model, urdf),
         *_list_faults(model),
     ]
@@ -89,6 +100,26 @@ def _bus_faults(model: CellModel) -> Iterator[Fault]:
         if used[axis.node_id] > 1:
             yield Fault(
                 ("axes", index, "node_id"), f"{axis.node_id}, used {used[axis.node_id]} times", "each node once"
+            )
+
+
+def _sync_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
+    if model.bus is None or model.sync is None:
+        return
+    if model.sync.pacing is Pacing.LOCKSTEP and model.bus.interface not in SIMULATED_INTERFACES:
+        yield Fault(
+            ("sync", "pacing"),
+            f"lockstep on a bus of interface {model.bus.interface}",
+            f"timed: lockstep makes the time of the samples up, which is true of a simulated cell "
+            f"({' or '.join(SIMULATED_INTERFACES)}) alone",
+        )
+    for drive in model.drives:
+        refresh_us = profiles[drive].update_period_us
+        if refresh_us > model.sync.period_us:
+            yield Fault(
+                ("sync", "period_us"),
+                f"{model.sync.period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
+                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
             )
 
 

@@ -75,7 +75,7 @@ def cell_from_bundle(
         for drive in model.drives
         for member in (f"{DRIVES}{drive}.yaml",)
     }
-    check(document, model, urdf)
+    check(document, model, urdf, profiles)
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
         name=model.name,

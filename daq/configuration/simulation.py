@@ -107,15 +107,6 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
     )
 
 
-def payload_names(path: Path) -> tuple[str, ...]:
-    """Bodies that a simulation file knows.
-
-    Raises:
-        ConfigurationError: the file is missing or wrong.
-    """
-    return tuple(read_model(parse_yaml(read_bytes(path), str(path)), SimulationModel).payloads)
-
-
 def axis_index(axis: str | int) -> int:
     """Index from 0 of an axis given as "J3" or by its number from 1."""
     number = int(re.sub(r"^J", "", axis)) if isinstance(axis, str) else axis

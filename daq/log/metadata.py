@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from ident.payload import PAYLOAD_PARAMETERS, Payload
+from ident.link import LINK_PARAMETERS
+from ident.payload import Payload
 
 RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
 VERSION = "1"
@@ -101,7 +102,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     payload = None
     if Role(record["role"]) is Role.LOADED:
         known = json.loads(record["payload_known"])
-        if not isinstance(known, dict) or not known.keys() <= set(PAYLOAD_PARAMETERS):
+        if not isinstance(known, dict) or not known.keys() <= set(LINK_PARAMETERS):
             raise ValueError(f"known payload parameters {record['payload_known']!r}")
         payload = Payload(record["payload"], record["mounting"], {key: float(value) for key, value in known.items()})
     rate_hz = float(record["rate_hz"])

@@ -8,13 +8,14 @@ import numpy as np
 
 from daq.fit import Fit
 from daq.report.gains import plot_gains
+from daq.report.picture import FloatArray
 from daq.report.residual import plot_residual
 from daq.report.torque import plot_torques
 from ident.calibration import Calibration
-from ident.effects.effect import along
+from ident.effects.effect import Abscissa
 from ident.identify import Identification
-from ident.observation import decimate_rows
-from ident.signals import signals
+from ident.rows import decimate_rows
+from ident.signals import Signals, signals
 
 
 def draw(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
@@ -48,7 +49,7 @@ def _draw_effect(before: Identification, after: Identification, names: tuple[str
     seen = signals(after.model, data, after.training, after.estimate)
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along(placed.effect.abscissa, seen, placed.axis), data.velocity_rad_s[placed.axis])
+        for column in (_along(placed.effect.abscissa, seen, placed.axis), data.velocity_rad_s[placed.axis])
     )
     use = rows_after.use[placed.axis, chosen]
     residuals = (
@@ -65,3 +66,17 @@ def _draw_effect(before: Identification, after: Identification, names: tuple[str
         velocity_rad_s=velocity,
         title=f"{name}: {placed.effect.name}, run {data.name}",
     )
+
+
+def _along(abscissa: Abscissa, signals: Signals, axis: int) -> FloatArray:
+    """The variable that a picture is drawn along, shape (k,)."""
+    rate = np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz
+    variables: dict[Abscissa, FloatArray] = {
+        Abscissa.VELOCITY: signals.velocity_rad_s[axis],
+        Abscissa.POSITION: signals.position_rad[axis],
+        Abscissa.LOAD: signals.load_torque_nm[axis],
+        Abscissa.MOTOR_ANGLE: np.mod(signals.motor_position_rad[axis], 2.0 * np.pi),
+        Abscissa.CURRENT: signals.current_a[axis],
+        Abscissa.TORQUE_RATE: np.asarray(rate),
+    }
+    return variables[abscissa]

@@ -8,7 +8,6 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.drive_train import DriveTrain
 from ident.model import Column
 from ident.signals import Signals
 
@@ -72,23 +71,3 @@ class Effect(Protocol):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque at the axis per unit of each coefficient [Nm], shape (coefficients, k)."""
         ...
-
-
-def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
-    """An effect's columns at its axis, shape (p, k), as torque of all joints, shape (n, p, k)."""
-    acts_on = drive_train.direction[axis] if effect.side is Side.MOTOR else np.eye(len(drive_train.ratio))[axis]
-    return np.asarray(acts_on[:, None, None] * columns[None])
-
-
-def along(abscissa: Abscissa, signals: Signals, axis: int) -> FloatArray:
-    """The variable that a picture is drawn along, shape (k,)."""
-    rate = np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz
-    variables: dict[Abscissa, FloatArray] = {
-        Abscissa.VELOCITY: signals.velocity_rad_s[axis],
-        Abscissa.POSITION: signals.position_rad[axis],
-        Abscissa.LOAD: signals.load_torque_nm[axis],
-        Abscissa.MOTOR_ANGLE: np.mod(signals.motor_position_rad[axis], 2.0 * np.pi),
-        Abscissa.CURRENT: signals.current_a[axis],
-        Abscissa.TORQUE_RATE: np.asarray(rate),
-    }
-    return variables[abscissa]

@@ -19,14 +19,16 @@ from ident.errors import NotConverged, RankDeficient
 from ident.estimate import Estimate, Method
 from ident.estimators.least_squares import require_known_payload, wls
 from ident.estimators.total_least_squares import Scaling, tls
-from ident.estimators.triangles import Triangles, motor_triangles, singular_values, solve
+from ident.estimators.triangles import Triangles, joint_triangles, motor_triangles, solve
 from ident.linearisation import jackknife_covariance, linearise
 from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
 
 MAX_ITERATIONS = 100
-STEP_TOLERANCE = 1e-9
+STEP_TOLERANCE = 1e-7
+"""Relative step of the gains; their standard deviations are some 1e-3."""
+LARGEST_DAMPING = 1e6
 
 
 def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estimate:
@@ -38,7 +40,8 @@ def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estim
 
     Raises:
         DataUnfit: free gains without a known payload, or fewer rows than unknowns.
-        RankDeficient: a gain cannot be told from the parameters.
+        RankDeficient: no linear estimate gives every gain a value to start from.
+        TooFewMoves: for the covariance.
         NotConverged: the cost still falls, or cannot fall, after MAX_ITERATIONS.
     """
     triangles = motor_triangles(observation)
@@ -56,7 +59,9 @@ def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estim
         if np.allclose(updated, noise, rtol=1e-10):
             break
         noise = updated
-    jacobian_singular = singular_values(_scaled_linear(triangles, gamma, noise))
+    joints = joint_triangles(observation)
+    full = np.concatenate((1.0 / gamma, parameters, [1.0]))
+    weighted = joints.weighted_system(full, free, gains=fixed_gains is None)
     problem = linearise(observation, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None)
     covariance = jackknife_covariance(problem, len(gamma) + len(parameters))
     return Estimate(
@@ -67,8 +72,8 @@ def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estim
         parameters=parameters,
         covariance=covariance,
         axis_noise=noise,
-        singular_values=jacobian_singular,
-        condition=float(jacobian_singular[0] / jacobian_singular[-1]),
+        singular_values=weighted,
+        condition=float(weighted[0] / weighted[-1]),
         rows=int(triangles.rows.sum()),
         iterations=iterations,
     )
@@ -103,7 +108,7 @@ def _start(observation: Observation, triangles: Triangles) -> FloatArray:
     gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
     if not gammas:
         gains = tuple(f"gain {motor + 1}" for motor in range(len(even)))
-        raise RankDeficient("no linear estimate gives every gain a value", float("inf"), gains)
+        raise RankDeficient("no linear estimate gives every gain a value", gains)
     return min(gammas, key=lambda gamma: _log_likelihood_cost(triangles, gamma, _parameters(triangles, gamma, even)))
 
 
@@ -116,7 +121,7 @@ def _gauss_newton(observation: Observation, triangles: Triangles) -> tuple[Float
         parameters = _parameters(triangles, gamma, noise)
         noise = _noise_of(triangles, gamma, parameters, 0)
     cost = [_log_likelihood_cost(triangles, gamma, parameters)]
-    damping, step = 1e-3, np.inf
+    damping = 1e-3
     for iteration in range(1, MAX_ITERATIONS + 1):
         parameters = _parameters(triangles, gamma, noise)
         residual = np.concatenate([e / s for e, s in zip(_residuals(triangles, gamma, parameters), noise, strict=True)])
@@ -132,6 +137,10 @@ def _gauss_newton(observation: Observation, triangles: Triangles) -> tuple[Float
         q, _ = np.linalg.qr(linear / np.linalg.norm(linear, axis=0))
         projected = towards - q @ (q.T @ towards)
         gram, gradient = projected.T @ projected, projected.T @ residual
+        # Judged before damping: a step made small by damping alone is a failure, not an optimum.
+        step = float(np.max(np.abs(np.linalg.lstsq(gram, gradient, rcond=None)[0])))
+        if step < STEP_TOLERANCE:
+            return gamma, iteration
         while True:
             relative = np.linalg.solve(gram + damping * np.diag(np.diag(gram)), gradient)
             trial = gamma * (1.0 + relative)
@@ -141,14 +150,11 @@ def _gauss_newton(observation: Observation, triangles: Triangles) -> tuple[Float
                 if trial_cost <= cost[-1] + 1e-12 * abs(cost[-1]):
                     break
             damping *= 10.0
-            if damping > 1e12:
-                raise NotConverged("ml", iteration, tuple(cost), float(step))
-        step = float(np.max(np.abs(relative)))
+            if damping > LARGEST_DAMPING:
+                raise NotConverged("ml", iteration, tuple(cost), step)
         gamma, damping = trial, max(damping * 0.1, 1e-12)
         noise = _noise_of(triangles, gamma, candidate, 0)
         cost.append(trial_cost)
-        if step < STEP_TOLERANCE:
-            return gamma, iteration
     raise NotConverged("ml", MAX_ITERATIONS, tuple(cost), step)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.errors import DataUnfit
-from ident.linearisation import motor_torque
 from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
@@ -35,6 +34,17 @@ class Triangles:
         size = np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
         return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(self.rows), 1.0)))
 
+    def weighted_system(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
+        """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
+
+        Args:
+            solution: (g, χ, χ_uL, 1) of eq. (17).
+            free: number of estimated parameters.
+            gains: whether the columns V belong to the unknowns.
+        """
+        first = 0 if gains else len(self.factors)
+        return singular_values(self.stacked(1.0 / self.residual_std(solution, free))[:, first:-1])
+
 
 def joint_triangles(observation: Observation) -> Triangles:
     """Rows of the paper's eq. (17), W_tot = [V | −W | −W_uL | −W_kL χ_kL], joint by joint: c = n + p + 1 columns."""
@@ -55,7 +65,7 @@ def joint_triangles(observation: Observation) -> Triangles:
 
 def motor_triangles(observation: Observation) -> Triangles:
     """Rows [v_i | (T W)_i | (T W_kL χ_kL)_i] of g_i v_i = (T W χ + T W_kL χ_kL)_i: each holds one current alone."""
-    linear, known = motor_torque(observation)
+    linear, known = observation.motor_torque()
     factors: list[FloatArray] = []
     for motor, used in enumerate(observation.motor_use):
         if used.sum() <= linear.shape[1]:

@@ -65,6 +65,10 @@ def test_the_contracts_are_kept() -> None:
         ("drivers/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
         ("drivers/profile.py", "import pinocchio", "drivers.profile is not allowed to import pinocchio"),
         ("daq/errors.py", "import canopen", "daq is not allowed to import canopen"),
+        ("daq/fit.py", "import daq.configuration.simulation", "daq.fit is not allowed to import daq.configuration.sim"),
+        ("daq/log/reader.py", "import drivers.simulated.spec", "daq.log is not allowed to import drivers.simulated"),
+        # Also by way of a module that nobody has named.
+        ("daq/atomic_file.py", "import drivers.simulated.spec", "daq.write_back is not allowed to import drivers.sim"),
     ],
 )
 def test_a_contract_broken_on_purpose_is_reported(copied: Path, file: str, line: str, says: str) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError, Source
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.relative_error import RelativeError
 
 NAMEPLATE = (32.96, 32.96, 25.65, -11.52, 18.48, 7.68)
 IDENTIFIED = (33.9, 32.4, 24.2, -9.21, 16.3, 6.79)

@@ -23,7 +23,8 @@ from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, Contro
 from daq.write_back.apply import Proposal, apply, propose, refused
 from daq.write_back.controller_write import backups, roll_back
 from daq.write_back.gates import ApplyPolicy, Gate
-from ident.calibration import Calibration, Gain, RelativeError, Source
+from ident.calibration import Calibration, Gain, Source
+from ident.relative_error import RelativeError
 from tests.daq.calibrations import AXES, KEYS, demo_calibration
 
 CONFIGS = Path(__file__).parents[2] / "configs"

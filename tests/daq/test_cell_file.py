@@ -105,12 +105,27 @@ def test_the_digest_follows_every_file(configurations: Path) -> None:
         ("[drives.J1.gain, ", "[", "5 keys"),
         ("tx40.urdf", "../simulation/demo.yaml", "a URDF of an arm"),
         ("sync:\n  period_us: 1000\n  pacing: lockstep ", "#", "sampling period"),
+        ("interface: virtual", "interface: socketcan", "lockstep on a bus of interface socketcan; expected timed"),
+        ("interface: virtual", "interface: pcan", "lockstep on a bus of interface pcan; expected timed"),
+        ("period_us: 1000", "period_us: 999", r"999, while drive generic-cia402 refreshes .* every 1000 µs; .*1000 or"),
     ],
 )
 def test_a_cell_that_contradicts_itself_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
     path = _spoil(configurations / "cells/demo.yaml", old, new)
     with pytest.raises(ConfigurationInconsistent, match=message):
         load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("interface", "pacing"), [("socketcand", "lockstep"), ("socketcan", "timed"), ("socketcand", "timed")]
+)
+def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
+    configurations: Path, interface: str, pacing: str
+) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}")
+    cell = load_cell(_spoil(path, "pacing: lockstep", f"pacing: {pacing}"))
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing(pacing)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daq.configuration.cell_file import load_cell
-from daq.conversion import load_run, scaling
+from daq.conversion import load_run, scaling, unwrapped
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.readback import AxisReadback, Readback, readback_of_drives
 from drivers.event import CellEvent, EventKind
@@ -103,6 +104,50 @@ def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
     rows = [Sample(k, START_NS + k * 1_100_000, (0,) * 6, (0,) * 6, (0,) * 6) for k in range(20)]
     with pytest.raises(ClockImplausible, match=r"909\.091 Hz; expected 1000 Hz"):
         load_run(record(rows))
+
+
+def test_one_late_sync_is_refused(record: Recorder) -> None:
+    """The mean rate of such a run is right, and its derivatives are not."""
+    rows = samples([[0] * 6] * 400)
+    late = replace(rows[7], time_ns=rows[7].time_ns + 210_000)
+    with pytest.raises(ClockImplausible, match=r"cycle 17 1\.21 ms after cycle 16 \(2 such steps\); expected 1 ms"):
+        load_run(record([*rows[:7], late, *rows[8:]]))
+
+
+def test_a_sync_within_a_fifth_of_its_period_is_taken(record: Recorder) -> None:
+    rows = samples([[0] * 6] * 400)
+    early = replace(rows[7], time_ns=rows[7].time_ns - 190_000)
+    assert load_run(record([*rows[:7], early, *rows[8:]]))[0].rate_hz == 1000.0
+
+
+@given(
+    st.integers(-(2**31), 2**31 - 1),
+    st.lists(st.one_of(st.integers(-(2**31) + 1, 2**31 - 1), st.integers(-1000, 1000)), max_size=30),
+)
+def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: list[int]) -> None:
+    way = np.cumsum([start, *steps], dtype=np.int64)
+    counter = ((way + 2**31) % 2**32 - 2**31).astype(np.int32)
+    np.testing.assert_array_equal(unwrapped(np.stack((counter, np.full_like(counter, 7)), axis=1))[:, 0], way)
+
+
+def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
+    """With an offset that puts the end of the counter in the middle of the joint's range."""
+    end_rad = 2**31 / 65536 * 2 * pi / 32
+    axes = (replace(CELL.axes[0], zero_offset_rad=-end_rad), *CELL.axes[1:])
+    counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
+    rows = [replace(row, current_raw=(0,) * 6) for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])]
+    run, _ = load_run(record(rows), replace(CELL, axes=axes))
+    np.testing.assert_allclose(run.position_rad[:, 0], np.arange(-3, 3) * 2 * pi / 65536 / 32, atol=1e-9)
+
+
+def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
+    start = demo_content(checkout)
+    top = 2**31 - 1
+    quantum = 1.0 / top
+    readback = Readback(tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes))
+    rows = [Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6) for k, sign in enumerate((1, -1))]
+    run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
+    np.testing.assert_allclose(run.position_rad[:, 0], [1 / 32, -1 / 32])
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daq.configuration.simulation import load_simulation, payload_names
+from daq.configuration.simulation import load_simulation
 from daq.errors import ConfigurationInconsistent, SchemaMismatch, UsageError
 
 READERS = {"daq/cli/simulate.py", "daq/cli/demo.py", "daq/simulate.py", "daq/demo.py"}
@@ -24,7 +24,6 @@ def test_the_truth_is_read(checkout: Path) -> None:
     assert spec.axes[3].gain_nm_per_a == -9.21
     assert "<robot" in spec.urdf
     assert load_simulation(path).payload is None
-    assert payload_names(path) == ("disc", "plate")
 
 
 def test_an_unknown_payload_is_refused(checkout: Path) -> None:

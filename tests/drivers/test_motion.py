@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 
+import can
 import pytest
 
+from drivers.axis import Axis
 from drivers.errors import DriveFault, HeartbeatLost, MotionRefused, MotionTimeout, SampleLost, StateRefused
 from drivers.event import CellEvent, EventKind
 from drivers.motion import MotionBounds, execute
@@ -227,6 +229,79 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
     with pytest.raises(MotionTimeout, match="axis 2"):
         run(moving, FAR)
     assert powerless(bus)
+
+
+def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, _, bus, _ = moving
+    receive = bus.recv
+    last_profile = 0x302
+
+    def interrupt(timeout: float | None = None) -> can.Message | None:
+        # The set-points are queued right after the SYNC that follows the last profile.
+        if not timeout and last_profile in [frame.arbitration_id for frame in bus.sent[-4:-1]]:
+            monkeypatch.setattr(bus, "recv", receive)
+            raise KeyboardInterrupt
+        return receive(timeout)
+
+    monkeypatch.setattr(bus, "recv", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(moving, FAR)
+    assert last_profile in [frame.arbitration_id for frame in bus.sent]
+    controlwords = [frame.data[0] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
+    assert not any(word & 0x10 for word in controlwords)
+    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    assert powerless(bus)
+
+
+def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
+    """Cycles from the stop to its end of drives that stay in QUICK STOP ACTIVE while their encoders show this."""
+    _, _, bus, events = moving
+    stopping: list[int] = []
+
+    def drift(cycle: int) -> None:
+        if any(event.kind is EventKind.STOP for event in events):
+            stopping.append(cycle)
+            for node in bus.nodes:
+                node.position += drift_counts[len(stopping) % len(drift_counts)]
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = drift
+    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    return stopping
+
+
+def test_an_encoder_that_flickers_stands_still(moving: Moving) -> None:
+    stopping = stop_with(moving, (3.0, -5.0, 2.0, 0.0))
+    assert len(stopping) < 20
+    assert powerless(moving[2])
+
+
+def test_an_axis_that_creeps_does_not_stand_still(moving: Moving) -> None:
+    bound_cycles = round(BOUNDS.stop_s * 1e9 / PERIOD_NS)
+    assert len(stop_with(moving, (7.0,))) >= bound_cycles
+
+
+def test_every_axis_that_could_not_be_stopped_is_told(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    network, _, bus, _ = moving
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+
+    def refuse(axis: Axis) -> None:
+        raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "QUICK STOP ACTIVE", 0x07)
+
+    def coast(_cycle: int) -> None:
+        for node in bus.nodes:
+            node.position += 50
+
+    bus.on_cycle = coast
+    near = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    with monkeypatch.context() as patched:
+        patched.setattr(network, "disable", refuse)
+        with pytest.raises(StateRefused, match="node 1") as error:
+            run(moving, near)
+    assert ["node 2" in note for note in error.value.__notes__] == [True]
+    bus.on_cycle = lambda _cycle: None
 
 
 def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> None:

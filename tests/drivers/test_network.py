@@ -69,6 +69,7 @@ def test_prepare_sets_up_and_leaving_restores_everything() -> None:
         assert isinstance(report, dict)
         assert report["serial"] == 7
         assert report["scale_objects"] == {"6075h:00": 2000}
+        assert (report["amplitude"], report["tap"]) == ("rms", "reference")
         assert report["mapping"][0] == "TPDO1: COB-ID 00000181h, type 1, 60640020 60740010 60410010"
     changed = ((0x6040, 0), (0x6041, 0))
     for node, objects in zip(bus.nodes, before, strict=True):

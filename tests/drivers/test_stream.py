@@ -31,7 +31,7 @@ def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
         network.prepare()
         bus.cycle = -1
         bus.on_cycle = count_cycles
-        pacing = TimedSync(PERIOD_NS, bus.clock) if timed else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
+        pacing = TimedSync(PERIOD_NS, 77, bus.clock) if timed else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
         yield SyncStream(network, pacing, events.append), bus, events
         bus.tamper = lambda message: (message,)
         for node in bus.nodes:
@@ -130,14 +130,22 @@ def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> 
     assert stream.statistics == StreamStatistics(cycles=3, frames=5, missing=1, wrong_length=1)
 
 
-def test_frames_that_nobody_asked_for_are_surplus(lockstep: Prepared) -> None:
+def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))  # before the first SYNC
     next(stream)
     bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))  # of a foreign node
     bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))  # another identifier
     assert next(stream).position_counts == (1, 1)
-    assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=3)
+    assert stream.statistics == StreamStatistics(cycles=2, frames=4, foreign=3)
+
+
+def test_a_frame_that_an_axis_was_not_told_to_send_is_surplus(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))  # TPDO4 of node 1
+    assert next(stream).position_counts == (1, 1)
+    assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=1)
 
 
 def test_too_many_missing_cycles_in_a_row_end_the_stream(lockstep: Prepared) -> None:
@@ -176,6 +184,23 @@ def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None
     stream, bus, _ = lockstep
     bus.nodes[0].fault()
     assert [next(stream).cycle for _ in range(3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("following_error", [False, True])
+def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(lockstep: Prepared, following_error: bool) -> None:
+    """Its statusword before its first answer is nobody's: what it says then is no change."""
+    stream, bus, events = lockstep
+    bus.nodes[1].fault(following_error)
+    drop(bus, 0x182, range(2))
+    samples = [next(stream) for _ in range(6)]
+    assert [sample.missing for sample in samples] == [2, 2, 0, 0, 0, 0]
+    states = [event for event in events if event.kind is EventKind.STATE and event.axis == 1]
+    assert [(event.time_ns, event.code) for event in states] == [(samples[2].time_ns, samples[2].statusword[1])]
+    bus.nodes[1].fault()
+    bus.nodes[0].fault()
+    next(stream)
+    with pytest.raises(DriveFault, match="node 1"):
+        next(stream)
 
 
 def test_a_limit_that_acts_is_an_event_alone(lockstep: Prepared) -> None:
@@ -239,7 +264,11 @@ def test_a_cut_wire_is_a_bus_error(lockstep: Prepared) -> None:
 def test_timed_syncs_keep_to_the_schedule(timed: Prepared) -> None:
     stream, _, _ = timed
     times = [next(stream).time_ns for _ in range(20)]
-    assert [time - times[0] for time in times] == [PERIOD_NS * k for k in range(20)]
+    assert times == [77 + PERIOD_NS * k for k in range(20)]
+
+
+def test_before_the_first_sync_it_is_already_the_start(timed: Prepared, lockstep: Prepared) -> None:
+    assert timed[0].time_ns == lockstep[0].time_ns == 77
 
 
 def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) -> None:
@@ -247,9 +276,9 @@ def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) 
     first = next(stream).time_ns
     bus.clock.now_ns += round(3.5 * PERIOD_NS)
     second, third = next(stream), next(stream)
-    assert second.cycle == 1
     assert stream.statistics.skipped_periods == 2
-    assert (third.time_ns - first) % PERIOD_NS == 0
+    assert (second.cycle, third.cycle) == (3, 4)  # periods 1 and 2 had no SYNC
+    assert (third.time_ns - first) == third.cycle * PERIOD_NS
 
 
 def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:

@@ -11,8 +11,9 @@ from scipy import signal
 from ident.conditioning import Conditioning
 from ident.dataset import differentiate
 from ident.drive_train import DriveTrain
+from ident.link import LINK_PARAMETERS
 from ident.model import Model
-from ident.payload import PAYLOAD_PARAMETERS, Payload
+from ident.payload import Payload
 from ident.robot import robot_from_urdf
 from ident.run import Run
 from tests.ident.arms import TX40
@@ -23,7 +24,7 @@ RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
 RATIO[5, 4] = 32.0
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
 PAYLOAD_TRUTH = dict(
-    zip(PAYLOAD_PARAMETERS, (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59), strict=True)
+    zip(LINK_PARAMETERS, (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59), strict=True)
 )
 MOUNTED = Payload("disc", "a", {"m": 4.59})
 CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6)
@@ -96,10 +97,10 @@ def record(
     bare = Run(name, time, q, np.zeros_like(q))
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the motion's own.
     data = differentiate(bare, truth.model.drive_train, Conditioning(position_cutoff_hz=0.3 * rate_hz))
-    columns = truth.model.regressor(data, slice(0, len(time)))
+    columns = truth.model.regressor(data.motion())
     parameters = truth.parameters.copy()
     if payload is not None:
-        parameters[truth.model.flange] += [PAYLOAD_TRUTH[p] for p in PAYLOAD_PARAMETERS]
+        parameters[truth.model.flange] += [PAYLOAD_TRUTH[p] for p in LINK_PARAMETERS]
     torque = np.einsum("jck,c->jk", columns, parameters)
     current = np.zeros_like(q)
     current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, RelativeError
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.dataset import Dataset, differentiate
 from ident.effects.cogging import Cogging
 from ident.effects.load_friction import LoadFriction
@@ -19,9 +19,10 @@ from ident.effects.stribeck import Stribeck
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.estimate import Method
 from ident.identify import Identification, PlacedEffect, identify, with_effects
-from ident.observation import decimate_rows, row_masks
 from ident.payload import Payload
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
+from ident.relative_error import RelativeError
+from ident.rows import decimate_rows, row_masks
 from ident.run import Run
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth
 
@@ -123,7 +124,7 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     named = tuple(
         Parameter(name, float(value), 0.0, "") for name, value in zip(base.names, base.grouping @ standard, strict=True)
     )
-    columns = truth.model.regressor(motion, slice(None))
+    columns = truth.model.regressor(motion.motion())
     expected = np.einsum("jck,c->jk", columns, standard)
     found = predict_torque(_calibration(GAINS, named), truth.model, motion)
     assert found == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))

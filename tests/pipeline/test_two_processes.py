@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,36 @@ def test_plan_record_info_and_the_same_plan_again(
     assert main(["info", str(log), "--json"]) == ExitCode.OK
     assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion"]) == ExitCode.USAGE
     assert "file of that name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_an_interrupted_recording_stops_the_axes_and_says_so(
+    cell: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str], number: signal.Signals
+) -> None:
+    plan, log = tmp_path / "plan.yaml", tmp_path / "bare.mcap"
+    part = tmp_path / "bare.mcap.part"
+    assert main(["plan", str(cell), "--out", str(plan), "--duration", "20", "--exchanges", "0"]) == ExitCode.OK
+    command = [sys.executable, "-m", "daq", "record", str(cell), str(plan), "--out", str(log), "--enable-motion"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=checkout) as process:
+        for _ in range(1200):
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=0.05)
+            begun = part.stat().st_size if part.exists() else 0
+            if begun > 60_000 or process.returncode is not None:
+                break
+        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)  # a second one does not cut the stop short
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == ExitCode.INTERRUPTED, err
+    assert out == ""
+    assert "Traceback" not in err
+    told = f"interrupted: axes stopped; what was recorded is in {part}, which is not usable for a fit"
+    assert told in err.splitlines()
+    assert sorted(tmp_path.iterdir()) == [part, plan]
+    capsys.readouterr()
+    assert main(["scan", str(cell), "--json"]) == ExitCode.OK
+    assert {node["state"] for node in json.loads(capsys.readouterr().out)["nodes"]} == {"SWITCH ON DISABLED"}
+    assert main(["fit", str(part)]) == ExitCode.DATA_UNFIT
 
 
 def test_nothing_moves_and_nothing_is_written_without_permission(

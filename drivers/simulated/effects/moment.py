@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +40,3 @@ class Moment:
     viscous_nm_s_rad: FloatArray
     torque_nm: FloatArray
     motor_torque_nm: FloatArray
-
-
-class ActingEffect(Protocol):
-    """Physics that acts on the plant in each substep."""
-
-    def act(self, moment: Moment) -> None:
-        """Change the moment's changeable arrays."""

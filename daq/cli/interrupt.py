@@ -1,0 +1,45 @@
+"""Being told to stop while a robot moves: by Ctrl-C or, from a service manager or a scheduler, by SIGTERM."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+GRACE_S = 10.0
+"""Longer than a stop of all axes takes."""
+
+
+@contextmanager
+def interruptible(clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
+    """Turn SIGINT or SIGTERM within the block into KeyboardInterrupt; pass over the ones that follow it too soon.
+
+    By default SIGTERM ends a process at once, and the axes would go on. What follows the first signal is the stop of
+    the axes: a second one, of an impatient person, must not cut that short. Later ones count again, so that nobody is
+    left without a way out. In another thread than the main one nothing is changed: Python handles no signals there.
+
+    Args:
+        clock: monotonic time [s].
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    deaf_until_s = float("-inf")
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        nonlocal deaf_until_s
+        if clock() >= deaf_until_s:
+            deaf_until_s = clock() + GRACE_S
+            raise KeyboardInterrupt
+
+    before = [(number, signal.signal(number, interrupt)) for number in SIGNALS]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)

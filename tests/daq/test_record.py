@@ -1,0 +1,173 @@
+"""Recording against drives that live in a time of their own: what the bus did must be in the log and in its verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import radians
+from pathlib import Path
+
+import can
+import pytest
+
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from daq.conversion import load_run
+from daq.errors import RunInvalid
+from daq.log.reader import read_log
+from daq.plan_file import load_plan
+from daq.record import Clocks, Recorded, record
+from drivers.errors import SampleLost
+from drivers.network import CanopenNetwork
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
+
+WALL_NS = 1_700_000_000_000_000_000
+ELBOW, ELBOW_COUNTS = 3, round(radians(60) * 45 / (2 * 3.141592653589793) * 65536)
+PLAN = """format: drivegain-plan
+cell: demo
+seed: 1
+condition: 100.0
+moves:
+  - {target_deg: [5, -5, 70, 5, -5, 5], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+  - {target_deg: [0, 0, 60, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+"""
+
+
+class Rig:
+    """Six scripted drives in the place of the demo cell's, the elbow at 60 deg."""
+
+    def __init__(self, checkout: Path, folder: Path, patch: pytest.MonkeyPatch, pacing: str) -> None:
+        configs = checkout / "configs"
+        text = (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+        self.cell_file = folder / "cell.yaml"
+        self.cell_file.write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
+        self.plan = folder / "plan.yaml"
+        self.plan.write_text(PLAN)
+        self.out = folder / "a.mcap"
+        self.network, self.bus = cell(6)
+        self.bus.nodes[ELBOW - 1].position = ELBOW_COUNTS
+
+        def network_of(_cell: Cell) -> CanopenNetwork:
+            return self.network
+
+        patch.setattr("daq.record.network_of", network_of)
+
+    def run(self) -> Recorded:
+        """Record the plan."""
+        declared = load_cell(self.cell_file)
+        clocks = Clocks(lambda: WALL_NS, self.bus.clock)
+        moves = load_plan(self.plan, declared)
+        return record(
+            self.cell_file,
+            declared,
+            moves,
+            self.out,
+            payload=None,
+            operator="Ada",
+            granted_by="the test",
+            run_id="1",
+            clocks=clocks,
+        )
+
+    def profiles(self) -> list[bytes]:
+        """What the elbow was told about velocity and acceleration."""
+        cob_id = 0x300 + ELBOW
+        return [bytes(frame.data) for frame in self.bus.sent if frame.arbitration_id == cob_id]
+
+
+@pytest.fixture
+def lockstep(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(checkout, tmp_path, monkeypatch, "lockstep")
+
+
+@pytest.fixture
+def timed(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(checkout, tmp_path, monkeypatch, "timed")
+
+
+def silent_at_first(bus: ScriptedBus, cycles: int) -> None:
+    """Let the elbow's first answers be lost."""
+    first: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id != 0x180 + ELBOW or len(first) == cycles:
+            return (message,)
+        first.append(bus.cycle)
+        return ()
+
+    bus.tamper = tamper
+
+
+@pytest.mark.parametrize("pacing", ["lockstep", "timed"])
+def test_a_sound_run_is_valid_and_starts_at_wall_time(
+    pacing: str, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(checkout, tmp_path, monkeypatch, pacing)
+    done = rig.run()
+    assert (done.log.valid, done.log.reason, done.log.lost_cycles) == (True, "", 0)
+    time_ns = read_log(rig.out).samples.time_ns
+    assert time_ns.tolist() == [WALL_NS + PERIOD_NS * k for k in range(len(time_ns))]
+    assert all(event.time_ns in time_ns for event in read_log(rig.out).events)
+    assert load_run(rig.out)[0].move is not None
+
+
+def test_moves_are_planned_from_where_the_axes_are_known_to_be(
+    lockstep: Rig, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent_at_first(lockstep.bus, 2)
+    done = lockstep.run()
+    samples = read_log(lockstep.out).samples
+    assert samples.missing[:4].tolist() == [1 << ELBOW - 1, 1 << ELBOW - 1, 0, 0]
+    assert samples.position_counts[2, ELBOW - 1] == ELBOW_COUNTS
+    assert (done.log.valid, done.log.reason) == (False, "2 missing answers")
+    (tmp_path / "sound").mkdir()
+    sound = Rig(checkout, tmp_path / "sound", monkeypatch, "lockstep")
+    sound.run()
+    assert lockstep.profiles() == sound.profiles() != []
+
+
+def test_an_axis_that_never_answers_is_not_waited_for_for_ever(lockstep: Rig) -> None:
+    silent_at_first(lockstep.bus, 1000)
+    with pytest.raises(SampleLost, match=f"no answer from axis {ELBOW}"):
+        lockstep.run()
+    assert not lockstep.out.exists()
+    assert not any(node.powered_cycles for node in lockstep.bus.nodes)
+
+
+def test_a_schedule_that_slipped_is_refused(timed: Rig) -> None:
+    def busy(cycle: int) -> None:
+        if cycle == 150:
+            timed.bus.clock.now_ns += 3 * PERIOD_NS
+
+    timed.bus.on_cycle = busy
+    done = timed.run()
+    skipped = done.stream.skipped_periods
+    assert skipped >= 2
+    assert (done.log.valid, done.log.lost_cycles) == (False, skipped)
+    assert f"{skipped} periods without SYNC" in done.log.reason
+    with pytest.raises(RunInvalid, match="periods without SYNC"):
+        load_run(timed.out)
+
+
+@pytest.mark.parametrize(("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was told to send")])
+def test_what_the_stream_cannot_explain_makes_a_run_invalid(lockstep: Rig, twice: int, says: str) -> None:
+    sent: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id != 0x182 or lockstep.bus.cycle < 150 or sent:
+            return (message,)
+        sent.append(lockstep.bus.cycle)
+        return (message, can.Message(arbitration_id=twice, is_extended_id=False, data=message.data))
+
+    lockstep.bus.tamper = tamper
+    done = lockstep.run()
+    assert not done.log.valid
+    assert says in done.log.reason
+
+
+def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
+    lockstep.bus.on_cycle = lambda cycle: lockstep.bus.inject(
+        can.Message(arbitration_id=0x1C0, is_extended_id=False, data=bytes(8))
+    )
+    done = lockstep.run()
+    assert done.stream.foreign > 100
+    assert (done.log.valid, done.log.reason) == (True, "")
