@@ -43,7 +43,7 @@ demo: setup
 	$(BIN)/drivegain demo --out out/demo
 
 test: check
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 check: setup
 	$(BIN)/ruff check .

@@ -29,8 +29,9 @@ LIMIT_MARGIN = 0.05
 """Share of a joint's range by which positions may leave its limits."""
 LARGEST_SATURATED = 0.1
 """Share of the samples of an axis in which a limit may act; they are masked."""
-STEP_TOLERANCE = 0.2
-"""Share of a period by which one time stamp may be nearer to, or further from, the one before."""
+STEP_TOLERANCE = 0.5
+"""Share of a period by which one time stamp may be nearer to, or further from, the one before: half a period is the least
+that cannot be anything but another cycle."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the rate asked for and the one that the time stamps show."""
 

@@ -6,7 +6,7 @@ direction is built from the *predicted* torque, not the measured current, so tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,18 @@ class Linearisation:
     def moves(self) -> int:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
+
+    def ordered(self, order: IntArray) -> Linearisation:
+        """The same rows in another order."""
+        return replace(
+            self,
+            jacobian=self.jacobian[order],
+            residual=self.residual[order],
+            current=self.current[order],
+            motor=self.motor[order],
+            cluster=self.cluster[order],
+            source=self.source[order],
+        )
 
     def whitened(self, torque_nm: FloatArray) -> FloatArray:
         """Motor-side torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra)."""
@@ -118,12 +130,12 @@ def jackknife_covariance(problem: Linearisation, unknowns: int) -> FloatArray:
     Raises:
         TooFewMoves: their scatter says nothing of the uncertainty.
     """
-    order = np.argsort(problem.cluster, kind="stable")
     moves = problem.moves
     if moves < FEWEST_MOVES:
         raise TooFewMoves(moves, FEWEST_MOVES)
-    bounds = np.searchsorted(problem.cluster[order], np.arange(moves + 1))
-    jacobian, residual = problem.jacobian[order], problem.residual[order]
+    problem = problem.ordered(np.argsort(problem.cluster, kind="stable"))
+    bounds = np.searchsorted(problem.cluster, np.arange(moves + 1))
+    jacobian, residual = problem.jacobian, problem.residual
     hessian = jacobian.T @ jacobian
     shifts = np.empty((moves, hessian.shape[0]))
     for move in range(moves):

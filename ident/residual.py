@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,15 @@ class Folds:
     """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
 
     Attributes:
-        problem: the linearisation.
-        fold: of each row, shape (rows,).
+        problem: the linearisation, its rows sorted by fold so that a fold is a slice and never a copy.
+        slices: rows of each fold.
         factors: Cholesky factor of JᵀJ without each fold, with scipy's flag.
         scores: Jᵀe without each fold, shape (folds, f).
         residual: e of each row, predicted by a fit that did not see its fold, shape (rows,).
     """
 
     problem: Linearisation
-    fold: IntArray
+    slices: tuple[slice, ...]
     factors: tuple[tuple[FloatArray, bool], ...]
     scores: FloatArray
     residual: FloatArray
@@ -40,9 +41,9 @@ class Folds:
 
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
-        n = len(self.problem.gamma)
-        sums = np.bincount(self.fold * n + self.problem.motor, weights=residual**2, minlength=self.count * n)
-        return np.asarray(sums.reshape(self.count, n), dtype=np.float64)
+        n, squares = len(self.problem.gamma), residual**2
+        sums = [np.bincount(self.problem.motor[rows], squares[rows], n) for rows in self.slices]
+        return np.asarray(np.stack(sums), dtype=np.float64)
 
 
 def cut(problem: Linearisation, count: int = 8) -> Folds:
@@ -59,11 +60,14 @@ def cut(problem: Linearisation, count: int = 8) -> Folds:
         raise TooFewMoves(problem.moves, FEWEST_MOVES)
     count = min(count, problem.moves)
     fold = problem.cluster % count
+    order = np.argsort(fold, kind="stable")
+    problem = problem.ordered(order)
+    bounds = np.searchsorted(fold[order], np.arange(count + 1))
+    slices = tuple(slice(int(first), int(last)) for first, last in pairwise(bounds))
     hessian, score = problem.jacobian.T @ problem.jacobian, problem.jacobian.T @ problem.residual
     factors, scores = [], []
     residual = np.empty_like(problem.residual)
-    for index in range(count):
-        rows = fold == index
+    for rows in slices:
         inside = problem.jacobian[rows]
         rest = hessian - inside.T @ inside
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
@@ -71,7 +75,7 @@ def cut(problem: Linearisation, count: int = 8) -> Folds:
         factors.append(linalg.cho_factor(rest, lower=True))
         scores.append(score - inside.T @ problem.residual[rows])
         residual[rows] = problem.residual[rows] - inside @ linalg.cho_solve(factors[-1], scores[-1])
-    return Folds(problem, fold, tuple(factors), np.stack(scores), residual)
+    return Folds(problem, slices, tuple(factors), np.stack(scores), residual)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +116,8 @@ def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatAr
     gram = projected.T @ projected
     if np.any(np.diag(gram) < 1e-6 * np.sum(columns**2, axis=0)):
         return None
-    score = projected.T @ problem.residual
-    coefficients = np.linalg.solve(gram, score)
+    score = np.asarray(projected.T @ problem.residual)
+    coefficients = np.asarray(np.linalg.solve(gram, score), dtype=np.float64)
     after = problem.residual - projected @ coefficients
     by_move = [np.bincount(problem.cluster, part, problem.moves) for part in (projected * after[:, None]).T]
     scatter = np.asarray(np.stack(by_move, axis=1), dtype=np.float64)
@@ -123,8 +127,8 @@ def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatAr
     training_fall = np.empty(folds.count)
     size = columns.T @ columns
     against = columns.T @ problem.residual
-    for index, (factor, nuisance) in enumerate(zip(folds.factors, folds.scores, strict=True)):
-        rows = folds.fold == index
+    folded = zip(folds.slices, folds.factors, folds.scores, strict=True)
+    for index, (rows, factor, nuisance) in enumerate(folded):
         inside, j = columns[rows], problem.jacobian[rows]
         coupling = whole - j.T @ inside
         moved = linalg.cho_solve(factor, coupling)

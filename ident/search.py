@@ -104,6 +104,7 @@ def find(
         observation, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=estimate.gains_fixed
     )
     folds = cut(problem)
+    problem = folds.problem
     hessian = linalg.cho_factor(problem.jacobian.T @ problem.jacobian, lower=True)
     to_motor = model.drive_train.to_motor
     tried: list[tuple[int, tuple[tuple[Effect, Trial], ...]]] = []

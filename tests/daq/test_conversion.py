@@ -109,14 +109,14 @@ def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
 def test_one_late_sync_is_refused(record: Recorder) -> None:
     """The mean rate of such a run is right, and its derivatives are not."""
     rows = samples([[0] * 6] * 400)
-    late = replace(rows[7], time_ns=rows[7].time_ns + 210_000)
-    with pytest.raises(ClockImplausible, match=r"cycle 17 1\.21 ms after cycle 16 \(2 such steps\); expected 1 ms"):
+    late = replace(rows[7], time_ns=rows[7].time_ns + 510_000)
+    with pytest.raises(ClockImplausible, match=r"cycle 17 1\.51 ms after cycle 16 \(2 such steps\); expected 1 ms"):
         load_run(record([*rows[:7], late, *rows[8:]]))
 
 
-def test_a_sync_within_a_fifth_of_its_period_is_taken(record: Recorder) -> None:
+def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
     rows = samples([[0] * 6] * 400)
-    early = replace(rows[7], time_ns=rows[7].time_ns - 190_000)
+    early = replace(rows[7], time_ns=rows[7].time_ns - 490_000)
     assert load_run(record([*rows[:7], early, *rows[8:]]))[0].rate_hz == 1000.0
 
 

@@ -27,6 +27,6 @@ def noisy_runs(truth: Truth) -> tuple[Run, ...]:
     """Two runs without load and two with, at a relative error of about six per cent."""
     rng = np.random.default_rng(3)
     return tuple(
-        record(truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=30.0)
+        record(truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
         for index in range(4)
     )
