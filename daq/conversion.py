@@ -30,8 +30,9 @@ LIMIT_MARGIN = 0.05
 LARGEST_SATURATED = 0.1
 """Share of the samples of an axis in which a limit may act; they are masked."""
 STEP_TOLERANCE = 0.5
-"""Share of a period by which one time stamp may be nearer to, or further from, the one before: half a period is the least
-that cannot be anything but another cycle."""
+"""Share of a period by which one time stamp may be nearer to, or further from, the one before.
+
+Half a period is the least that cannot be told from another cycle."""
 RATE_TOLERANCE = 0.01
 """Relative difference between the rate asked for and the one that the time stamps show."""
 

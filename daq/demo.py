@@ -18,7 +18,7 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import load_cell
 from daq.configuration.simulation import load_simulation
-from daq.errors import UsageError
+from daq.errors import OutputExists, UsageError
 from daq.fit import Fit, calibration_of, close_loop, fit
 from daq.plan import Plan, plan
 from daq.plan_file import save_plan
@@ -33,6 +33,7 @@ from drivers.simulated.cell import SimulatedCell
 from ident.calibration import Calibration
 from ident.identify import Identification
 
+MARK = ".drivegain-demo"
 PLANS = ("a", "b", "c")
 RUNS = (
     ("bare-1", None, "a"),
@@ -185,9 +186,16 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 
 
 def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
-    if out.exists() and not out.is_dir():
-        raise UsageError(str(out), found="a file", expected="a folder", remedy="choose another --out")
+    """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
+        raise OutputExists(
+            str(out),
+            found="something that is no folder of a demonstration",
+            expected="no such folder, an empty one, or that of an earlier demonstration",
+            remedy="choose another --out",
+        )
     out.mkdir(parents=True, exist_ok=True)
+    (out / MARK).write_text("Made by `drivegain demo`, which may replace what is in this folder.\n")
     for log in logs:
         log.unlink(missing_ok=True)
         log.with_name(log.name + ".part").unlink(missing_ok=True)

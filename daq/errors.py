@@ -27,6 +27,8 @@ DaqError
 │   │   ├── TableNotNumeric     a field is not a finite number
 │   │   └── TimeNotUniform      its time column has gaps or jumps
 │   ├── LogsDiffer              logs of different cells, or of different configurations of one
+│   ├── LogRepeated             one recording twice
+│   ├── RolesExchanged          loaded and unloaded runs are mistaken for each other
 │   └── RunUnfit
 │       ├── RunInvalid          the recorder itself marked it invalid
 │       ├── CyclesLost          SYNC cycles are missing
@@ -178,6 +180,14 @@ class TimeNotUniform(TableUnfit):
 
 class LogsDiffer(DataError):
     """Logs of different cells, or of different configurations of one."""
+
+
+class LogRepeated(DataError):
+    """One recording twice, in the fit or in fit and hold-out."""
+
+
+class RolesExchanged(DataError):
+    """Loaded and unloaded runs are mistaken for each other."""
 
 
 class RunUnfit(DataError):

@@ -8,11 +8,12 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
-from daq.errors import LogsDiffer
+from daq.errors import LogRepeated, LogsDiffer, RolesExchanged
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.estimate import Estimate, Method
@@ -92,6 +93,7 @@ def fit(
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
     runs, declared = load_runs((*logs, *holdout), cell)
+    _check_distinct((*logs, *holdout), runs)
     used, rest = runs[: len(logs)], runs[len(logs) :]
     nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
@@ -103,8 +105,35 @@ def fit(
         method=chosen,
         fixed_gains=nameplate if gains_fixed else None,
     )
+    if not gains_fixed:
+        check_signs(result.estimate, nameplate)
     paper = None if gains_fixed else tls(result.training)
     return Fit(declared, used, rest, result, (), paper)
+
+
+def _check_distinct(logs: Sequence[Path], runs: tuple[Run, ...]) -> None:
+    """A log given twice would count twice, and a held-out one would be held out of nothing."""
+    seen: dict[str, Path] = {}
+    for log, run in zip(logs, runs, strict=True):
+        if run.digest in seen:
+            raise LogRepeated(
+                str(log),
+                found=f"the same recording as {seen[run.digest]}",
+                expected="every recording once, in the fit or held out",
+                remedy="name other logs",
+            )
+        seen[run.digest] = log
+
+
+def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
+    """The payload's weight sets the sign of all gains together: taken from the wrong runs it turns them all."""
+    if np.all(np.sign(estimate.gains) == -np.sign(nameplate)):
+        raise RolesExchanged(
+            "all drive gains",
+            found=", ".join(f"{gain:.3g}" for gain in estimate.gains),
+            expected="the signs of the nameplate: " + ", ".join(f"{gain:.3g}" for gain in nameplate),
+            remedy="were the payload's run and the run without load exchanged? look at `drivegain info` of each log",
+        )
 
 
 def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:

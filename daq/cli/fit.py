@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.calibration_file import as_document, save
+from daq.cli.output import check_output
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
@@ -22,6 +23,9 @@ from daq.report.fit import draw
 from daq.report.gain_table import gain_table
 from ident.calibration import Calibration
 from ident.estimate import Method
+
+CALIBRATION = "drivegain-calibration"
+"""What a calibration file says it is."""
 
 
 class Gains(Enum):
@@ -56,6 +60,7 @@ def fit_verb(
     json: JsonOption = False,
 ) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
+    check_output(out, (*logs, *(holdout or ()), *(() if cell is None else (cell,))), CALIBRATION)
     with status("identifying"):
         fitted = fit(
             logs,

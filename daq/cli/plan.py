@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from daq.cli.output import check_output
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
@@ -28,6 +29,7 @@ def plan_verb(
     json: JsonOption = False,
 ) -> None:
     """Choose point-to-point moves inside the joint limits until the observation matrix is well conditioned."""
+    check_output(out, (cell,), "drivegain-plan")
     declared = load_cell(cell)
     with progress_bar("planning") as told:
         made = plan(

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from daq.calibration_file import as_document
 from daq.cli.fit import (
+    CALIBRATION,
     CellOption,
     Gains,
     GainsOption,
@@ -23,6 +24,7 @@ from daq.cli.fit import (
     save_calibration,
     save_pictures,
 )
+from daq.cli.output import check_output
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
@@ -49,6 +51,7 @@ def residual_verb(
     json: JsonOption = False,
 ) -> None:
     """Find the effect that the residual asks for, add it to the model, refit everything, and look again."""
+    check_output(out, (*logs, *(holdout or ()), *(() if cell is None else (cell,))), CALIBRATION)
     with status("identifying") as told:
         fitted = fit(
             logs,

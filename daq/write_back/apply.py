@@ -78,7 +78,7 @@ def propose(
     now = decode(content, str(file))
     scalars = now.locate(tuple(keys[gain.axis] for gain in calibration.gains))
     changes = tuple(_change(gain, scalar) for gain, scalar in zip(calibration.gains, scalars, strict=True))
-    refusals = calibration_refusals(calibration, cell, configuration_sha256) + tuple(
+    refusals = calibration_refusals(calibration, cell, configuration_sha256, policy) + tuple(
         r for c in changes for r in gain_refusals(c, policy)
     )
     spelling = {change.key: change.spelling for change in changes if change.spelling}

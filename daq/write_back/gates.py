@@ -21,11 +21,13 @@ class ApplyPolicy:
         max_change_percent: from the gain in the file now [%].
         max_nameplate_percent: from the manufacturer's gain [%].
         max_std_percent: relative standard deviation of the identified gain [%].
+        max_error_percent: relative error of the torques, on held-out data where there are any [%].
     """
 
     max_change_percent: float = 35.0
     max_nameplate_percent: float = 50.0
     max_std_percent: float = 3.0
+    max_error_percent: float = 25.0
 
 
 class Gate(Enum):
@@ -39,6 +41,7 @@ class Gate(Enum):
     UNCERTAINTY = "uncertainty"
     SOURCES = "sources"
     HOLDOUT = "hold-out error"
+    ERROR = "error"
     CELL = "cell"
     CONFIGURATION = "configuration"
 
@@ -159,13 +162,16 @@ def gain_refusals(change: GainChange, policy: ApplyPolicy) -> tuple[Refusal, ...
     return tuple(closed)
 
 
-def calibration_refusals(calibration: Calibration, cell: str, configuration_sha256: str | None) -> tuple[Refusal, ...]:
+def calibration_refusals(
+    calibration: Calibration, cell: str, configuration_sha256: str | None, policy: ApplyPolicy
+) -> tuple[Refusal, ...]:
     """Closed gates of the calibration as a whole.
 
     Args:
         calibration: to be written.
         cell: name of the cell whose controller it goes to.
         configuration_sha256: digest of that cell's configuration now, None where it is not to be compared.
+        policy: bounds.
     """
     closed = []
     if calibration.cell != cell:
@@ -190,6 +196,16 @@ def calibration_refusals(calibration: Calibration, cell: str, configuration_sha2
         closed.append(
             Refusal(
                 Gate.NOT_FINITE, "calibration", "a relative error that is no number", "finite", "fit the logs again"
+            )
+        )
+    elif errors[-1].total > policy.max_error_percent:
+        closed.append(
+            Refusal(
+                Gate.ERROR,
+                "calibration",
+                f"a relative error of {errors[-1].total:.1f} % of the torques",
+                f"at most {policy.max_error_percent:g} %",
+                "the model does not describe this robot: check drive train, roles, payload and units",
             )
         )
     closed += [

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.errors import ExitCode
+from daq.configuration.cell_model import model_of
+from daq.errors import ExitCode, RolesExchanged
+from daq.fit import check_signs, load_runs
+from ident.identify import identify
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +107,26 @@ def test_the_wrong_drive_train_shows_in_the_residual(
         assert max(wrong[4], wrong[5]) > 2 * max(right[4], right[5])
     else:
         assert code == ExitCode.DATA_UNFIT
+
+
+def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> None:
+    runs, cell = load_runs([demonstration / f"{name}.mcap" for name in ("bare-1", "loaded-1")])
+    payload = runs[1].payload
+    exchanged = (replace(runs[0], payload=payload), replace(runs[1], payload=None))
+    estimate = identify(model_of(cell), exchanged, cell.conditioning).estimate
+    nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
+    with pytest.raises(RolesExchanged, match="exchanged"):
+        check_signs(estimate, nameplate)
+
+
+def test_validate_measures_the_calibration_on_the_unused_run(
+    demonstration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = json.loads((demonstration / "summary.json").read_text())
+    capsys.readouterr()
+    calibration, unused = demonstration / "calibration.yaml", demonstration / "unused.mcap"
+    assert main(["validate", str(calibration), str(unused), "--json"]) == ExitCode.OK
+    found = json.loads(capsys.readouterr().out)
+    assert found["logs"][0]["relative_error_percent"]["total"] == pytest.approx(
+        summary["error_after_percent"], rel=0.01
+    )
