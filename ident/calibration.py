@@ -59,7 +59,9 @@ class AcceptedEffect:
         axis: name of the axis.
         settings: the searched (non-linear) parameters by name, units in the names.
         coefficients: the linear parameters, identified.
-        error_before_percent, error_after_percent: relative error of the axis on the data not used for the fit [%].
+        error_before_percent, error_after_percent: of the axis, without and with the effect, on data that the fit did
+            not use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or without any ‖e‖/‖v‖ of the motor's current
+            on moves left out in turn.
         ambiguity: families whose held-out score cannot be told from this one's.
     """
 

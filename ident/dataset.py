@@ -1,4 +1,4 @@
-"""A run with its derivatives: zero-phase band-pass of the positions, and which samples stand still."""
+"""A run with its derivatives: low-passed positions, central differences, and which samples stand still."""
 
 from __future__ import annotations
 

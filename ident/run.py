@@ -20,7 +20,8 @@ class Run:
         name: what a person calls it (the log's stem).
         time_s: time of each sample [s], shape (k,), uniform.
         position_rad: joint positions [rad; m for a prismatic joint], shape (k, n).
-        current_a: input references of the current loops, one a motor, in the unit of the reference [A], shape (k, n).
+        current_a: input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is
+            Nm at the joint per that unit], shape (k, n).
         payload: what was mounted, or None without load.
         move: number of the move that each sample belongs to, shape (k,), or None where no one wrote it down.
         digest: of the log it was read from (sha256, hex).

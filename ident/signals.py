@@ -33,7 +33,7 @@ class Signals:
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
         motor_position_rad: of the motors, R q.
         load_torque_nm: what links and payload ask of each joint, friction and drive chain left out.
-        motor_torque_nm: what each motor must give, in joint units (g v), friction included.
+        motor_torque_nm: what each motor must give, in joint units (g v), friction included, effects left out.
         current_a: the same in the unit of the current reference.
     """
 

@@ -20,7 +20,7 @@ class Saturation:
     """g v (1 − c v²): seen as a torque c · g v³ more than the current tells
 
     v is the current that the model predicts. Source: saturation of the stator iron, the first even term of K_t(v);
-    Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. Signature: large current, even for one direction.
+    Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. Signature: large current, odd in it.
     """
 
     name: ClassVar[str] = "saturation"

@@ -36,15 +36,15 @@ def tls(observation: Observation, scaling: Scaling = Scaling.ROWS) -> Estimate:
     """
     require_known_payload(observation)
     triangles = joint_triangles(observation)
-    even = np.ones(observation.joint_count)
+    weight = np.ones(observation.joint_count)
     columns = scaling in (Scaling.COLUMNS, Scaling.BOTH)
     if scaling in (Scaling.ROWS, Scaling.BOTH):
-        first, _, _ = _smallest(triangles, even, columns)
+        first, _, _ = _smallest(triangles, weight, columns)
         # σ_W^j, the standard deviation of joint j's equations (§3.3, last paragraph).
-        even = 1.0 / triangles.residual_std(first, len(first) - 1)
-    vector, covariance, singular = _smallest(triangles, even, columns)
+        weight = 1.0 / triangles.residual_std(first, len(first) - 1)
+    vector, covariance, singular = _smallest(triangles, weight, columns)
     count = observation.joint_count
-    regressor = triangles.stacked(even)[:, :-1]
+    regressor = triangles.stacked(weight)[:, :-1]
     weighted = np.linalg.svd(regressor, compute_uv=False)
     return Estimate(
         method=Method.TLS,
