@@ -46,7 +46,7 @@ def read_table(path: Path, table: Table) -> TableFile:
     Raises:
         TableMissing: there is no such file, or it cannot be read.
         TableEmpty: no line of numbers.
-        TableTruncated: the last line is shorter than the others.
+        TableTruncated: the last line is shorter than the others, or has no end.
         TableColumns: another line is shorter or longer than the others.
     """
     try:
@@ -63,6 +63,14 @@ def read_table(path: Path, table: Table) -> TableFile:
             str(path), found=f"byte {error.start} is no UTF-8", expected="text", remedy="is this a CSV file?"
         ) from error
     lines = text.splitlines()
+    if len(lines) > 1 and not text.endswith(("\n", "\r")):
+        # The last number may lack digits, and nobody would see it.
+        raise TableTruncated(
+            f"{path}:{len(lines)}",
+            found=f"a last line {lines[-1][-40:]!r} without an end of line",
+            expected="an end of line, as after all others",
+            remedy="the file ends early: export or copy it again; if the exporter never writes the last one, add it",
+        )
     while lines and not lines[-1].strip():
         lines.pop()
     start = table.skip_rows + (1 if table.header else 0)

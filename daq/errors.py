@@ -34,6 +34,8 @@ DaqError
 │       ├── CyclesLost          SYNC cycles are missing
 │       ├── ClockImplausible    the time stamps show another rate than was asked for, or uneven steps
 │       ├── CurrentSaturated    a limit acted in too large a part of the run
+│       ├── CurrentImplausible  a dead channel, or a number that is no current
+│       ├── SpeedImplausible    faster than the joint can be: a wrong rate
 │       └── PositionImplausible far outside the joint limits: deg for rad, or a wrong drive train
 ├── ConfigurationError          a configuration file is wrong                                 exit 6
 │   ├── ConfigurationMissing    there is no such file
@@ -208,6 +210,14 @@ class ClockImplausible(RunUnfit):
 
 class CurrentSaturated(RunUnfit):
     """A limit acted in too large a part of the run."""
+
+
+class CurrentImplausible(RunUnfit):
+    """A dead channel, or a number that is no current."""
+
+
+class SpeedImplausible(RunUnfit):
+    """Faster than the joint can be: a wrong rate."""
 
 
 class PositionImplausible(RunUnfit):

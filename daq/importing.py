@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from math import ceil, log2, pi
+from math import ceil, degrees, log2, pi
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,15 @@ from daq.configuration.cell_file import bundle, load_cell
 from daq.configuration.importing import ImportDescription, PositionUnit, Side, TimeColumn, load_import
 from daq.conversion import check_limits, scaling
 from daq.csv_table import TableFile, columns, read_table
-from daq.errors import ConfigurationInconsistent, PositionImplausible, TableColumns, TableNotNumeric, TimeNotUniform
+from daq.errors import (
+    ConfigurationInconsistent,
+    CurrentImplausible,
+    PositionImplausible,
+    SpeedImplausible,
+    TableColumns,
+    TableNotNumeric,
+    TimeNotUniform,
+)
 from daq.log.metadata import RunInfo, RunStatistics
 from daq.log.readback import AxisReadback, Readback
 from daq.log.writer import LogContent, LogWriter
@@ -32,6 +40,10 @@ IntArray = NDArray[np.int64]
 LARGEST_RAW = 2**31 - 1
 SMALLEST_MOTION = 0.02
 """Share of a joint's range that at least one joint moves in any run worth importing."""
+LARGEST_OUTLIER = 1000.0
+"""Times the 99th percentile of a column of currents; a real peak is some ten times that."""
+SPEED_MARGIN = 3.0
+"""Times a joint's velocity limit, which is often only guessed in a cell that imports; a wrong rate is off by more."""
 TIME_TOLERANCE = 0.5
 """Share of a period by which a time stamp may be off."""
 
@@ -50,7 +62,7 @@ def import_csv(
 
     Raises:
         ConfigurationError: description or cell are wrong, or contradict each other.
-        TableUnfit, PositionImplausible: the files cannot be used.
+        TableUnfit, CurrentImplausible, PositionImplausible, SpeedImplausible: the files cannot be used.
         OutputExists, OutputFailed: the log cannot be written.
     """
     wanted = load_import(description)
@@ -67,6 +79,7 @@ def import_csv(
     _check_lengths(files)
     rate_hz = _rate_hz(wanted, files)
     counts, count_rad = _counts(wanted, cell, position, files[wanted.position.file])
+    _check_current(current, wanted, files[wanted.current.file])
     raw, unit = quantise(current * wanted.current_factor)
     readback = Readback(
         tuple(
@@ -78,6 +91,7 @@ def import_csv(
     joint_rad = scale.joint_position(counts)
     check_limits(str(data / wanted.position.file), joint_rad, cell)
     _check_motion(str(data / wanted.position.file), joint_rad, cell)
+    _check_speed(str(data / wanted.position.file), joint_rad, rate_hz, cell)
     digests = {name: hashlib.sha256("\n".join(file.rows).encode()).hexdigest() for name, file in files.items()}
     run = RunInfo(
         run_id=f"import-{hashlib.sha256(repr(sorted(digests.items())).encode()).hexdigest()[:16]}",
@@ -224,6 +238,42 @@ def _check_lengths(files: dict[str, TableFile]) -> None:
             expected="as many in each",
             remedy="one of them ends early, or they are of different runs; export them again",
         )
+
+
+def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFile) -> None:
+    """One absurd number would make the quantum of its whole column so coarse that the others become zero."""
+    size = np.abs(current)
+    usual = np.percentile(size, 99.0, axis=0)
+    for index, column in enumerate(wanted.current.columns):
+        row = int(np.argmax(size[:, index]))
+        if size[row, index] == 0.0:
+            raise CurrentImplausible(
+                f"{file.path}, column {column}",
+                found="zero in every row",
+                expected="the current reference of a motor that moves",
+                remedy="is the channel connected, and the column the right one?",
+            )
+        if size[row, index] > LARGEST_OUTLIER * max(usual[index], 1e-200):
+            raise CurrentImplausible(
+                f"{file.path}:{file.first_line + row}, column {column}",
+                found=f"{current[row, index]:.6g}, while 99 % of the column are within {usual[index]:.3g}",
+                expected="a current",
+                remedy="samples are never invented: cut the recording there, or export it again",
+            )
+
+
+def _check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
+    """A wrong rate scales all speeds; over many samples they are far above the noise of differences."""
+    step = max(1, min(round(0.1 * rate_hz), len(joint_rad) // 10))
+    speed = np.abs(joint_rad[step:] - joint_rad[:-step]).max(axis=0) * rate_hz / step
+    for axis, fastest in zip(cell.axes, speed.tolist(), strict=True):
+        if fastest > SPEED_MARGIN * axis.limits.velocity:
+            raise SpeedImplausible(
+                f"{name}, axis {axis.name}",
+                found=f"{degrees(fastest):.4g} deg/s over {step} samples at {rate_hz:g} Hz",
+                expected=f"at most {degrees(axis.limits.velocity):.4g} deg/s, the limit in the cell configuration",
+                remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
+            )
 
 
 def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:

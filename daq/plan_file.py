@@ -14,7 +14,8 @@ from daq.configuration.yaml_file import StrictModel, parse_yaml, read_bytes, rea
 from daq.errors import ConfigurationInconsistent
 from daq.plan import Plan, PlannedMove, duration_of
 
-Share = Annotated[float, Field(gt=0, le=1)]
+Share = Annotated[float, Field(ge=0.01, le=1)]
+"""Slower than a hundredth of its limits a move would hardly end."""
 
 
 class _Move(StrictModel):

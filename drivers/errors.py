@@ -116,10 +116,10 @@ class SampleLost(DriverError):
 
 
 class DriveFault(DriverError):
-    """EMCY, fault bit or following error while running; the axes have been stopped."""
+    """EMCY, fault bit or following error while running; a stop that could not be confirmed is noted on the error."""
 
     def __init__(self, node_id: int, reason: str, statusword: int | None = None, emcy_code: int | None = None) -> None:
-        super().__init__(f"node {node_id}: {reason}; all axes were stopped and stay disabled")
+        super().__init__(f"node {node_id}: {reason}; stopping all axes, none is enabled again")
         self.node_id = node_id
         self.reason = reason
         self.statusword = statusword
@@ -127,10 +127,10 @@ class DriveFault(DriverError):
 
 
 class HeartbeatLost(DriverError):
-    """A node fell silent; the axes have been stopped."""
+    """A node fell silent; a stop that could not be confirmed is noted on the error."""
 
     def __init__(self, node_id: int, silent_s: float) -> None:
-        super().__init__(f"node {node_id}: no heartbeat for {silent_s:g} s; all axes were stopped and stay disabled")
+        super().__init__(f"node {node_id}: no heartbeat for {silent_s:g} s; stopping all axes, none is enabled again")
         self.node_id = node_id
         self.silent_s = silent_s
 
@@ -140,12 +140,12 @@ class MotionRefused(DriverError):
 
 
 class MotionTimeout(DriverError):
-    """A move did not end in its bound; the axes have been stopped."""
+    """A move did not end in its bound; a stop that could not be confirmed is noted on the error."""
 
     def __init__(self, move: int, axes: tuple[int, ...], waited_s: float) -> None:
         super().__init__(
             f"move {move}: axis {', '.join(str(a + 1) for a in axes)} did not reach its target "
-            f"within {waited_s:g} s; all axes were stopped"
+            f"within {waited_s:g} s; stopping all axes"
         )
         self.move = move
         self.axes = axes

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,7 +26,7 @@ from daq.cli.scan import SCAN
 from daq.cli.simulate import SIMULATE
 from daq.cli.validate import VALIDATE
 from daq.cli.verb import Verb, printable
-from daq.errors import DaqError, ExitCode, exit_code
+from daq.errors import DaqError, ExitCode, OutputFailed, exit_code
 from daq.version import software
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
@@ -74,6 +77,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (DaqError, DriverError, IdentificationError) as error:
         show_error(error, Console(stderr=True, soft_wrap=True))
         return exit_code(type(error)) or ExitCode.UNEXPECTED
+    except BrokenPipeError:  # whoever read the output has seen enough
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123 - the interpreter flushes it once more at its end
+        return ExitCode.UNEXPECTED
+    except OSError as error:
+        show_error(OutputFailed.of(Path(str(error.filename or "standard output")), error), Console(stderr=True))
+        return ExitCode.UNEXPECTED
     except SystemExit as stop:  # typer ends so, after success too
         return stop.code if isinstance(stop.code, int) else ExitCode.OK
     return ExitCode.OK
@@ -89,6 +98,11 @@ def show_error(error: Exception, console: Console) -> None:
             ("expected", error.expected, "bold"),
             ("do", error.remedy, "bold"),
         ]
+    # What a stop or a give-back could not confirm is noted on the error on its way up.
+    notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(("while stopping", "while closing"))]
+    lines += [("note", note, "bold") for note in notes]
+    if notes:
+        lines.append(("AXES", "NOT ALL OF THEM ARE KNOWN TO STAND: use the emergency stop", "bold red"))
     for label, text, style in lines:
         console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text)))
 

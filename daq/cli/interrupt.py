@@ -1,4 +1,4 @@
-"""Being told to stop while a robot moves: by Ctrl-C or, from a service manager or a scheduler, by SIGTERM."""
+"""Being told to stop while a robot moves: by Ctrl-C, by a service manager (SIGTERM), by a terminal that has gone."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 10.0
 """Longer than a stop of all axes takes."""
 
 
 @contextmanager
 def interruptible(clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
-    """Turn SIGINT or SIGTERM within the block into KeyboardInterrupt; pass over the ones that follow it too soon.
+    """Turn SIGINT, SIGTERM and SIGHUP within the block into KeyboardInterrupt; pass over those that follow too soon.
 
-    By default SIGTERM ends a process at once, and the axes would go on. What follows the first signal is the stop of
-    the axes: a second one, of an impatient person, must not cut that short. Later ones count again, so that nobody is
-    left without a way out. In another thread than the main one nothing is changed: Python handles no signals there.
+    By default the latter two end a process at once, and the axes would go on. What follows the first signal is the stop
+    of the axes: a second one, of an impatient person, must not cut that short. Later ones count again, so that nobody
+    is left without a way out. In another thread than the main one nothing changes: Python handles no signals there.
 
     Args:
         clock: monotonic time [s].

@@ -10,7 +10,7 @@ from daq.configuration.cell import Pacing
 from daq.configuration.yaml_file import StrictModel
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
-FileName = Annotated[str, Field(min_length=1, max_length=400)]
+FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 Positive = Annotated[float, Field(gt=0)]
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 

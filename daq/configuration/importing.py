@@ -9,7 +9,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.configuration.cell_schema import FileName, Name, Positive
+from daq.configuration.cell_schema import FileName, Name
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent
 
@@ -141,7 +141,7 @@ class CurrentModel(StrictModel):
     file: FileName
     columns: Annotated[tuple[Column, ...], Field(min_length=1)]
     unit: Annotated[str, Field(min_length=1)]
-    factor: float = 1.0
+    factor: Annotated[float, Field(ge=-1e9, le=1e9)] = 1.0
 
 
 class TimeModel(StrictModel):
@@ -160,7 +160,7 @@ class ImportModel(StrictModel):
     table: TableModel = TableModel()
     position: PositionModel
     current: CurrentModel
-    rate_hz: Positive | None = None
+    rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
     time: TimeModel | None = None
     payload: Name | None = None
     mounting: Name | None = None

@@ -19,6 +19,8 @@ MAX_BYTES = 4 * 2**20
 """No configuration is larger; a file that is must be something else."""
 MAX_DEPTH = 40
 """Lists in lists; deeper ones take time and memory beyond their size."""
+MAX_EXPLAINED = 100
+"""Faults for which the nearest known key is looked up; a hostile file has a hundred thousand."""
 MAX_SHOWN = 8
 """Faults listed in one message."""
 
@@ -173,13 +175,19 @@ def read_model(document: Document, model: type[Model]) -> Model:
         # By way of JSON, where a list may become a tuple and a word an enum although everything else is strict.
         return model.model_validate_json(json.dumps(document.tree))
     except ValidationError as error:
-        raise _mismatch(document, [_fault(item, model) for item in error.errors(include_url=False)]) from error
+        items = error.errors(include_url=False)
+        faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
+        raise _mismatch(document, faults, len(items) - len(faults)) from error
 
 
-def _mismatch(document: Document, faults: list[Fault]) -> SchemaMismatch:
+def _mismatch(document: Document, faults: list[Fault], others: int) -> SchemaMismatch:
     # A list counts as empty when its items are wrong; what is wrong inside says enough.
-    inner = [f for f in faults if not any(g.path[: len(f.path)] == f.path and g.path != f.path for g in faults)]
-    return SchemaMismatch(**describe(document, inner), remedy="correct the file; `drivegain init` shows every key")
+    outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
+    inner = [fault for fault in faults if fault.path not in outer]
+    remedy = "correct the file; `drivegain init` shows every key"
+    if others:
+        remedy += f" ({others} more faults are not listed)"
+    return SchemaMismatch(**describe(document, inner), remedy=remedy)
 
 
 def describe(document: Document, faults: list[Fault]) -> dict[str, str]:

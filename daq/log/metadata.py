@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -104,17 +105,23 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         known = json.loads(record["payload_known"])
         if not isinstance(known, dict) or not known.keys() <= set(LINK_PARAMETERS):
             raise ValueError(f"known payload parameters {record['payload_known']!r}")
-        payload = Payload(record["payload"], record["mounting"], {key: float(value) for key, value in known.items()})
+        numbers = {key: float(value) for key, value in known.items() if not isinstance(value, list | dict)}
+        if len(numbers) < len(known) or not all(map(math.isfinite, numbers.values())) or numbers.get("m", 1.0) <= 0.0:
+            raise ValueError(f"known payload {record['payload_known']!r}: not finite numbers with a mass above 0")
+        payload = Payload(record["payload"], record["mounting"], numbers)
     rate_hz = float(record["rate_hz"])
     if not 0.0 < rate_hz < 1e6:
         raise ValueError(f"sampling rate {record['rate_hz']!r}")
+    wall_ns = int(record["started_wall_ns"])
+    if not 0 <= wall_ns < 2**63:
+        raise ValueError(f"start time {record['started_wall_ns']!r}")
     return RunInfo(
         run_id=record["run_id"],
         rate_hz=rate_hz,
         payload=payload,
         operator=record["operator"],
         software=record["software"],
-        started_wall_ns=int(record["started_wall_ns"]),
+        started_wall_ns=wall_ns,
         started_monotonic_ns=int(record["started_monotonic_ns"]),
         origin=record["origin"],
     )

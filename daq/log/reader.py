@@ -133,7 +133,7 @@ class LogReader:
         try:
             run = run_from_record(self._metadata[RUN])
             readback = readback_from_bytes(self._attachments[READBACK])
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, RecursionError) as error:
             raise self._incomplete(error, f"metadata {RUN!r} and attachment {READBACK!r}") from error
         return LogHead(run, readback, self._attachments)
 
@@ -146,7 +146,7 @@ class LogReader:
         """
         try:
             return statistics_from_record(self._metadata[STATISTICS])
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, RecursionError) as error:
             raise self._incomplete(error, f"metadata {STATISTICS!r}") from error
 
     def _chunk(self, offset: int, data: bytes) -> Iterator[SampleBlock]:

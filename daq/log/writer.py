@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BufferedWriter
 from pathlib import Path
@@ -123,7 +124,8 @@ class LogWriter:
         try:
             self._open()
         except OSError as error:
-            self._stream.close()
+            with suppress(OSError):  # closing flushes, and a full disk refuses that a second time
+                self._stream.close()
             self.part.unlink(missing_ok=True)
             raise self._failed(error) from error
         return self
@@ -236,7 +238,12 @@ class LogWriter:
                 self._missing[axis] += sample.missing >> axis & 1
 
     def _failed(self, error: OSError) -> OutputFailed:
-        return OutputFailed.of(self.part, error)
+        return OutputFailed(
+            str(self.part),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="a folder that can be written, with room",
+            remedy="what was recorded until then stays in that file, which no fit reads; free space and record again",
+        )
 
 
 def _sync_folder(folder: Path) -> None:

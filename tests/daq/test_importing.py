@@ -289,6 +289,35 @@ def test_a_full_disk_leaves_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatc
     assert bench.left == []
 
 
+def test_a_rate_that_makes_the_joints_too_fast(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(rate_hz=100_000.0)
+    _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+
+
+def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.current_a[120, 3] = 1e300
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(bench, capsys, 4, "run.csv:122, column i4", "1e+300")
+
+
+def test_a_dead_channel(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.current_a[:, 2] = 0.0
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(bench, capsys, 4, "column i3", "zero in every row")
+
+
+def test_a_last_number_that_may_lack_digits(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bench.data / "run.csv"
+    path.write_bytes(path.read_bytes()[:-3])
+    _refused(bench, capsys, 4, "without an end of line")
+
+
+@pytest.mark.parametrize("change", [{"rate_hz": 1e-9}, {"rate_hz": 1e9}])
+def test_rates_beyond_reason(bench: Bench, capsys: pytest.CaptureFixture[str], change: dict[str, object]) -> None:
+    bench.describe(**change)
+    _refused(bench, capsys, 6, "rate_hz")
+
+
 def _with_time(bench: Bench, time_s: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
     lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
     timed = ["t," + lines[0], *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True))]

@@ -67,7 +67,7 @@ def test_plan_record_info_and_the_same_plan_again(
     assert "file of that name" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_an_interrupted_recording_stops_the_axes_and_says_so(
     cell: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str], number: signal.Signals
 ) -> None:

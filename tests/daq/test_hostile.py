@@ -1,0 +1,98 @@
+"""What an attacker or a dying disk would try, and what the operator is told."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from daq.cli.app import main, show_error
+from daq.configuration.yaml_file import MAX_EXPLAINED, StrictModel, parse_yaml, read_model
+from daq.errors import ExitCode, OutputFailed, SchemaMismatch
+from daq.log.metadata import run_from_record, run_record
+from daq.log.writer import LogWriter
+from drivers.errors import DriveFault
+from tests.daq.logs import DISC, content, joints
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("payload_known", '{"m": [1]}'),
+        ("payload_known", '{"m": NaN}'),
+        ("payload_known", '{"m": -4.59}'),
+        ("payload_known", '{"m": 0}'),
+        ("payload_known", '{"m": {"m": 1}}'),
+        ("started_wall_ns", "-99999999999999999999999"),
+        ("started_wall_ns", "9" * 40),
+        ("rate_hz", "nan"),
+    ],
+)
+def test_hostile_metadata_is_a_value_error(key: str, value: str) -> None:
+    record = run_record(content(6, DISC).run)
+    assert run_from_record(record).payload == DISC
+    with pytest.raises(ValueError, match=r".+"):
+        run_from_record({**record, key: value})
+
+
+def test_a_hundred_thousand_unknown_keys_are_counted_and_not_all_explained() -> None:
+    class Small(StrictModel):
+        name: str
+
+    keys = "\n".join(f"key{number}: 1" for number in range(100_000))
+    with pytest.raises(SchemaMismatch, match=f"{100_000 - MAX_EXPLAINED} more faults"):
+        read_model(parse_yaml(f"name: x\n{keys}".encode(), "file.yaml"), Small)
+
+
+def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full = OSError(28, os.strerror(28))
+    path = tmp_path / "run.mcap"
+
+    def refuse(*_: object) -> None:
+        raise full
+
+    class FullStream:
+        write = flush = close = staticmethod(refuse)
+
+        def tell(self) -> int:
+            return 0
+
+    real_open = Path.open
+
+    def open_part(self: Path, mode: str = "r", *_: object) -> object:
+        real_open(self, "xb").close()
+        return FullStream()
+
+    monkeypatch.setattr(Path, "open", open_part)
+    with pytest.raises(OutputFailed, match="no space left"), LogWriter(path, content(2), joints, lambda: 0):
+        pytest.fail("the writer opened on a full disk")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[str]) -> None:
+    error = DriveFault(3, "fault")
+    error.add_note("while stopping: node 3: object 6041h:00: no answer")
+    show_error(error, Console(stderr=True, soft_wrap=True))
+    told = capsys.readouterr().err
+    assert "node 3: object 6041h:00: no answer" in told
+    assert "emergency stop" in told
+    assert "all axes were stopped" not in told
+
+
+def test_a_stop_that_was_confirmed_is_not(capsys: pytest.CaptureFixture[str]) -> None:
+    show_error(DriveFault(3, "fault"), Console(stderr=True, soft_wrap=True))
+    assert "emergency" not in capsys.readouterr().err
+
+
+def test_an_unwritable_standard_output_is_no_traceback(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr("daq.cli.import_.import_csv", lambda *_, **__: full(None))
+    code = main(["import", "x.yaml", "--data", ".", "--out", "y.mcap"])
+    assert code == ExitCode.UNEXPECTED
+    assert "no space left" in capsys.readouterr().err
