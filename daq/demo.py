@@ -101,11 +101,6 @@ class Outcome:
     written: Written | None
 
 
-def shipped_simulation(name: str = "demo") -> Path:
-    """A simulation file that comes with drivegain."""
-    return shipped_configurations() / "simulation" / f"{name}.yaml"
-
-
 def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Telling) -> Outcome:
     """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
 

@@ -16,7 +16,8 @@ from daq.cli.progress import Stepper
 from daq.cli.residual import before_after_table, ranking_table
 from daq.cli.scan import scan_rows, scan_table
 from daq.cli.verb import JsonOption, Verb, json_text, print_json
-from daq.demo import Outcome, Settings, Telling, demonstrate, shipped_simulation, summary
+from daq.configuration.simulation import shipped_simulation
+from daq.demo import Outcome, Settings, Telling, demonstrate, summary
 from daq.errors import OutputFailed
 from daq.report.gain_table import gain_table
 

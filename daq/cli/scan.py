@@ -7,10 +7,12 @@ from typing import Annotated, Any
 
 import typer
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.record import network_of
@@ -32,7 +34,8 @@ def scan_verb(
     if json:
         print_json({"bus": str(network.link.address), "nodes": rows})
     else:
-        Console(soft_wrap=True).print(scan_table(rows))
+        console = Console(soft_wrap=True)
+        console.print(scan_table(rows, console.width))
     missing = tuple(row["node_id"] for row in rows if row["verdict"] == "missing")
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for node in found), wait)
@@ -69,17 +72,34 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...]) -> list[dict[str, Any]]:
     return rows
 
 
-def scan_table(rows: list[dict[str, Any]]) -> Table:
-    """The rows for a person."""
+_GAP = 2
+_DISPENSABLE = ("nmt", "vendor", "product", "serial", "state")
+"""Left out one after the other where a terminal is too narrow; `--json` has them all."""
+
+
+def scan_table(rows: list[dict[str, Any]], width: int = 80) -> Table:
+    """The rows for a person, in at most so many columns; node, axis and verdict are always whole."""
+    columns = {
+        "node": [str(row["node_id"]) for row in rows],
+        "axis": [printable(row["axis"] or "") for row in rows],
+        "vendor": ["" if row["vendor_id"] is None else f"{row['vendor_id']:#x}" for row in rows],
+        "product": ["" if row["product_code"] is None else f"{row['product_code']:#x}" for row in rows],
+        "serial": ["" if row["serial"] is None else str(row["serial"]) for row in rows],
+        "nmt": [(row["nmt"] or "").lower() for row in rows],
+        "state": [(row["state"] or "").lower() for row in rows],
+        "verdict": [row["verdict"] for row in rows],
+    }
+    wide = {heading: max(map(cell_len, (heading, *texts))) for heading, texts in columns.items()}
+    for heading in _DISPENSABLE:
+        if sum(wide.values()) + _GAP * (len(wide) - 1) <= width:
+            break
+        del wide[heading], columns[heading]
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for heading in ("node", "axis", "vendor", "product", "serial", "NMT", "state", ""):
-        table.add_column(heading, no_wrap=True)
-    for row in rows:
-        numbers = ("" if row[key] is None else f"{row[key]:#x}" for key in ("vendor_id", "product_code"))
-        serial = "" if row["serial"] is None else str(row["serial"])
-        words = ((row[key] or "").lower() for key in ("nmt", "state"))
+    for heading, least in wide.items():
+        table.add_column(heading.upper() if heading == "nmt" else heading, no_wrap=True, min_width=least)
+    for row, texts in zip(rows, zip(*columns.values(), strict=True), strict=True):
         style = None if row["verdict"] == "ok" else "bold red"
-        table.add_row(str(row["node_id"]), row["axis"] or "", *numbers, serial, *words, row["verdict"], style=style)
+        table.add_row(*map(Text, texts), style=style)
     return table
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent, UsageError
+from daq.resources import shipped_configurations
 from drivers.simulated.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
 
 Positive = Annotated[float, Field(gt=0)]
@@ -105,6 +106,11 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
         substeps=model.substeps,
         seed=model.seed,
     )
+
+
+def shipped_simulation(name: str = "demo") -> Path:
+    """A simulation file that comes with drivegain."""
+    return shipped_configurations() / "simulation" / f"{name}.yaml"
 
 
 def axis_index(axis: str | int) -> int:

@@ -12,7 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.demo import Settings, Telling, demonstrate, shipped_simulation, summary
+from daq.configuration.simulation import shipped_simulation
+from daq.demo import Settings, Telling, demonstrate, summary
 
 OUT = Path("out/gain-study")
 SEEDS = (1, 2, 3, 4)
