@@ -34,6 +34,8 @@ from ident.payload import Payload
 
 FloatArray = NDArray[np.float64]
 
+LOCKSTEP_TIMEOUT_S = 5.0
+"""A simulated cell on a busy machine may be that late, and nothing real waits meanwhile."""
 ROUNDING = 1.001
 """Whole counts may ask a drive for this much more than a limit."""
 
@@ -226,5 +228,7 @@ def _sync(cell: Cell) -> declared.Sync:
 def _pacing(cell: Cell, run: RunInfo, clocks: Clocks) -> Pacing:
     sync = _sync(cell)
     if sync.pacing is declared.Pacing.LOCKSTEP:
-        return LockstepSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)
+        return LockstepSync(
+            sync.period_us * 1000, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns
+        )
     return TimedSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)
