@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -16,60 +16,88 @@ from daq.conversion import load_run
 from daq.errors import LogRepeated, LogsDiffer, RolesExchanged
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimate import Estimate, Method
 from ident.estimators.total_least_squares import tls
-from ident.identify import Identification, Step, close_the_loop, identify
+from ident.identify import Identification, estimate_with, identify
+from ident.loop import Evidence, Step, close_the_loop, gather
 from ident.relative_error import RelativeError
 from ident.run import Run
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """An identification with the cell and the runs it speaks of.
+    """An identification with the cell and the logs it speaks of.
 
     Attributes:
         cell: as the logs describe it.
-        runs, holdout: what was fitted, and what was not.
+        logs, holdout: what was fitted, and what was not; they are read again where rows are needed.
+        sources: the same, with digests and roles.
         identification: the estimate without effects.
         steps: turns of the loop, empty where nobody looked for effects.
-        paper: the paper's total least squares on the same rows, None with fixed gains.
+        paper: the paper's total least squares on the same equations, None with fixed gains.
     """
 
     cell: Cell
-    runs: tuple[Run, ...]
-    holdout: tuple[Run, ...]
+    logs: tuple[Path, ...]
+    holdout: tuple[Path, ...]
+    sources: tuple[Source, ...]
     identification: Identification
     steps: tuple[Step, ...]
     paper: Estimate | None
 
     @property
-    def final(self) -> Identification:
+    def final(self) -> Identification | Evidence:
         """With all accepted effects."""
         return self.steps[-1].after if self.steps else self.identification
 
+    def evidence(self) -> Evidence:
+        """The rows behind the identification, without effects; the logs are read again."""
+        used, unseen = ((load_run(log, self.cell)[0] for log in logs) for logs in (self.logs, self.holdout))
+        return gather(self.identification, used, unseen)
 
-def load_runs(logs: Sequence[Path], cell: Cell | None = None) -> tuple[tuple[Run, ...], Cell]:
-    """Read logs of one cell.
 
-    Args:
-        logs: at least one.
-        cell: another description of the cell than the one that the logs carry.
+class _Reading:
+    """Logs of one cell, read one after the other, and what was met on the way."""
 
-    Raises:
-        DataError, ConfigurationError: a log cannot be used.
-        LogsDiffer: they do not carry the same cell configuration.
-    """
-    loaded = [load_run(log, cell) for log in logs]
-    first = loaded[0][1]
-    for log, (_, other) in zip(logs, loaded, strict=True):
-        if other.digest != first.digest:
-            raise LogsDiffer(
-                str(log),
-                found=f"cell {other.name!r}, configuration {other.digest[:12]}",
-                expected=f"cell {first.name!r}, configuration {first.digest[:12]}, as in {logs[0]}",
-                remedy="fit logs of one cell and one configuration, or name the right one with --cell",
-            )
-    return tuple(run for run, _ in loaded), first
+    def __init__(self, logs: Sequence[Path], cell: Cell | None) -> None:
+        self._given = cell
+        self._first: tuple[Path, Run] | None = None
+        self._seen: dict[str, Path] = {}
+        self.sources: list[Source] = []
+        run, self.cell = load_run(logs[0], cell)
+        self._first = (logs[0], run)
+
+    def runs(self, logs: Sequence[Path], role: str) -> Iterator[Run]:
+        """One run after the other; the first log is not read twice.
+
+        Raises:
+            LogsDiffer: a log is of another cell or configuration than the first one.
+            LogRepeated: a recording was given twice: it would count twice, or be held out of nothing.
+        """
+        for log in logs:
+            if self._first is not None and self._first[0] == log:
+                run, cell = self._first[1], self.cell
+                self._first = None
+            else:
+                run, cell = load_run(log, self._given)
+            if cell.digest != self.cell.digest:
+                raise LogsDiffer(
+                    str(log),
+                    found=f"cell {cell.name!r}, configuration {cell.digest[:12]}",
+                    expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as in the first log",
+                    remedy="fit logs of one cell and one configuration, or name the right one with --cell",
+                )
+            if run.digest in self._seen:
+                raise LogRepeated(
+                    str(log),
+                    found=f"the same recording as {self._seen[run.digest]}",
+                    expected="every recording once, in the fit or held out",
+                    remedy="name other logs",
+                )
+            self._seen[run.digest] = log
+            self.sources.append(Source(run.name, run.digest, role))
+            yield run
 
 
 def fit(
@@ -92,37 +120,43 @@ def fit(
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
-    runs, declared = load_runs((*logs, *holdout), cell)
-    _check_distinct((*logs, *holdout), runs)
-    used, rest = runs[: len(logs)], runs[len(logs) :]
+    try:
+        return _fit(logs, holdout, method, gains_fixed, cell)
+    except PayloadUnseen as error:
+        raise PayloadUnseen(error.std_percent, error.runs, _culprit(logs, cell)) from error
+
+
+def _fit(
+    logs: Sequence[Path], holdout: Sequence[Path], method: Method | None, gains_fixed: bool, cell: Cell | None
+) -> Fit:
+    reading = _Reading(logs, cell)
+    declared = reading.cell
     nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
-    chosen = method or (Method.WLS if gains_fixed else Method.ML)
     result = identify(
         model_of(declared),
-        used,
+        reading.runs(logs, "fit"),
         declared.conditioning,
-        holdout=rest,
-        method=chosen,
+        holdout=reading.runs(holdout, "holdout"),
+        method=method or (Method.WLS if gains_fixed else Method.ML),
         fixed_gains=nameplate if gains_fixed else None,
     )
     if not gains_fixed:
         check_signs(result.estimate, nameplate)
-    paper = None if gains_fixed else tls(result.training)
-    return Fit(declared, used, rest, result, (), paper)
+    paper = None if gains_fixed else tls(result.system)
+    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper)
 
 
-def _check_distinct(logs: Sequence[Path], runs: tuple[Run, ...]) -> None:
-    """A log given twice would count twice, and a held-out one would be held out of nothing."""
-    seen: dict[str, Path] = {}
-    for log, run in zip(logs, runs, strict=True):
-        if run.digest in seen:
-            raise LogRepeated(
-                str(log),
-                found=f"the same recording as {seen[run.digest]}",
-                expected="every recording once, in the fit or held out",
-                remedy="name other logs",
-            )
-        seen[run.digest] = log
+def _culprit(logs: Sequence[Path], cell: Cell | None) -> str:
+    """Which log contradicts the others about the payload: without it they agree."""
+    for log in logs:
+        try:
+            rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell)
+        except IdentificationError:
+            continue
+        gains = rest.identification.estimate
+        std = float(np.max(gains.gains_std / np.abs(gains.gains)))
+        return f"without {log} they do (σ at most {100.0 * std:.1f} %): was the payload of that run declared as it was?"
+    return ""
 
 
 def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
@@ -147,19 +181,14 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
     Raises:
         IdentificationError: a refit failed.
     """
-    identification = start.identification
-    if identification.estimate.method is not Method.ML:
-        fixed = identification.estimate.gains if identification.estimate.gains_fixed else None
-        identification = identify(
-            identification.model,
-            start.runs,
-            start.cell.conditioning,
-            holdout=start.holdout,
-            method=Method.ML,
-            fixed_gains=fixed,
-        )
-    steps = close_the_loop(identification, np.random.default_rng(seed), progress=progress)
-    return replace(start, identification=identification, steps=steps)
+    evidence = start.evidence()
+    before = start.identification
+    if before.estimate.method is not Method.ML:
+        fixed = before.estimate.gains if before.estimate.gains_fixed else None
+        before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
+        evidence = replace(evidence, estimate=before.estimate)
+    steps = close_the_loop(evidence, np.random.default_rng(seed), progress=progress)
+    return replace(start, identification=before, steps=steps)
 
 
 def calibration_of(fitted: Fit, created: datetime) -> Calibration:
@@ -189,12 +218,8 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         holdout_error_percent=final.holdout_error,
         condition=estimate.condition,
         rows=estimate.rows,
-        filter=final.training.conditioning.document(),
-        sources=tuple(
-            Source(run.name, run.digest, role)
-            for runs, role in ((fitted.runs, "fit"), (fitted.holdout, "holdout"))
-            for run in runs
-        ),
+        filter=final.conditioning.document(),
+        sources=fitted.sources,
         configuration_sha256=fitted.cell.digest,
         created=created.isoformat(timespec="seconds"),
         software=software(),
@@ -203,7 +228,7 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
 
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
     accepted = []
-    before = fitted.identification
+    before: Identification | Evidence = fitted.identification
     for step in fitted.steps:
         if step.accepted is None:
             continue
@@ -226,6 +251,6 @@ def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEf
     return tuple(accepted)
 
 
-def _axis_error(identification: Identification, axis: int) -> float | None:
+def _axis_error(identification: Identification | Evidence, axis: int) -> float | None:
     error: RelativeError | None = identification.holdout_error
     return None if error is None else error.axes[axis]

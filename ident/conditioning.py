@@ -71,13 +71,21 @@ class Decimator:
     def __call__(self, columns: FloatArray) -> FloatArray:
         """Filter and decimate along the last axis: shape (..., k) → (..., rows(k))."""
         shape = columns.shape
-        flat = np.ascontiguousarray(columns).reshape(-1, shape[-1])
-        count = self.rows(shape[-1])
-        # Zeros before the taps shift upfirdn's grid, so that its first whole window is this decimator's first.
-        shifted = np.concatenate((np.zeros((1 - len(self.taps)) % self.factor), self.taps))
-        first = (len(shifted) - 1) // self.factor
-        kept = signal.upfirdn(shifted, flat, up=1, down=self.factor)[:, first : first + count]
-        return np.ascontiguousarray(kept).reshape(*shape[:-1], count)
+        count, factor = self.rows(shape[-1]), self.factor
+        # Window r starts at sample r·q, so with the taps cut into blocks of q it is a sum over blocks of samples: one
+        # matrix product that reads every sample once.
+        blocks = -(-len(self.taps) // factor)
+        taps = np.zeros(blocks * factor)
+        taps[: len(self.taps)] = self.taps
+        length = (count + blocks - 1) * factor
+        flat = np.zeros((int(np.prod(shape[:-1])), length))
+        flat[:, : min(length, shape[-1])] = columns.reshape(-1, shape[-1])[:, :length]
+        weighted = flat.reshape(-1, factor) @ taps.reshape(blocks, factor).T
+        weighted = weighted.reshape(len(flat), count + blocks - 1, blocks)
+        out = np.zeros((len(flat), count))
+        for block in range(blocks):
+            out += weighted[:, block : block + count, block]
+        return out.reshape(*shape[:-1], count)
 
 
 def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:

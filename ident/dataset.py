@@ -77,7 +77,8 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate**2
     speed_limit = np.asarray(conditioning.standstill_rad_s or (0.0,) * len(velocity))[:, None]
     moving = np.abs(velocity) >= speed_limit
-    motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit
+    # A motor's speed is told as that of its joint, which need not have its number.
+    motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving) if run.valid is None else np.ascontiguousarray(run.valid.T[:, 1:-1])
     # One move holds all joints: without a log of moves, they part where every joint stands still.
     move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]

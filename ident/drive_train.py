@@ -31,11 +31,14 @@ class DriveTrain:
             raise ModelError(f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}")
 
     @property
+    def joints(self) -> tuple[int, ...]:
+        """The joint that each motor is told by: its own, or that of its largest ratio where it does not drive that."""
+        return tuple(i if row[i] != 0.0 else int(np.argmax(np.abs(row))) for i, row in enumerate(self.ratio))
+
+    @property
     def reduction(self) -> FloatArray:
-        """N of each motor, shape (n,): its own joint's ratio, or its largest where it does not drive that joint."""
-        own = np.diag(self.ratio)
-        largest = self.ratio[np.arange(len(own)), np.argmax(np.abs(self.ratio), axis=1)]
-        return np.where(own != 0.0, own, largest)
+        """N of each motor, shape (n,): its ratio to the joint that it is told by."""
+        return np.asarray(self.ratio[np.arange(len(self.ratio)), list(self.joints)], dtype=np.float64)
 
     @property
     def direction(self) -> FloatArray:

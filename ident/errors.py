@@ -5,6 +5,7 @@ IdentificationError
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data cannot tell some unknowns apart
+├── PayloadUnseen         the runs that are said to carry the payload do not differ from the others by its weight
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
 """
@@ -48,6 +49,19 @@ class RankDeficient(IdentificationError):
         super().__init__(f"{reason} (unknowns that cannot be told: {', '.join(unknowns)})")
         self.reason = reason
         self.unknowns = unknowns
+
+
+class PayloadUnseen(IdentificationError):
+    """The runs that are said to carry the payload do not differ from the others by its weight."""
+
+    def __init__(self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = "") -> None:
+        super().__init__(
+            f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, expected some 1 %: "
+            "the runs declared loaded and those declared unloaded do not differ by the weight of the payload; "
+            + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")
+        )
+        self.std_percent = std_percent
+        self.runs = runs
 
 
 class NotConverged(IdentificationError):

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ident.model import Column
 from ident.observation import Observation
-from ident.relative_error import RelativeError, relative_error
+from ident.relative_error import RelativeError, of_squares
+from ident.system import System
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -73,6 +74,8 @@ class Estimate:
         """ρ = V g − W χ − … (eq. 13) [Nm], shape (n, r)."""
         return observation.torque(self.gains) - self.predicted_torque(observation)
 
-    def relative_error(self, observation: Observation) -> RelativeError:
+    def relative_error(self, system: System) -> RelativeError:
         """‖ρ_j‖/‖Y_j‖ of each joint over its used rows, and of all together [%] (paper Table 6)."""
-        return relative_error(observation.torque(self.gains), self.predicted_torque(observation), observation.use)
+        rest = np.zeros(len(self.parameters))
+        left = system.joints.square_sum(np.concatenate((self.gains, self.parameters, [1.0])))
+        return of_squares(system.joints.square_sum(np.concatenate((self.gains, rest, [0.0]))), left)

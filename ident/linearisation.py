@@ -11,14 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.errors import TooFewMoves
 from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-FEWEST_MOVES = 8
-"""With fewer, leaving one out in turn tells little of the scatter, and folds of moves hold one each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,36 +110,3 @@ def linearise(
         free=free,
         scale=unit[free],
     )
-
-
-def jackknife_covariance(problem: Linearisation, unknowns: int) -> FloatArray:
-    """Covariance of (gains, parameters) by leaving out one move at a time (a CR3 cluster sandwich).
-
-    The residual of a geared robot is correlated over a move (lag one about 0.67), so rows are not independent, moves
-    nearly are. With G_c = J_cᵀJ_c and s_c = J_cᵀe_c of move c, leaving it out shifts the estimate by −(H − G_c)⁻¹ s_c
-    (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002).
-
-    Args:
-        problem: around the estimate.
-        unknowns: length of (gains, parameters), free or not.
-
-    Raises:
-        TooFewMoves: their scatter says nothing of the uncertainty.
-    """
-    moves = problem.moves
-    if moves < FEWEST_MOVES:
-        raise TooFewMoves(moves, FEWEST_MOVES)
-    problem = problem.ordered(np.argsort(problem.cluster, kind="stable"))
-    bounds = np.searchsorted(problem.cluster, np.arange(moves + 1))
-    jacobian, residual = problem.jacobian, problem.residual
-    hessian = jacobian.T @ jacobian
-    shifts = np.empty((moves, hessian.shape[0]))
-    for move in range(moves):
-        part = slice(bounds[move], bounds[move + 1])
-        gram, score = jacobian[part].T @ jacobian[part], jacobian[part].T @ residual[part]
-        shifts[move] = np.linalg.lstsq(hessian - gram, score, rcond=None)[0]
-    centred = shifts - shifts.mean(axis=0)
-    covariance = np.zeros((unknowns, unknowns))
-    unit = problem.scale
-    covariance[np.ix_(problem.free, problem.free)] = (moves - 1) / moves * (centred.T @ centred) * np.outer(unit, unit)
-    return covariance

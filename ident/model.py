@@ -14,6 +14,11 @@ from ident.regressor import rigid_regressor
 from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
+"""Of what acts along a joint, of its speed, and of a rotor's inertia seen there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +46,7 @@ class Model:
         """Names and units of the standard parameters."""
         columns: list[Column] = []
         for number, joint in enumerate(self.robot.joints, start=1):
-            force = "Nm" if joint.kind is JointKind.REVOLUTE else "N"
-            rate = "rad/s" if joint.kind is JointKind.REVOLUTE else "m/s"
-            inertia = "kg m²" if joint.kind is JointKind.REVOLUTE else "kg"
+            force, rate, inertia = DRIVE_UNITS[joint.kind]
             columns += [Column(f"{name}{number}", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)]
             columns += [
                 Column(f"Ia{number}", inertia),
@@ -52,10 +55,11 @@ class Model:
                 Column(f"off{number}", force),
             ]
         for motor in self.drive_train.coupled:
+            force, rate, inertia = DRIVE_UNITS[self.robot.joints[self.drive_train.joints[motor]].kind]
             columns += [
-                Column(f"Iam{motor + 1}", "kg m²"),
-                Column(f"fvm{motor + 1}", "Nm/(rad/s)"),
-                Column(f"fsm{motor + 1}", "Nm"),
+                Column(f"Iam{motor + 1}", inertia),
+                Column(f"fvm{motor + 1}", f"{force}/({rate})"),
+                Column(f"fsm{motor + 1}", force),
             ]
         return tuple(columns)
 
@@ -64,6 +68,23 @@ class Model:
         """The ten columns of the last link; a payload on it has the same."""
         first = 14 * (self.robot.joint_count - 1)
         return slice(first, first + 10)
+
+    @property
+    def support(self) -> BoolArray:
+        """Which standard parameters can load which joint, shape (n, c); all other entries of the regressor are zero."""
+        count = self.robot.joint_count
+        out = np.zeros((count, len(self.columns)), dtype=np.bool_)
+        for link in range(count):
+            first = 14 * link
+            out[link, first + 10 : first + 14] = True
+            joint = link
+            while joint >= 0:  # a link loads its own joint and those before it
+                out[joint, first : first + 10] = True
+                joint = self.robot.joints[joint].parent
+        for index, motor in enumerate(self.drive_train.coupled):
+            first = 14 * count + 3 * index
+            out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
+        return out
 
     def regressor(self, motion: Motion) -> FloatArray:
         """Joint torque per unit of every standard parameter.

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.link import LINK_PARAMETERS
+
+FloatArray = NDArray[np.float64]
+
 
 @dataclass(frozen=True, slots=True)
 class Payload:
@@ -19,3 +26,8 @@ class Payload:
     name: str
     mounting: str
     known: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def known_parameters(self) -> FloatArray:
+        """χ_kL in the order of LINK_PARAMETERS, zero where unknown, shape (10,)."""
+        return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])

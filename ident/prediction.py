@@ -11,9 +11,9 @@ from ident.calibration import AcceptedEffect, Calibration
 from ident.dataset import Dataset
 from ident.effects import EFFECTS
 from ident.effects.effect import Effect
+from ident.effects.placed import PlacedEffect
 from ident.effects.torque import at_joints
 from ident.errors import DataUnfit, EffectRefused, ModelError
-from ident.identify import PlacedEffect
 from ident.link import LINK_PARAMETERS
 from ident.model import Model
 from ident.payload import Payload

@@ -1,27 +1,36 @@
 """Joint torques as a linear function of the links' inertial parameters, for many samples at once.
 
-For link i with angular velocity ω, angular acceleration α and linear acceleration a of its frame's origin (gravity
-taken as a base acceleration of −g), all in its own frame, Newton-Euler gives the wrench at that origin
+Motions are screws (w, u): angular part, and linear part at the origin of the frame in which they are written. Three
+kinds of them go from link to link by the same matrices, and therefore in one product: the velocity V = (ω, v), the
+acceleration A = (α, a′) and the screw S_j of every joint j that moves the link,
 
-    f = m a + α × h + ω × (ω × h),        n = I α + ω × (I ω) + h × a,        h = m c.
+    V_i = X V + S q̇,        A_i = X A + S q̈ + V × S q̇,        S_j,i = X S_j,        X = Σ_f f(q) X_f,
 
-A joint j below it moves the link with a screw: w (angular) and u (linear, at the link frame's origin). The joint's
-torque is the power of the wrench over that screw, u·f + w·n, which is linear in (I, h, m):
+with constant 6 × 6 matrices X_f and f of (1, cos q, sin q) for a revolute joint, (1, q) for a prismatic one. Gravity is
+a base acceleration of −g. With a = a′ + ω × v, the acceleration of the link frame's origin, Newton-Euler gives the
+wrench there,
 
-    ∂/∂m = u·a,     ∂/∂h = u × α + (u·ω) ω − |ω|² u + a × w,     ∂/∂I from w·Iα + (w × ω)·Iω.
+    n = I α + ω × (I ω) + h × a,        f = m a + α × h + ω × (ω × h),        h = m c,
 
-So no 6 × 10 matrix is moved from link to link, only screws; every operation is a plain product of arrays that are
-contiguous in time (paper eqs. 1-2, IDM_st without drive chain).
+linear in (I, h, m): a 6 × 10 matrix Y. The torque of joint j is the power of the wrench over its screw, S_jᵀ Y (paper
+eqs. 1-2, IDM_st without drive chain). Only what joint j moves is ever computed; every operation is a plain product of
+arrays that are contiguous in time.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.link import LINK_PARAMETERS
 from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
+
+BLOCK_SAMPLES = 2048
+"""Samples computed at once: their screws and products stay in a core's own cache."""
 
 
 def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
@@ -35,80 +44,178 @@ def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, ac
         shape (n, 10 n, k): row of joint j, column 10 i + p of parameter p (LINK_PARAMETERS) of link i, sample
         [Nm or N per unit].
     """
-    count = robot.joint_count
+    count, samples = position.shape
+    out = np.zeros((count, count, len(LINK_PARAMETERS), samples))
+    fill_rigid(robot, position, velocity, acceleration, out)
+    return out.reshape(count, count * len(LINK_PARAMETERS), samples)
+
+
+def fill_rigid(
+    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, out: FloatArray
+) -> None:
+    """Write the columns of the rigid links into an array of the caller, who may use it again for the next piece.
+
+    Args:
+        robot, position, velocity, acceleration: as for ``rigid_regressor``.
+        out: shape (n, n, 10, k): joint, link, parameter, sample; a view into a wider layout will do. Only links that
+            the joint moves are written (``moved_links``), so that the rest may be zeroed once and for all.
+    """
+    links = _links(robot)
     samples = position.shape[1]
-    columns = np.zeros((count, 10 * count, samples))
-    omega: list[FloatArray] = []
-    alpha: list[FloatArray] = []
-    linear: list[FloatArray] = []
-    screws: list[dict[int, tuple[FloatArray, FloatArray]]] = []
-    base = np.repeat(-robot.gravity_m_s2[:, None], samples, axis=1)
-    still = np.zeros((3, samples))
+    size = min(samples, BLOCK_SAMPLES)
+    work = _work(robot, links, size)
+    for first in range(0, samples, BLOCK_SAMPLES):
+        block = slice(first, min(first + BLOCK_SAMPLES, samples))
+        if block.stop - first != size:
+            work = _work(robot, links, block.stop - first)
+        for index, link in enumerate(links):
+            _move(link, work, index, position[index, block], velocity[index, block], acceleration[index, block])
+            screws = work.screws[index]
+            _fill_wrench(work.inertia, work.moments, screws[:, 0], screws[:, 1])
+            for place, mover in enumerate(link.movers, start=2):
+                screw, row = screws[:, place], out[mover, index, :, block]
+                np.einsum("dk,dck->ck", screw[:3], work.inertia, out=row[:6])
+                np.einsum("dk,dck->ck", screw, work.moments, out=row[6:])
+
+
+def moved_links(robot: Robot) -> tuple[tuple[int, ...], ...]:
+    """For each joint the links behind it, ascending, its own first: in other columns its row is zero."""
+    links = _links(robot)
+    return tuple(
+        tuple(index for index, link in enumerate(links) if joint in link.movers) for joint in range(robot.joint_count)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """What is constant of a link: X_f below each other, shape (6 f, 6), S, and C with V × S = C V."""
+
+    parent: int
+    movers: tuple[int, ...]
+    revolute: bool
+    transforms: FloatArray
+    own: FloatArray
+    cross: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """Arrays that every block uses again: V, A and the movers' screws of each link (the base is the last), and Y."""
+
+    screws: tuple[FloatArray, ...]
+    inertia: FloatArray
+    moments: FloatArray
+
+
+def _links(robot: Robot) -> tuple[_Link, ...]:
+    links: list[_Link] = []
     for index, joint in enumerate(robot.joints):
-        parent = joint.parent
-        before = (omega[parent], alpha[parent], linear[parent]) if parent >= 0 else (still, still, base)
         revolute = joint.kind is JointKind.REVOLUTE
-        axis = joint.axis[:, None]
-        offset = joint.translation_m[:, None]
-        if not revolute:
-            offset = offset + (joint.rotation @ axis) * position[index]
-        # The joint's origin, seen from the parent: a_o = a + α × p + ω × (ω × p).
-        origin = before[2] + _cross(before[1], offset) + _cross(before[0], _cross(before[0], offset))
-        into = _into_link(joint.rotation, joint.axis, position[index] if revolute else None, samples)
-        w, dw, a = (_apply(into, vector) for vector in (before[0], before[1], origin))
+        fixed, skew = _blocks(joint.rotation.T, -joint.rotation.T @ _skew(joint.translation_m)), _skew(joint.axis)
         if revolute:
-            dw = dw + axis * acceleration[index] + _cross(w, axis * velocity[index])
-            w = w + axis * velocity[index]
+            # exp(−skew θ) = e eᵀ + cos θ (1 − e eᵀ) − sin θ skew (Rodrigues).
+            outer = np.outer(joint.axis, joint.axis)
+            parts = [_blocks(turn) @ fixed for turn in (outer, np.eye(3) - outer, -skew)]
         else:
-            a = a + axis * acceleration[index] + 2.0 * _cross(w, axis * velocity[index])
-        omega.append(w)
-        alpha.append(dw)
-        linear.append(a)
-        moved = {}
-        if parent >= 0:
-            # A screw's linear part is taken at this link's origin: u' = u + w × p.
-            for ancestor, (angular, along) in screws[parent].items():
-                moved[ancestor] = (_apply(into, angular), _apply(into, along + _cross(angular, offset)))
-        own = np.repeat(axis, samples, axis=1)
-        moved[index] = (own, still) if revolute else (still, own)
-        screws.append(moved)
-        for row, (angular, along) in moved.items():
-            _fill(columns[row, 10 * index : 10 * index + 10], angular, along, w, dw, a)
-    return columns
+            # Slid along the axis e, u + w × (p + R e q): the second term is all that changes.
+            parts = [fixed, _blocks(np.zeros((3, 3)), -skew @ joint.rotation.T)]
+        own = np.zeros(6)
+        own[slice(0, 3) if revolute else slice(3, 6)] = joint.axis
+        links.append(
+            _Link(
+                parent=joint.parent,
+                movers=(*(links[joint.parent].movers if joint.parent >= 0 else ()), index),
+                revolute=revolute,
+                transforms=np.concatenate(parts),
+                own=own,
+                cross=_blocks(-_skew(own[:3]), -_skew(own[3:])),
+            )
+        )
+    return tuple(links)
 
 
-def _into_link(rotation: FloatArray, axis: FloatArray, angle: FloatArray | None, samples: int) -> FloatArray:
-    """Rotation matrices from the parent's frame into the link's, shape (3, 3, k)."""
-    if angle is None:
-        return np.repeat(rotation.T[:, :, None], samples, axis=2)
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    outer = np.outer(axis, axis)
-    # (R exp(skew θ))ᵀ = exp(−skew θ) Rᵀ, by Rodrigues' formula.
-    fixed, cosine, sine = outer @ rotation.T, (np.eye(3) - outer) @ rotation.T, -skew @ rotation.T
-    return fixed[:, :, None] + cosine[:, :, None] * np.cos(angle) + sine[:, :, None] * np.sin(angle)
+def _work(robot: Robot, links: tuple[_Link, ...], samples: int) -> _Work:
+    base = np.zeros((6, 2, samples))
+    base[3:, 1] = -robot.gravity_m_s2[:, None]
+    screws = [np.empty((6, 2 + len(link.movers), samples)) for link in links]
+    for link, array in zip(links, screws, strict=True):
+        array[:, -1] = link.own[:, None]
+    return _Work((*screws, base), np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
 
 
-def _apply(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    return np.asarray(matrix[:, 0] * vector[0] + matrix[:, 1] * vector[1] + matrix[:, 2] * vector[2])
+def _move(
+    link: _Link, work: _Work, index: int, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
+) -> None:
+    before, here = work.screws[link.parent], work.screws[index]
+    factors = (np.cos(position), np.sin(position)) if link.revolute else (position,)
+    parts = (link.transforms @ before.reshape(6, -1)).reshape(-1, *before.shape)
+    carried = parts[0]
+    for number, factor in enumerate(factors, start=1):
+        parts[number] *= factor
+        carried += parts[number]
+    here[:, :-1] = carried
+    v, a = here[:, 0], here[:, 1]
+    # S × S is nothing: V may be that before S q̇ is added.
+    a += np.outer(link.own, acceleration) + (link.cross @ v) * velocity
+    v += np.outer(link.own, velocity)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.stack((a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]))
+def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray:
+    """[[D, 0], [L, D]]: how screws (w, u) change frames."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = diagonal
+    if lower is not None:
+        out[3:, :3] = lower
+    return out
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+def _skew(vector: FloatArray) -> FloatArray:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def _fill(out: FloatArray, w: FloatArray, u: FloatArray, omega: FloatArray, alpha: FloatArray, a: FloatArray) -> None:
-    p = _cross(w, omega)
-    row = 0
-    for i in range(3):
-        for j in range(i, 3):
-            out[row] = w[i] * alpha[j] + p[i] * omega[j]
-            if i != j:
-                out[row] += w[j] * alpha[i] + p[j] * omega[i]
-            row += 1
-    out[6:9] = _cross(u, alpha) + _dot(u, omega) * omega - _dot(omega, omega) * u + _cross(a, w)
-    out[9] = _dot(u, a)
+def _fill_wrench(inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> None:
+    """Y, in two parts: the moment of unit inertias, shape (3, 6, k); moment and force of unit (h, m), shape (6, 4, k).
+
+    What is zero in every motion is left as it is.
+    """
+    w, v, dw = velocity[:3], velocity[3:], acceleration[:3]
+    xx, yy, zz = w[0] * w[0], w[1] * w[1], w[2] * w[2]
+    xy, xz, yz = w[0] * w[1], w[0] * w[2], w[1] * w[2]
+    # Columns of K(α) + [ω] K(ω), where I x = K(x) (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
+    inertia[0, 0] = inertia[1, 1] = inertia[2, 2] = dw[0]
+    inertia[0, 1] = inertia[1, 3] = inertia[2, 4] = dw[1]
+    inertia[0, 2] = inertia[1, 4] = inertia[2, 5] = dw[2]
+    inertia[0, 1] -= xz
+    inertia[0, 2] += xy
+    inertia[1, 1] += yz
+    inertia[1, 4] -= xy
+    inertia[2, 2] -= yz
+    inertia[2, 4] += xz
+    inertia[0, 5] = yz
+    inertia[1, 0] = xz
+    inertia[2, 3] = xy
+    np.negative(yz, out=inertia[0, 3])
+    np.negative(xz, out=inertia[1, 5])
+    np.negative(xy, out=inertia[2, 0])
+    np.subtract(yy, zz, out=inertia[0, 4])
+    np.subtract(zz, xx, out=inertia[1, 2])
+    np.subtract(xx, yy, out=inertia[2, 1])
+    # Force: m a + ([α] + [ω]²) h. Moment: −[a] h.
+    origin = moments[3:, 3]
+    np.add(acceleration[3], w[1] * v[2] - w[2] * v[1], out=origin[0])
+    np.add(acceleration[4], w[2] * v[0] - w[0] * v[2], out=origin[1])
+    np.add(acceleration[5], w[0] * v[1] - w[1] * v[0], out=origin[2])
+    moments[0, 1], moments[1, 2], moments[2, 0] = origin[2], origin[0], origin[1]
+    np.negative(moments[0, 1], out=moments[1, 0])
+    np.negative(moments[1, 2], out=moments[2, 1])
+    np.negative(moments[2, 0], out=moments[0, 2])
+    np.negative(yy + zz, out=moments[3, 0])
+    np.negative(xx + zz, out=moments[4, 1])
+    np.negative(xx + yy, out=moments[5, 2])
+    np.subtract(xy, dw[2], out=moments[3, 1])
+    np.add(xz, dw[1], out=moments[3, 2])
+    np.add(xy, dw[2], out=moments[4, 0])
+    np.subtract(yz, dw[0], out=moments[4, 2])
+    np.subtract(xz, dw[1], out=moments[5, 0])
+    np.add(yz, dw[0], out=moments[5, 1])

@@ -27,7 +27,11 @@ def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolA
         use: rows of each joint that count, shape (n, r).
     """
     size = np.sum(measured_nm**2, axis=1, where=use)
-    left = np.sum((measured_nm - predicted_nm) ** 2, axis=1, where=use)
+    return of_squares(size, np.sum((measured_nm - predicted_nm) ** 2, axis=1, where=use))
+
+
+def of_squares(size: FloatArray, left: FloatArray) -> RelativeError:
+    """The same from ‖Y_j‖² and ‖ρ_j‖² of each joint, both of shape (n,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         axes = 100.0 * np.sqrt(left / size)
         total = 100.0 * np.sqrt(left.sum() / size.sum())

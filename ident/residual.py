@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ident.errors import TooFewMoves
-from ident.linearisation import FEWEST_MOVES, Linearisation
+from ident.jackknife import FEWEST_MOVES
+from ident.linearisation import Linearisation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

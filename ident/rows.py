@@ -1,8 +1,9 @@
-"""Which rows a run gives: the filter that makes them, the samples behind each, and whether it counts."""
+"""The rows that a run gives: the filter that makes them, the samples behind each, and whether it counts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,11 @@ from ident.conditioning import Conditioning, Decimator, decimator
 from ident.dataset import Dataset
 from ident.drive_train import DriveTrain
 from ident.errors import DataUnfit
+from ident.model import Model
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 
 CHUNK_ROWS = 256
 """Decimated rows built at once: the regressor of their samples stays in the cache's reach."""
@@ -58,9 +61,65 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
     return use, motor_use
 
 
-def chunks(filter_: Decimator, samples: int) -> Iterator[slice]:
-    """Pieces of a run's samples, each with the whole windows of up to CHUNK_ROWS rows."""
+def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]:
+    """Pieces of a run's samples, each with the whole windows of up to so many rows."""
     rows = filter_.rows(samples)
-    for first in range(0, rows, CHUNK_ROWS):
-        last = min(first + CHUNK_ROWS, rows) - 1
+    for first in range(0, rows, chunk_rows):
+        last = min(first + chunk_rows, rows) - 1
         yield slice(first * filter_.factor, last * filter_.factor + 2 * filter_.half + 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Consecutive decimated rows of one run; arrays are joint-first and time-last.
+
+    Attributes:
+        current: current references of the motors [A], shape (n, r).
+        standard: torque at each joint per unit of each standard parameter, shape (n, c, r).
+        use: rows of each joint that count: moving and valid, shape (n, r).
+        motor_use: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r).
+        time_s: of each row, since the start of the run, shape (r,).
+        move: number of each row's move within the run, shape (r,).
+    """
+
+    current: FloatArray
+    standard: FloatArray
+    use: BoolArray
+    motor_use: BoolArray
+    time_s: FloatArray
+    move: IntArray
+
+
+def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows: int = CHUNK_ROWS) -> Iterator[Rows]:
+    """Build, filter and decimate a run's rows piece by piece; the pieces together do not depend on their length.
+
+    Args:
+        model: the declared model.
+        data: a differentiated run.
+        conditioning: every column and the currents go through the same decimation.
+        chunk_rows: rows built at once.
+
+    Raises:
+        DataUnfit: the run is too short for the filter, or no row of it counts.
+    """
+    filter_ = row_filter(data, conditioning)
+    use, motor_use = row_masks(model.drive_train, data, conditioning)
+    if not use.any():
+        raise DataUnfit(data.name, "no row is left after the standstill and validity masks; did the robot move?")
+    centres = filter_.centres(len(data.time_s))
+    time_s, move = data.time_s[centres] - data.time_s[0], data.move[centres]
+    first, support = 0, model.support
+    for part in chunks(filter_, len(data.time_s), chunk_rows):
+        whole = model.regressor(data.motion(part))
+        standard = np.zeros((*support.shape, filter_.rows(whole.shape[2])))
+        standard[support] = filter_(whole[support])
+        piece = slice(first, first + standard.shape[2])
+        first = piece.stop
+        yield Rows(
+            current=filter_(data.current_a[:, part]),
+            standard=standard,
+            use=use[:, piece],
+            motor_use=motor_use[:, piece],
+            time_s=time_s[piece],
+            move=move[piece],
+        )

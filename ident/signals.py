@@ -108,7 +108,7 @@ def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatAr
 
 
 def _identified(payload: Payload | None, observation: Observation, estimate: Estimate) -> dict[str, float]:
-    first = observation.robot.shape[1]
+    first = len(observation.columns)
     for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
         values = estimate.parameters[first : first + len(indices)]
         if payload is not None and other.mounting == payload.mounting:

@@ -1,1 +1,1 @@
-"""The estimators, each on the same Observation."""
+"""The estimators, each on the same System."""

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from ident.errors import NotConverged, RankDeficient
 from ident.estimate import Estimate, Method
-from ident.estimators.least_squares import require_known_payload, wls
+from ident.estimators.least_squares import wls
 from ident.estimators.total_least_squares import Scaling, tls
-from ident.estimators.triangles import Triangles, joint_triangles, motor_triangles, solve
-from ident.linearisation import jackknife_covariance, linearise
-from ident.observation import Observation
+from ident.jackknife import jackknife_covariance
+from ident.system import System, require_known_payload, require_rows
+from ident.triangles import Triangles, solve
 
 FloatArray = NDArray[np.float64]
 
@@ -31,11 +31,11 @@ STEP_TOLERANCE = 1e-7
 LARGEST_DAMPING = 1e6
 
 
-def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estimate:
+def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     """Damped Gauss-Newton from the likeliest of the linear estimates.
 
     Args:
-        observation: rows of at least one loaded and one unloaded run where the gains are unknown.
+        system: of at least one loaded and one unloaded run where the gains are unknown.
         fixed_gains: known gains [Nm/A], shape (n,); the problem is then linear.
 
     Raises:
@@ -44,14 +44,14 @@ def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estim
         TooFewMoves: for the covariance.
         NotConverged: the cost still falls, or cannot fall, after MAX_ITERATIONS.
     """
-    triangles = motor_triangles(observation)
+    require_rows(system)
+    triangles = system.motors
     if fixed_gains is None:
-        require_known_payload(observation)
-        gamma, iterations = _gauss_newton(observation, triangles)
+        require_known_payload(system)
+        gamma, iterations = _gauss_newton(system)
     else:
         gamma, iterations = 1.0 / fixed_gains, 0
-    free = observation.robot.shape[1] + sum(map(len, observation.payload_columns))
-    free += 0 if fixed_gains is not None else observation.joint_count
+    free = len(system.unknowns) + (0 if fixed_gains is not None else system.joint_count)
     noise = _noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
     for _ in range(30):  # σ and χ for these γ: a fixed point of a few rounds
         parameters = _parameters(triangles, gamma, noise)
@@ -59,16 +59,14 @@ def ml(observation: Observation, fixed_gains: FloatArray | None = None) -> Estim
         if np.allclose(updated, noise, rtol=1e-10):
             break
         noise = updated
-    joints = joint_triangles(observation)
     full = np.concatenate((1.0 / gamma, parameters, [1.0]))
-    weighted = joints.weighted_system(full, free, gains=fixed_gains is None)
-    problem = linearise(observation, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None)
-    covariance = jackknife_covariance(problem, len(gamma) + len(parameters))
+    weighted = system.joints.weighted_system(full, free, gains=fixed_gains is None)
+    covariance = jackknife_covariance(system, 1.0 / gamma, parameters, noise, gains_fixed=fixed_gains is not None)
     return Estimate(
         method=Method.ML,
         gains=1.0 / gamma,
         gains_fixed=fixed_gains is not None,
-        unknowns=observation.unknowns,
+        unknowns=system.unknowns,
         parameters=parameters,
         covariance=covariance,
         axis_noise=noise,
@@ -101,10 +99,10 @@ def _noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, f
     return np.asarray(np.sqrt(size / np.maximum(triangles.rows - free / len(gamma), 1.0)))
 
 
-def _start(observation: Observation, triangles: Triangles) -> FloatArray:
+def _start(system: System) -> FloatArray:
     """γ of whichever linear estimate makes these data likeliest; each is good somewhere."""
-    even = np.ones(observation.joint_count)
-    starts = [wls(observation), tls(observation, Scaling.COLUMNS), tls(observation, Scaling.BOTH)]
+    even, triangles = np.ones(system.joint_count), system.motors
+    starts = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
     gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
     if not gammas:
         gains = tuple(f"gain {motor + 1}" for motor in range(len(even)))
@@ -112,10 +110,10 @@ def _start(observation: Observation, triangles: Triangles) -> FloatArray:
     return min(gammas, key=lambda gamma: _log_likelihood_cost(triangles, gamma, _parameters(triangles, gamma, even)))
 
 
-def _gauss_newton(observation: Observation, triangles: Triangles) -> tuple[FloatArray, int]:
+def _gauss_newton(system: System) -> tuple[FloatArray, int]:
     """γ by variable projection: χ is eliminated for each γ, so that only n unknowns are iterated."""
-    count = observation.joint_count
-    gamma = _start(observation, triangles)
+    count, triangles = system.joint_count, system.motors
+    gamma = _start(system)
     noise = np.ones(count)
     for _ in range(3):
         parameters = _parameters(triangles, gamma, noise)

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.estimate import Estimate, Method
-from ident.estimators.least_squares import require_known_payload
-from ident.estimators.triangles import Triangles, joint_triangles
-from ident.observation import Observation
+from ident.system import System, require_known_payload
+from ident.triangles import Triangles
 
 FloatArray = NDArray[np.float64]
 
@@ -24,33 +23,33 @@ class Scaling(Enum):
     BOTH = "rows weighted per joint, unit-norm columns"
 
 
-def tls(observation: Observation, scaling: Scaling = Scaling.ROWS) -> Estimate:
+def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
     """The right singular vector of W_tot's smallest singular value, scaled so that its last entry is one (eq. 18).
 
     Args:
-        observation: rows of at least one loaded and one unloaded run.
+        system: of at least one loaded and one unloaded run.
         scaling: of rows and columns before the decomposition; the paper weights rows per joint.
 
     Raises:
         DataUnfit: no run carries a known payload.
     """
-    require_known_payload(observation)
-    triangles = joint_triangles(observation)
-    weight = np.ones(observation.joint_count)
+    require_known_payload(system)
+    triangles = system.joints
+    weight = np.ones(system.joint_count)
     columns = scaling in (Scaling.COLUMNS, Scaling.BOTH)
     if scaling in (Scaling.ROWS, Scaling.BOTH):
         first, _, _ = _smallest(triangles, weight, columns)
         # σ_W^j, the standard deviation of joint j's equations (§3.3, last paragraph).
         weight = 1.0 / triangles.residual_std(first, len(first) - 1)
     vector, covariance, singular = _smallest(triangles, weight, columns)
-    count = observation.joint_count
+    count = system.joint_count
     regressor = triangles.stacked(weight)[:, :-1]
     weighted = np.linalg.svd(regressor, compute_uv=False)
     return Estimate(
         method=Method.TLS,
         gains=vector[:count],
         gains_fixed=False,
-        unknowns=observation.unknowns,
+        unknowns=system.unknowns,
         parameters=vector[count:-1],
         covariance=covariance,
         axis_noise=triangles.residual_std(vector, len(vector) - 1),
@@ -63,9 +62,9 @@ def tls(observation: Observation, scaling: Scaling = Scaling.ROWS) -> Estimate:
 def _smallest(
     triangles: Triangles, weight: FloatArray, unit_columns: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    system = triangles.stacked(weight)
-    norms = np.linalg.norm(system, axis=0) if unit_columns else np.ones(system.shape[1])
-    scaled = system / norms
+    stacked = triangles.stacked(weight)
+    norms = np.linalg.norm(stacked, axis=0) if unit_columns else np.ones(stacked.shape[1])
+    scaled = stacked / norms
     u, s, vt = np.linalg.svd(scaled, full_matrices=False)
     vector = vt[-1] / vt[-1, -1]
     rows, unknowns = int(triangles.rows.sum()), len(vector)

@@ -11,7 +11,9 @@ from scipy import signal
 from ident.conditioning import Conditioning
 from ident.dataset import differentiate
 from ident.drive_train import DriveTrain
+from ident.identify import identify
 from ident.link import LINK_PARAMETERS
+from ident.loop import Evidence, gather
 from ident.model import Model
 from ident.payload import Payload
 from ident.robot import robot_from_urdf
@@ -106,3 +108,8 @@ def record(
     current[1:-1] = ((truth.model.drive_train.to_motor @ torque) / truth.gains[:, None]).T
     current += noise_a * rng.standard_normal(current.shape)
     return Run(name, time, q, current, payload)
+
+
+def gathered(truth: Truth, runs: tuple[Run, ...], holdout: tuple[Run, ...] = ()) -> Evidence:
+    """Identified by ``ml``, with its rows."""
+    return gather(identify(truth.model, runs, CONDITIONING, holdout=holdout), runs, holdout)

@@ -8,13 +8,15 @@ import pytest
 from ident.base_parameters import base_parameters
 from ident.dataset import differentiate
 from ident.observation import observe
+from ident.reduction import reduce_runs
 from ident.run import Run
 from tests.ident.recordings import CONDITIONING, Truth
 
 
 def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
     data = differentiate(clean_runs[0], truth.model.drive_train, CONDITIONING)
-    observation = observe(truth.model, [data], CONDITIONING)
+    reduction = reduce_runs(truth.model, clean_runs[:1], CONDITIONING)
+    observation = observe(truth.model, [data], CONDITIONING, reduction.system(reduction.base(), ()))
     assert len(observation.columns) == 61
     assert observation.columns[0].name.startswith("Izz1 + 1.0*Ia1 + 1.0*Iyy2")
     torque = np.einsum("jcr,c->jr", observation.robot, observation.base.grouping @ truth.parameters)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.dataset import differentiate
 from ident.drive_train import DriveTrain
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimate import Estimate, Method
@@ -16,7 +15,6 @@ from ident.estimators.maximum_likelihood import ml
 from ident.estimators.total_least_squares import Scaling, tls
 from ident.identify import estimate_with, identify
 from ident.model import Model
-from ident.observation import observe, require_distinct
 from ident.payload import Payload
 from ident.run import Run
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record
@@ -41,7 +39,7 @@ def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: t
 def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
     for method in (Method.LS, Method.WLS, Method.ML):
         result = identify(truth.model, clean_runs[:1], CONDITIONING, method=method, fixed_gains=GAINS)
-        expected = result.training.base.grouping @ truth.parameters
+        expected = result.system.base.grouping @ truth.parameters
         assert result.estimate.parameters == pytest.approx(expected, rel=1e-3, abs=2e-3)
         assert np.all(result.estimate.gains_std == 0.0)
 
@@ -85,6 +83,7 @@ def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple
     before = identify(truth.model, noisy_runs, conditioning).estimate
     after = identify(model, runs, conditioning).estimate
     assert after.gains == pytest.approx(before.gains[order], rel=1e-3)
+    assert after.parameters == pytest.approx(before.parameters, rel=1e-2, abs=3e-3)
 
 
 def test_the_covariance_covers_the_error(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
@@ -94,10 +93,26 @@ def test_the_covariance_covers_the_error(truth: Truth, noisy_runs: tuple[Run, ..
     assert np.all(estimate.gains_std / np.abs(GAINS) < 0.02)
 
 
+def test_ml_solves_the_instrumental_variable_equations(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    """Instruments are the columns of W and the predicted currents (docs/decisions/0010)."""
+    system = identify(truth.model, noisy_runs, CONDITIONING).system
+    estimate = ml(system)
+    gamma = 1.0 / estimate.gains
+    columns = np.zeros(len(estimate.parameters))
+    size = np.zeros_like(columns)
+    for factor, g, sigma in zip(system.motors.factors, gamma, estimate.axis_noise, strict=True):
+        predicted = g * (factor[:, 1:-1] @ estimate.parameters + factor[:, -1])
+        error = factor[:, 0] - predicted
+        assert abs(predicted @ error) < 1e-6 * np.linalg.norm(predicted) * np.linalg.norm(error)
+        columns += g / sigma**2 * (factor[:, 1:-1].T @ error)
+        size += abs(g) / sigma**2 * np.linalg.norm(factor[:, 1:-1], axis=0) * np.linalg.norm(error)
+    assert np.all(np.abs(columns) < 1e-6 * size)
+
+
 @pytest.mark.parametrize("scaling", Scaling)
 def test_tls_scalings_agree_without_noise(truth: Truth, clean_runs: tuple[Run, ...], scaling: Scaling) -> None:
-    observation = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).training
-    assert tls(observation, scaling).gains == pytest.approx(GAINS, rel=2e-4)
+    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
+    assert tls(system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
 
 
 def test_without_a_known_payload_there_is_no_scale(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
@@ -124,14 +139,12 @@ def test_a_mounting_has_one_payload(truth: Truth) -> None:
 
 
 def test_tls_has_nothing_to_do_with_fixed_gains(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    observation = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).training
+    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
     with pytest.raises(DataUnfit, match="free gains"):
-        estimate_with(Method.TLS, observation, GAINS)
+        estimate_with(Method.TLS, system, GAINS)
 
 
 def test_more_runs_of_one_mounting_share_its_unknowns(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    datasets = [differentiate(run, truth.model.drive_train, CONDITIONING) for run in noisy_runs]
-    observation = observe(truth.model, datasets, CONDITIONING)
-    require_distinct(observation, gains=True)
-    assert len(observation.unknowns) == 61 + 9
-    assert ml(observation).rows == int(observation.motor_use.sum())
+    system = identify(truth.model, noisy_runs, CONDITIONING).system
+    assert len(system.unknowns) == 61 + 9
+    assert ml(system).rows == int(system.motors.rows.sum())

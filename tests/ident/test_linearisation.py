@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.identify import identify
 from ident.linearisation import linearise
 from ident.run import Run
-from tests.ident.recordings import CONDITIONING, Truth
+from tests.ident.recordings import Truth, gathered
 
 
 def test_jacobian_is_the_slope_of_the_residual(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    start = identify(truth.model, clean_runs, CONDITIONING)
+    start = gathered(truth, clean_runs)
     gains, parameters, noise = start.estimate.gains, start.estimate.parameters, np.full(6, 0.1)
 
     def problem(step: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -13,14 +13,16 @@ from ident.dataset import Dataset
 from ident.drive_train import DriveTrain
 from ident.effects import EFFECTS
 from ident.effects.effect import Effect, Side
+from ident.effects.placed import PlacedEffect
 from ident.errors import RankDeficient, TooFewMoves
 from ident.estimators.maximum_likelihood import ml
-from ident.identify import Identification, PlacedEffect, close_the_loop, identify, with_effects
+from ident.identify import identify
+from ident.loop import Evidence, close_the_loop, with_effects
 from ident.model import Model
 from ident.rows import decimate_rows
 from ident.run import Run
 from ident.search import find
-from tests.ident.recordings import CONDITIONING, GAINS, PAYLOAD_TRUTH, RATIO, Truth
+from tests.ident.recordings import CONDITIONING, GAINS, PAYLOAD_TRUTH, RATIO, Truth, gathered
 
 FloatArray = NDArray[np.float64]
 
@@ -62,8 +64,8 @@ CASES = (
 
 
 @pytest.fixture(scope="module")
-def clean(truth: Truth, noisy_runs: tuple[Run, ...]) -> Identification:
-    return identify(truth.model, noisy_runs, CONDITIONING)
+def clean(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
+    return gathered(truth, noisy_runs)
 
 
 def _true(truth: Truth, data: Dataset, axis: int) -> True1:
@@ -83,7 +85,7 @@ def _true(truth: Truth, data: Dataset, axis: int) -> True1:
     )
 
 
-def _with(clean: Identification, truth: Truth, planted: Planted, side: Side) -> Identification:
+def _with(clean: Evidence, truth: Truth, planted: Planted, side: Side) -> Evidence:
     rows = [
         decimate_rows(data, CONDITIONING, planted.torque(_true(truth, data, planted.axis))) for data in clean.datasets
     ]
@@ -91,7 +93,7 @@ def _with(clean: Identification, truth: Truth, planted: Planted, side: Side) -> 
     added[planted.axis] = np.concatenate(rows)
     at_motors = added if side is Side.MOTOR else truth.model.drive_train.to_motor @ added
     bent = replace(clean.bare, current=clean.bare.current + at_motors / GAINS[:, None])
-    return replace(clean, bare=bent, training=bent, estimate=ml(bent))
+    return replace(clean, bare=bent, training=bent, estimate=ml(bent.system()))
 
 
 def _family(name: str) -> tuple[Effect, ...]:
@@ -103,7 +105,7 @@ def test_every_family_is_planted() -> None:
 
 
 @pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
-def test_it_is_named_with_its_size_and_sign(clean: Identification, truth: Truth, planted: Planted) -> None:
+def test_it_is_named_with_its_size_and_sign(clean: Evidence, truth: Truth, planted: Planted) -> None:
     start = _with(clean, truth, planted, _family(planted.family)[0].side)
     findings = find(start.model, start.datasets, start.training, start.estimate, np.random.default_rng(0))
     best = findings[0]
@@ -121,7 +123,7 @@ def test_it_is_named_with_its_size_and_sign(clean: Identification, truth: Truth,
     assert after.training_error.axes[planted.axis] < start.training_error.axes[planted.axis]
 
 
-def test_motors_in_another_order_change_no_verdict(clean: Identification, truth: Truth) -> None:
+def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth) -> None:
     """A spring on joint 2 must pass its gates on whichever motor gives the torque."""
     order = np.array([2, 0, 1, 3, 5, 4])
     start = _with(clean, truth, CASES[4], Side.JOINT)
@@ -133,7 +135,7 @@ def test_motors_in_another_order_change_no_verdict(clean: Identification, truth:
         motor_use=start.training.motor_use[order],
     )
     model = Model(truth.model.robot, train)
-    findings = find(model, start.datasets, training, ml(training), np.random.default_rng(0))
+    findings = find(model, start.datasets, training, ml(training.system()), np.random.default_rng(0))
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
     same = find(start.model, start.datasets, start.training, start.estimate, np.random.default_rng(0))
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
@@ -151,7 +153,7 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
 ) -> None:
     never_still = replace(CONDITIONING, standstill_rad_s=())
     whole = identify(truth.model, noisy_runs, never_still)
-    assert len(np.unique(whole.training.move)) >= 4 * 11
+    assert len(whole.system.moves) >= 4 * 11
     assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
     short = tuple(
         replace(run, time_s=run.time_s[:5000], position_rad=run.position_rad[:5000], current_a=run.current_a[:5000])
@@ -161,7 +163,7 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
         identify(truth.model, short, never_still)
 
 
-def test_sigma_is_true_for_correlated_noise(clean: Identification, truth: Truth) -> None:
+def test_sigma_is_true_for_correlated_noise(clean: Evidence, truth: Truth) -> None:
     """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
     rng = np.random.default_rng(5)
     bare, estimate = clean.bare, clean.estimate
@@ -173,7 +175,7 @@ def test_sigma_is_true_for_correlated_noise(clean: Identification, truth: Truth)
         drawn = rng.normal(size=exact.shape)
         for row in range(1, exact.shape[1]):
             noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
-        found = ml(replace(bare, current=exact + 0.05 * noise))
+        found = ml(replace(bare, current=exact + 0.05 * noise).system())
         gains.append(found.gains)
         claimed.append(found.gains_std)
     ratio = np.mean(claimed, axis=0) / np.std(gains, axis=0, ddof=1)
@@ -182,7 +184,7 @@ def test_sigma_is_true_for_correlated_noise(clean: Identification, truth: Truth)
     assert np.all(ratio < 1.6)
 
 
-def test_the_loop_ends_where_nothing_is_left(clean: Identification, truth: Truth) -> None:
+def test_the_loop_ends_where_nothing_is_left(clean: Evidence, truth: Truth) -> None:
     start = _with(clean, truth, CASES[3], Side.JOINT)
     steps = close_the_loop(start, np.random.default_rng(1))
     assert [step.accepted is not None for step in steps] == [True, False]

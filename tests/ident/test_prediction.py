@@ -14,11 +14,13 @@ from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.dataset import Dataset, differentiate
 from ident.effects.cogging import Cogging
 from ident.effects.load_friction import LoadFriction
+from ident.effects.placed import PlacedEffect
 from ident.effects.spring import Spring
 from ident.effects.stribeck import Stribeck
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.estimate import Method
-from ident.identify import Identification, PlacedEffect, identify, with_effects
+from ident.identify import identify
+from ident.loop import Evidence, gather, with_effects
 from ident.payload import Payload
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
 from ident.relative_error import RelativeError
@@ -50,7 +52,7 @@ def _calibration(gains: FloatArray, parameters: tuple[Parameter, ...]) -> Calibr
     )
 
 
-def _of(identification: Identification) -> Calibration:
+def _of(identification: Evidence) -> Calibration:
     estimate = identification.estimate
     parameters = tuple(
         Parameter(column.name, float(value), 0.0, column.unit)
@@ -65,7 +67,7 @@ def _of(identification: Identification) -> Calibration:
     return replace(_calibration(estimate.gains, parameters), effects=tuple(effects))
 
 
-def _largest_difference(identification: Identification) -> float:
+def _largest_difference(identification: Evidence) -> float:
     """Of the two predictions on the decimated rows, relative to the largest torque."""
     calibration = _of(identification)
     expected = identification.estimate.predicted_torque(identification.training)
@@ -77,12 +79,13 @@ def _largest_difference(identification: Identification) -> float:
 
 
 @pytest.fixture(scope="module")
-def identified(truth: Truth, noisy_runs: tuple[Run, ...]) -> Identification:
+def identified(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
     """One run without load and one with, by the classical identification."""
-    return identify(truth.model, noisy_runs[:2], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
+    found = identify(truth.model, noisy_runs[:2], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
+    return gather(found, noisy_runs[:2])
 
 
-def test_the_estimates_own_torque_comes_back(identified: Identification) -> None:
+def test_the_estimates_own_torque_comes_back(identified: Evidence) -> None:
     assert _largest_difference(identified) < 1e-9
 
 
@@ -95,7 +98,7 @@ def test_the_estimates_own_torque_comes_back(identified: Identification) -> None
     ],
     ids=["spring", "cogging and stribeck"],
 )
-def test_so_does_that_of_effects(identified: Identification, effects: tuple[PlacedEffect, ...]) -> None:
+def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffect, ...]) -> None:
     after = with_effects(identified, effects)
     assert _largest_difference(after) < 1e-9
     without = replace(_of(after), effects=())
@@ -103,7 +106,7 @@ def test_so_does_that_of_effects(identified: Identification, effects: tuple[Plac
         standard_parameters(without, identified.model)
 
 
-def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Identification) -> None:
+def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evidence) -> None:
     """The fit built its columns with the estimate before the last, so the two agree only as the iteration does."""
     after = with_effects(identified, (PlacedEffect(LoadFriction(), 1),))
     assert _largest_difference(after) < 1e-4
@@ -115,7 +118,7 @@ _seeds = st.integers(min_value=0, max_value=2**32 - 1)
 @given(seed=_seeds)
 @settings(max_examples=10, deadline=None)
 def test_leading_columns_alone_move_as_all_standard_parameters_do(
-    identified: Identification, truth: Truth, seed: int
+    identified: Evidence, truth: Truth, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     motion = _random_motion(identified.datasets[0], rng)
@@ -143,7 +146,7 @@ def _random_motion(like: Dataset, rng: np.random.Generator) -> Dataset:
 
 
 def test_the_true_parameters_predict_the_recorded_current(
-    identified: Identification, truth: Truth, clean_runs: tuple[Run, ...]
+    identified: Evidence, truth: Truth, clean_runs: tuple[Run, ...]
 ) -> None:
     base = identified.bare.base
     values = (*base.grouping @ truth.parameters, *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"))
@@ -167,13 +170,13 @@ def test_the_true_parameters_predict_the_recorded_current(
         (Payload("disc", "a", {"m": 4.59, "mx": -0.24}), "says mx of mounting 'a' beforehand"),
     ],
 )
-def test_a_payload_that_the_calibration_does_not_know(identified: Identification, payload: Payload, words: str) -> None:
+def test_a_payload_that_the_calibration_does_not_know(identified: Evidence, payload: Payload, words: str) -> None:
     data = replace(identified.datasets[1], payload=payload)
     with pytest.raises(DataUnfit, match=words):
         predict_torque(_of(identified), identified.model, data)
 
 
-def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Identification) -> None:
+def test_a_payload_that_is_known_in_full_needs_nothing_of_the_calibration(identified: Evidence) -> None:
     calibration, data = _of(identified), identified.datasets[1]
     full = dict.fromkeys(PAYLOAD_TRUTH, 0.0)
     weightless = predict_torque(calibration, identified.model, replace(data, payload=Payload("x", "x", full)))
@@ -203,7 +206,7 @@ def test_an_effect_that_does_not_exist_is_refused(effect: AcceptedEffect, words:
         placed_effect(effect, _calibration(GAINS, ()))
 
 
-def test_a_calibration_of_another_robot_is_refused(identified: Identification) -> None:
+def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
     calibration, data = _of(identified), identified.datasets[0]
     with pytest.raises(ModelError, match="5 gains, the model 6 joints"):
         predict_torque(replace(calibration, gains=calibration.gains[:5]), identified.model, data)

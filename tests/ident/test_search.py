@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.identify import Identification, close_the_loop, identify
 from ident.linearisation import linearise
+from ident.loop import Evidence, close_the_loop
 from ident.residual import cut
 from ident.run import Run
 from ident.search import find
-from tests.ident.recordings import CONDITIONING, GAINS, Truth
+from tests.ident.recordings import GAINS, Truth, gathered
 
 FloatArray = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ def _speed(run: Run, axis: int) -> FloatArray:
     return np.asarray(np.gradient(run.position_rad[:, axis]) * run.rate_hz)
 
 
-def _identified(truth: Truth, runs: tuple[Run, ...]) -> Identification:
-    return identify(truth.model, runs[:-1], CONDITIONING, holdout=runs[-1:])
+def _identified(truth: Truth, runs: tuple[Run, ...]) -> Evidence:
+    return gathered(truth, runs[:-1], runs[-1:])
 
 
 def test_clean_data_get_no_effect(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
@@ -67,7 +67,7 @@ def test_a_spring_is_told_from_gravity(truth: Truth, noisy_runs: tuple[Run, ...]
 
 def test_the_same_seed_gives_the_same_verdict(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     start = _identified(truth, noisy_runs)
-    trained = start.datasets[:-1]
+    trained = start.trained
     first, second = (
         find(start.model, trained, start.training, start.estimate, np.random.default_rng(4)) for _ in range(2)
     )

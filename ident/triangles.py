@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from ident.errors import DataUnfit
-from ident.observation import Observation
 
 FloatArray = NDArray[np.float64]
 
@@ -31,8 +29,12 @@ class Triangles:
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
         """Standard deviation of each axis' residual R x; ``free`` parameters are shared among the axes (eq. 9)."""
-        size = np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
+        size = self.square_sum(vector)
         return np.asarray(np.sqrt(size / np.maximum(self.rows - free / len(self.rows), 1.0)))
+
+    def square_sum(self, vector: FloatArray) -> FloatArray:
+        """‖R x‖² of each axis, shape (n,)."""
+        return np.array([float(np.sum((factor @ vector) ** 2)) for factor in self.factors])
 
     def weighted_system(self, solution: FloatArray, free: int, *, gains: bool) -> FloatArray:
         """Singular values of W_r with rows of a joint divided by its residual's deviation (paper Table 5).
@@ -46,39 +48,15 @@ class Triangles:
         return singular_values(self.stacked(1.0 / self.residual_std(solution, free))[:, first:-1])
 
 
-def joint_triangles(observation: Observation) -> Triangles:
-    """Rows of the paper's eq. (17), W_tot = [V | −W | −W_uL | −W_kL χ_kL], joint by joint: c = n + p + 1 columns."""
-    linear, known = observation.linear(), observation.known()
-    direction = observation.drive_train.direction
-    factors: list[FloatArray] = []
-    for joint, used in enumerate(observation.use):
-        rows = np.concatenate(
-            (
-                direction[:, joint, None] * observation.current[:, used],
-                -linear[joint][:, used],
-                -known[joint, used][None],
-            )
-        )
-        factors.append(np.asarray(np.linalg.qr(rows.T, mode="r"), dtype=np.float64))
-    return Triangles(tuple(factors), observation.use.sum(axis=1))
+def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
+    """R of rows that come in pieces below each other, shape (≤columns, columns).
 
-
-def motor_triangles(observation: Observation) -> Triangles:
-    """Rows [v_i | (T W)_i | (T W_kL χ_kL)_i] of g_i v_i = (T W χ + T W_kL χ_kL)_i: each holds one current alone."""
-    linear, known = observation.motor_torque()
-    factors: list[FloatArray] = []
-    for motor, used in enumerate(observation.motor_use):
-        if used.sum() <= linear.shape[1]:
-            raise DataUnfit(
-                ", ".join(observation.runs),
-                f"motor {motor + 1} has {int(used.sum())} usable rows for {linear.shape[1]} unknowns; "
-                "record longer, or move it more",
-            )
-        rows = np.concatenate(
-            (observation.current[motor, used][None], linear[motor][:, used], known[motor, used][None])
-        )
-        factors.append(np.asarray(np.linalg.qr(rows.T, mode="r"), dtype=np.float64))
-    return Triangles(tuple(factors), observation.motor_use.sum(axis=1))
+    Args:
+        parts: pieces of rows, each of shape (m, columns).
+        columns: c, for the case of no rows.
+    """
+    rows = np.concatenate([np.empty((0, columns)), *parts])
+    return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64) if len(rows) > columns else rows
 
 
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

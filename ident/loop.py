@@ -1,0 +1,160 @@
+"""Closing the loop: what the residual asks for is added, everything is refitted, and the residual is asked again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.conditioning import Conditioning
+from ident.dataset import Dataset, differentiate
+from ident.effects.placed import PlacedEffect
+from ident.effects.torque import effect_torque
+from ident.estimate import Estimate
+from ident.identify import Identification, estimate_with
+from ident.model import Column, Model
+from ident.observation import Observation, observe
+from ident.relative_error import RelativeError
+from ident.run import Run
+from ident.search import Finding, Gates, find
+from ident.signals import signals
+
+FloatArray = NDArray[np.float64]
+
+MAX_EFFECTS = 6
+"""More than this on one robot means that the declared model is wrong, not that it lacks an effect."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """An estimate with its rows at hand: what a search for effects, and a picture, looks into.
+
+    Attributes:
+        model: the declared model.
+        conditioning: the filters.
+        datasets: of all runs, hold-out runs last.
+        held_out: how many of them were held out.
+        bare: rows of all runs, without effects.
+        training: rows of the fit, with the columns of the effects.
+        holdout: rows of the runs that were held out, None without any.
+        effects: in the model, in the order of their columns.
+        estimate: of the training rows.
+    """
+
+    model: Model
+    conditioning: Conditioning
+    datasets: tuple[Dataset, ...]
+    held_out: int
+    bare: Observation
+    training: Observation
+    holdout: Observation | None
+    effects: tuple[PlacedEffect, ...]
+    estimate: Estimate
+
+    @property
+    def trained(self) -> tuple[Dataset, ...]:
+        """The runs of the fit."""
+        return self.datasets[: len(self.datasets) - self.held_out]
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Of W: base parameters, then effects."""
+        return self.training.columns
+
+    @property
+    def training_error(self) -> RelativeError:
+        """On the rows of the fit [%]."""
+        return self.estimate.relative_error(self.training.system())
+
+    @property
+    def holdout_error(self) -> RelativeError | None:
+        """On the rows that the fit has not seen [%]."""
+        return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One turn of the loop: what was found, and the model with it."""
+
+    findings: tuple[Finding, ...]
+    accepted: Finding | None
+    after: Evidence
+
+
+def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
+    """The rows behind an identification.
+
+    Args:
+        found: from the same runs.
+        runs, holdout: of the fit, and those that it has not seen.
+    """
+    model, conditioning = found.model, found.conditioning
+    trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
+    unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
+    bare = observe(model, (*trained, *unseen), conditioning, found.system)
+    training, rest = _parted(bare, len(unseen))
+    return Evidence(model, conditioning, (*trained, *unseen), len(unseen), bare, training, rest, (), found.estimate)
+
+
+def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidence:
+    """The same data with effects in the model, everything refitted, gains included.
+
+    Load and current are the model's predictions, so the columns are built twice: with the estimate before, and with
+    the estimate that they led to.
+    """
+    current = before
+    fixed = before.estimate.gains if before.estimate.gains_fixed else None
+    for _ in range(2):
+        runs = [signals(before.model, data, current.training, current.estimate) for data in before.datasets]
+        whole = before.bare
+        for placed in effects:
+            torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, whole.conditioning, before.model)
+            whole = whole.extended(placed.columns, torque)
+        training, rest = _parted(whole, before.held_out)
+        estimate = estimate_with(before.estimate.method, training.system(), fixed)
+        current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
+    return current
+
+
+def close_the_loop(
+    start: Evidence,
+    rng: np.random.Generator,
+    gates: Gates | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Step, ...]:
+    """Find what the residual asks for, add it, refit everything, and look again, until nothing passes the gates.
+
+    Hold-out runs take no part in it.
+
+    Args:
+        start: identified by ``ml``.
+        rng: of the bootstrap.
+        gates: what a candidate must show.
+        progress: told what is being done, in words.
+
+    Returns:
+        the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
+    """
+    steps: list[Step] = []
+    current = start
+    for _ in range(MAX_EFFECTS):
+        known = len(current.effects)
+        progress("looking for an effect that the model lacks" + (f" beside the {known} found" if known else ""))
+        findings = find(current.model, start.trained, current.training, current.estimate, rng, gates)
+        accepted = next((finding for finding in findings if finding.passed), None)
+        if accepted is None:
+            steps.append(Step(findings, None, current))
+            break
+        progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
+        current = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
+        steps.append(Step(findings, accepted, current))
+    return tuple(steps)
+
+
+def _parted(whole: Observation, held_out: int) -> tuple[Observation, Observation | None]:
+    if not held_out:
+        return whole, None
+    rows = whole.run >= len(whole.runs) - held_out
+    return whole.only(~rows), whole.only(rows)

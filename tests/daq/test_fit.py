@@ -1,0 +1,80 @@
+"""From logs to a fit: one log after the other, each once, of one cell, and the one that contradicts is named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq import fit as fit_module
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from daq.errors import LogRepeated, LogsDiffer
+from daq.fit import fit
+from daq.resources import shipped_configurations
+from ident.errors import PayloadUnseen
+from ident.run import Run
+from tests.ident.recordings import MOUNTED, record, tx40_truth
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Runs by the name of a log, in the place of files."""
+
+    cell: Cell
+    runs: dict[str, Run]
+
+    def load(self, path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+        return self.runs[path.name], cell or self.cell
+
+
+@pytest.fixture(scope="module")
+def shelf() -> Shelf:
+    """Two runs without load, two with."""
+    truth, rng = tx40_truth(), np.random.default_rng(3)
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    runs = {}
+    for index in range(4):
+        payload = MOUNTED if index % 2 else None
+        run = record(truth, f"run{index}", rng, payload, noise_a=0.3, seconds=22.0)
+        runs[run.name] = replace(run, digest=f"{index:064x}")
+    undeclared = record(truth, "undeclared", rng, MOUNTED, noise_a=0.3, seconds=22.0)
+    runs["undeclared"] = replace(undeclared, payload=None, digest="f" * 64)
+    return Shelf(cell, runs)
+
+
+def _paths(*names: str) -> list[Path]:
+    return [Path(name) for name in names]
+
+
+def test_logs_become_sources_with_their_roles(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    found = fit(_paths("run0", "run1", "run2"), holdout=_paths("run3"))
+    assert [(source.name, source.role) for source in found.sources] == [
+        ("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout"),
+    ]  # fmt: skip
+    assert found.identification.holdout_error is not None
+
+
+def test_the_log_that_contradicts_the_others_is_named(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(PayloadUnseen, match="without undeclared they do"):
+        fit(_paths("undeclared", "run1", "run2", "run3"))
+
+
+def test_a_recording_counts_once(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(LogRepeated):
+        fit(_paths("run0", "run1"), holdout=_paths("run1"))
+
+
+def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+        run, described = shelf.load(path, cell)
+        return run, replace(described, digest="0" * 64) if path.name == "run1" else described
+
+    monkeypatch.setattr(fit_module, "load_run", load)
+    with pytest.raises(LogsDiffer, match="as in the first log"):
+        fit(_paths("run0", "run1"))
