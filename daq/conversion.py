@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import cell_from_bundle
+from daq.configuration.joint_unit import DEGREE
 from daq.errors import (
     ClockImplausible,
     CurrentSaturated,
@@ -44,7 +45,7 @@ class Scaling:
     Attributes:
         rad_per_count: motor angle of a count [rad], shape (n,).
         to_joint: R⁻¹, shape (n, n).
-        offset_rad: joint position where R⁻¹ q_motor is zero [rad], shape (n,).
+        offset_rad: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,).
         current_per_unit: unit of the current reference (A) for each raw unit, shape (n,).
     """
 
@@ -54,7 +55,7 @@ class Scaling:
     current_per_unit: FloatArray
 
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
-        """Joint positions [rad] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)."""
+        """Joint positions [rad, or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)."""
         motor_rad = counts * self.rad_per_count
         return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
 
@@ -166,7 +167,7 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
 
     Args:
         name: of the recording, for the message.
-        position_rad: joint positions [rad], shape (k, n).
+        position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
         cell: with the limits.
         valid: samples that count, shape (k, n).
 
@@ -178,13 +179,14 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
         lower, upper = axis.limits.position
         margin = LIMIT_MARGIN * (upper - lower)
         if column.size and (column.min() < lower - margin or column.max() > upper + margin):
-            found, limits = np.degrees((column.min(), column.max())), np.degrees((lower, upper))
+            unit = axis.unit
+            confused = "degrees were taken for radians" if unit is DEGREE else "mm were taken for m"
             raise PositionImplausible(
                 f"{name}, axis {axis.name}",
-                found=f"joint positions from {found[0]:.5g} to {found[1]:.5g} deg",
-                expected=f"{limits[0]:.5g} to {limits[1]:.5g} deg, the limits in the cell configuration",
-                remedy="most likely degrees were taken for radians (or counts for either); else check motor or joint "
-                "side, ratio and zero offset",
+                found=f"joint positions from {column.min() / unit.si:.5g} to {unit.spell(column.max())}",
+                expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell configuration",
+                remedy=f"most likely {confused} (or counts for either); else check motor or joint side, ratio and zero "
+                "offset",
             )
 
 

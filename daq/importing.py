@@ -8,8 +8,9 @@ scales without a rounding of its own. raw = round(value / count).
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Sequence
-from math import ceil, degrees, log2, pi
+from math import ceil, log2, pi
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from daq.log.writer import LogContent, LogWriter
 from drivers.sample import Sample
 from ident.payload import Payload
 
+_LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 LARGEST_RAW = 2**31 - 1
@@ -44,6 +46,10 @@ LARGEST_OUTLIER = 1000.0
 """Times the 99th percentile of a column of currents; a real peak is some ten times that."""
 SPEED_MARGIN = 3.0
 """Times a joint's velocity limit, which is often only guessed in a cell that imports; a wrong rate is off by more."""
+SPEED_PERCENTILE = 99.9
+"""Of all speeds of a run: a few outliers are no wrong rate, and less than this is too little to tell one by."""
+SLOW_SHARE = 0.1
+"""Of a joint's velocity limit: where no joint is ever faster, the rate may be ten times what it is said to be."""
 TIME_TOLERANCE = 0.5
 """Share of a period by which a time stamp may be off."""
 
@@ -149,7 +155,11 @@ def _counts(
                 remedy="correct `unit` in the import description",
             )
         return position.astype(np.int64), None
-    angle_rad = position * (pi / 180.0) if wanted.position_unit is PositionUnit.DEG else position
+    angle_rad = position
+    if wanted.position_unit is PositionUnit.DEG:
+        # Behind the gears people read a prismatic axis in mm; in front of them everything turns.
+        units = [axis.unit.si if wanted.side is Side.JOINT else pi / 180.0 for axis in cell.axes]
+        angle_rad = position * np.array(units)
     if wanted.side is Side.JOINT:
         offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
         angle_rad = (angle_rad - offset_rad) @ cell.ratio.T
@@ -212,11 +222,11 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             remedy="correct the description, or choose the cell with --cell",
         )
     for axis in cell.axes:
-        if axis.gain_unit != f"Nm/{wanted.current_unit}":
+        if axis.gain_unit not in {f"Nm/{wanted.current_unit}", f"N/{wanted.current_unit}"}:
             raise ConfigurationInconsistent(
                 f"{description}: current.unit",
                 found=f"{wanted.current_unit!r}, while the gain of axis {axis.name} is in {axis.gain_unit!r}",
-                expected=f"current in {axis.gain_unit.removeprefix('Nm/')!r}",
+                expected=f"current in {axis.gain_unit.partition('/')[2]!r}",
                 remedy="state that unit, and `factor` to convert the numbers of the file to it",
             )
     if wanted.position_unit is PositionUnit.COUNTS and any(a.counts_per_revolution is None for a in cell.axes):
@@ -265,15 +275,27 @@ def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFi
 def _check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
     """A wrong rate scales all speeds; over many samples they are far above the noise of differences."""
     step = max(1, min(round(0.1 * rate_hz), len(joint_rad) // 10))
-    speed = np.abs(joint_rad[step:] - joint_rad[:-step]).max(axis=0) * rate_hz / step
-    for axis, fastest in zip(cell.axes, speed.tolist(), strict=True):
-        if fastest > SPEED_MARGIN * axis.limits.velocity:
+    speeds = np.abs(joint_rad[step:] - joint_rad[:-step]) * rate_hz / step
+    fastest = np.percentile(speeds, SPEED_PERCENTILE, axis=0)
+    limits = np.array([axis.limits.velocity for axis in cell.axes])
+    for axis, speed, limit in zip(cell.axes, fastest.tolist(), limits.tolist(), strict=True):
+        if speed > SPEED_MARGIN * limit:
             raise SpeedImplausible(
                 f"{name}, axis {axis.name}",
-                found=f"{degrees(fastest):.4g} deg/s over {step} samples at {rate_hz:g} Hz",
-                expected=f"at most {degrees(axis.limits.velocity):.4g} deg/s, the limit in the cell configuration",
+                found=f"{axis.unit.spell(speed)}/s over {step} samples at {rate_hz:g} Hz",
+                expected=f"at most {axis.unit.spell(limit)}/s, the limit in the cell configuration",
                 remedy="most likely rate_hz is too high, or the unit of the time column or of the positions is another",
             )
+    share = float((fastest / limits).max())
+    if share < SLOW_SHARE:
+        _LOG.warning(
+            "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the rate of the recording "
+            "right? A rate that is too low makes inertias wrong without a sign of it; moves that are so slow identify "
+            "none.",
+            name,
+            rate_hz,
+            100.0 * share,
+        )
 
 
 def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:

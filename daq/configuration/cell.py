@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.configuration.clearance import Clearance
+from daq.configuration.joint_unit import JointUnit
 from drivers.axis import Identity
 from drivers.profile import DriveProfile
 from ident.conditioning import Conditioning
@@ -45,12 +47,12 @@ class Sync:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of a joint, in rad (m for a prismatic joint).
+    """Of a joint, in SI: rad, or m where it is prismatic.
 
     Attributes:
-        position: lower and upper end [rad].
-        velocity: largest speed [rad/s].
-        acceleration: largest acceleration [rad/s²].
+        position: lower and upper end [rad or m].
+        velocity: largest speed [rad/s or m/s].
+        acceleration: largest acceleration [rad/s² or m/s²].
     """
 
     position: tuple[float, float]
@@ -66,9 +68,10 @@ class Axis:
         name: of the axis.
         node_id, drive, profile, identity: of the amplifier; None in a cell that only imports recordings.
         counts_per_revolution: encoder counts a motor revolution; None where the import chooses its own count.
-        zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad].
+        unit: in which people read the joint: degrees, or mm where it is prismatic.
+        zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint].
         nameplate_gain: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed.
-        gain_unit: Nm at the joint per unit of the current-loop reference.
+        gain_unit: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference.
         limits: of the joint.
     """
 
@@ -78,6 +81,7 @@ class Axis:
     profile: DriveProfile | None
     identity: Identity | None
     counts_per_revolution: int | None
+    unit: JointUnit
     zero_offset_rad: float
     nameplate_gain: float
     gain_unit: str
@@ -91,7 +95,7 @@ class WeighedPayload:
     Attributes:
         name, mounting: the body, and the one way in which it is mounted.
         mass_kg, mass_tolerance_kg: as weighed [kg].
-        known: further inertial parameters that are known, by their names in ident.link.LINK_PARAMETERS.
+        known: further inertial parameters, from its drawing, by their names in ident.link.LINK_PARAMETERS.
     """
 
     name: str
@@ -102,7 +106,12 @@ class WeighedPayload:
 
     @property
     def payload(self) -> Payload:
-        """As the identification takes it."""
+        """As a log and, unless told otherwise, the identification take it: of its mass alone (paper, case 4)."""
+        return Payload(self.name, self.mounting, {"m": self.mass_kg})
+
+    @property
+    def drawn(self) -> Payload:
+        """With all that its drawing says."""
         return Payload(self.name, self.mounting, {**self.known, "m": self.mass_kg})
 
 
@@ -122,12 +131,13 @@ class Cell:
         name: of the cell.
         urdf: text of the URDF.
         gravity_m_s2: in the base frame.
-        ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n).
+        ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m for a prismatic joint.
         bus, sync: None in a cell that only imports recordings.
         axes: n of them.
         payloads: bodies that can be mounted.
         conditioning: the filters.
         controller: None where nothing is written back.
+        clearance: the room around the arm, None where nothing is said of it.
         folder: of the cell file; None for a cell that was read from a log.
         digest: sha256 of the cell file and all files it refers to, hex.
     """
@@ -142,6 +152,7 @@ class Cell:
     payloads: tuple[WeighedPayload, ...]
     conditioning: Conditioning
     controller: Controller | None
+    clearance: Clearance | None
     folder: Path | None
     digest: str
 

@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from math import hypot
-from xml.etree import ElementTree
 
 import numpy as np
 
+from daq.configuration.axis_checks import axis_faults
+from daq.configuration.bus_load import LARGEST_SHARE, answer_us
 from daq.configuration.cell import Pacing
-from daq.configuration.cell_schema import AxisModel, CellModel
+from daq.configuration.cell_schema import CellModel, PayloadModel
+from daq.configuration.clearance import clearance_faults
+from daq.configuration.drive_train import ratio_of
 from daq.configuration.yaml_file import Document, Fault, describe
 from daq.errors import ConfigurationInconsistent
 from drivers.profile import DriveProfile
 from ident.errors import ModelError
-from ident.robot import JointKind, robot_from_urdf
+from ident.robot import Joint, robot_from_urdf
 
-LARGEST_POSITION_DEG = 720.0
-SMALLEST_RANGE_DEG = 0.2
 SIMULATED_INTERFACES = ("virtual", "socketcand")
 """Buses on which a simulated cell can be; every other one may have a machine on it."""
 LARGEST_CONDITION = 1e8
@@ -37,37 +38,35 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
-    faults = [
-        *_robot_faults(model, urdf),
+    joints, faults = _robot(model, urdf)
+    faults += [
         *_ratio_faults(model),
         *_bus_faults(model),
         *_sync_faults(model, profiles),
-        *_axis_faults(model, urdf),
+        *axis_faults(model, joints, urdf),
         *_list_faults(model),
+        *clearance_faults(model.workspace, model.clearance, [axis.name for axis in model.axes]),
     ]
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
 
 
-def _robot_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
+def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]:
+    """The joints of the URDF, none where it cannot be read, and what is wrong with the robot as a whole."""
+    faults = []
     gravity = hypot(*model.robot.gravity_m_s2)
     if not 9.7 < gravity < 9.9:
-        yield Fault(("robot", "gravity_m_s2"), f"{gravity:.4g} m/s² in all", "9.78 to 9.83 m/s², anywhere on Earth")
+        found = f"{gravity:.4g} m/s² in all"
+        faults.append(Fault(("robot", "gravity_m_s2"), found, "9.78 to 9.83 m/s², anywhere on Earth"))
     try:
-        robot = robot_from_urdf(urdf, model.robot.gravity_m_s2)
+        joints = robot_from_urdf(urdf, model.robot.gravity_m_s2).joints
     except ModelError as error:
-        yield Fault(("robot", "urdf"), str(error), "a URDF of an arm")
-        return
-    if len(robot.joints) != len(model.axes):
-        names = ", ".join(joint.name for joint in robot.joints)
-        yield Fault(("axes",), f"{len(model.axes)} axes", f"one for each moving joint of the URDF ({names})")
-    for index, joint in enumerate(robot.joints[: len(model.axes)]):
-        if joint.kind is not JointKind.REVOLUTE:
-            yield Fault(
-                ("axes", index, "limits"),
-                f"limits in deg, and joint {joint.name} of the URDF is {joint.kind.value}",
-                "a revolute joint",
-            )
+        return (), [*faults, Fault(("robot", "urdf"), str(error), "a URDF of an arm")]
+    if len(joints) != len(model.axes):
+        names = ", ".join(joint.name for joint in joints)
+        expected = f"one for each moving joint of the URDF ({names})"
+        faults.append(Fault(("axes",), f"{len(model.axes)} axes", expected))
+    return joints, faults
 
 
 def _ratio_faults(model: CellModel) -> Iterator[Fault]:
@@ -77,7 +76,7 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
         shape = f"{len(ratio)} rows of {', '.join(map(str, sorted({len(row) for row in ratio})))} numbers"
         yield Fault(path, shape, f"{n} × {n}, a row for each motor")
         return
-    condition = float(np.linalg.cond(np.array(ratio, dtype=np.float64)))
+    condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
         yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
 
@@ -113,6 +112,16 @@ def _sync_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iter
             f"timed: lockstep makes the time of the samples up, which is true of a simulated cell "
             f"({' or '.join(SIMULATED_INTERFACES)}) alone",
         )
+    used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None]
+    answers_us = answer_us(used, model.bus.bitrate_bit_s)
+    # In lockstep the next SYNC waits for the answers, however long they take.
+    if model.sync.pacing is Pacing.TIMED and answers_us > LARGEST_SHARE * model.sync.period_us:
+        yield Fault(
+            ("sync", "period_us"),
+            f"{model.sync.period_us}, while SYNC and the answers of {len(used)} axes can take {answers_us:.0f} µs "
+            f"at {model.bus.bitrate_bit_s} bit/s",
+            f"{answers_us / LARGEST_SHARE:.0f} or more, or a faster bus",
+        )
     for drive in model.drives:
         refresh_us = profiles[drive].update_period_us
         if refresh_us > model.sync.period_us:
@@ -123,67 +132,37 @@ def _sync_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iter
             )
 
 
-def _axis_faults(model: CellModel, urdf: str) -> Iterator[Fault]:
-    radian_limits = _urdf_limits(urdf)
-    for index, axis in enumerate(model.axes):
-        gain_key = "nameplate_gain" if axis.nameplate_gain_nm_per_a is None else "nameplate_gain_nm_per_a"
-        if not (axis.nameplate_gain or axis.nameplate_gain_nm_per_a):
-            yield Fault(("axes", index, gain_key), "0", "the manufacturer's gain, signed, not zero")
-        in_radians = radian_limits[index] if index < len(radian_limits) else None
-        yield from _limit_faults(("axes", index, "limits", "position_deg"), axis, in_radians)
-        if abs(axis.zero_offset_deg) > LARGEST_POSITION_DEG:
-            yield Fault(("axes", index, "zero_offset_deg"), f"{axis.zero_offset_deg:g}", "at most ±720 deg")
-
-
-def _limit_faults(
-    path: tuple[str | int, ...], axis: AxisModel, in_radians: tuple[float, float] | None
-) -> Iterator[Fault]:
-    lower, upper = axis.limits.position_deg
-    found = f"[{lower:g}, {upper:g}] deg"
-    if lower >= upper:
-        yield Fault(path, found, "the lower limit first")
-    elif max(abs(lower), abs(upper)) > LARGEST_POSITION_DEG:
-        yield Fault(path, found, f"at most ±{LARGEST_POSITION_DEG:g} deg; are these counts or motor degrees?")
-    elif upper - lower < SMALLEST_RANGE_DEG:
-        yield Fault(path, found, f"a range of at least {SMALLEST_RANGE_DEG:g} deg; are these revolutions?")
-    elif in_radians is not None and in_radians[0] < in_radians[1]:
-        tolerance = 0.1 * (in_radians[1] - in_radians[0])
-        if abs(lower - in_radians[0]) < tolerance and abs(upper - in_radians[1]) < tolerance:
-            yield Fault(path, f"{found}, the numbers of the URDF in rad", "deg; multiply by 57.3")
-
-
-def _urdf_limits(urdf: str) -> list[tuple[float, float] | None]:
-    """Limits of the moving joints as the URDF writes them [rad], in document order; [] when it cannot be read."""
-    try:
-        joints = ElementTree.fromstring(urdf).iter("joint")
-        limits: list[tuple[float, float] | None] = []
-        for joint in joints:
-            if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
-                continue
-            limit = joint.find("limit")
-            if limit is None or joint.get("type") != "revolute":
-                limits.append(None)
-            else:
-                limits.append((float(limit.get("lower", "0")), float(limit.get("upper", "0"))))
-    except (ElementTree.ParseError, ValueError):
-        return []
-    return limits
-
-
 def _list_faults(model: CellModel) -> Iterator[Fault]:
     n = len(model.axes)
     names = Counter(axis.name for axis in model.axes)
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
             yield Fault(("axes", index, "name"), f"{axis.name}, used {names[axis.name]} times", "each name once")
-    if len(model.conditioning.standstill_rad_s) != n:
-        found = f"{len(model.conditioning.standstill_rad_s)} speeds"
-        yield Fault(("conditioning", "standstill_rad_s"), found, f"{n}, one for each axis")
     if model.controller is not None and len(model.controller.gains) != n:
         yield Fault(("controller", "gains"), f"{len(model.controller.gains)} keys", f"{n}, one for each axis")
-    mountings = Counter((payload.name, payload.mounting) for payload in model.payloads)
+    mountings = Counter(payload.mounting for payload in model.payloads)
     for index, payload in enumerate(model.payloads):
         if payload.mass_kg <= 0:
             yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
-        if mountings[payload.name, payload.mounting] > 1:
-            yield Fault(("payloads", index, "name"), f"{payload.name} twice in one mounting", "each mounting once")
+        if mountings[payload.mounting] > 1:
+            yield Fault(
+                ("payloads", index, "mounting"),
+                f"{payload.mounting}, used {mountings[payload.mounting]} times",
+                "each mounting a name of its own: it stands for one body in one place",
+            )
+        yield from _inertia_faults(payload, index)
+
+
+def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
+    """No body has an inertia with a moment below zero, or above the sum of the other two."""
+    if payload.inertia_kg_m2 is None:
+        return
+    xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
+    least, middle, largest = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    margin = 1e-9 * abs(largest)
+    if least < -margin or largest > least + middle + margin:
+        yield Fault(
+            ("payloads", index, "inertia_kg_m2"),
+            f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
+            "those of a body about its centre of mass: none below 0, none above the sum of the other two",
+        )

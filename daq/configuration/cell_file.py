@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from math import radians
 from pathlib import Path
 
 import numpy as np
@@ -19,14 +18,18 @@ from daq.configuration.cell import (
     WeighedPayload,
 )
 from daq.configuration.cell_checks import check
-from daq.configuration.cell_schema import AxisModel, CellModel, PayloadModel
+from daq.configuration.cell_schema import AxisModel, CellModel, ConditioningModel, PayloadModel
+from daq.configuration.clearance import clearance_of
 from daq.configuration.drive import drive_from_text
+from daq.configuration.drive_train import ratio_of
+from daq.configuration.joint_unit import MILLIMETRE
 from daq.configuration.yaml_file import parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationMissing
 from daq.resources import shipped_configurations
 from drivers.axis import Identity
 from drivers.profile import DriveProfile
 from ident.conditioning import Conditioning
+from ident.link import LINK_PARAMETERS
 
 CELL = "cell.yaml"
 URDF = "robot.urdf"
@@ -81,13 +84,14 @@ def cell_from_bundle(
         name=model.name,
         urdf=urdf,
         gravity_m_s2=model.robot.gravity_m_s2,
-        ratio=np.array(model.drive_train.ratio, dtype=np.float64),
+        ratio=ratio_of(model),
         bus=None if model.bus is None else Bus(**model.bus.model_dump()),
         sync=None if model.sync is None else Sync(**model.sync.model_dump()),
         axes=tuple(_axis(axis, profiles) for axis in model.axes),
         payloads=tuple(_payload(payload) for payload in model.payloads),
-        conditioning=Conditioning(**model.conditioning.model_dump()),
+        conditioning=_conditioning(model.conditioning),
         controller=None if model.controller is None else Controller(**model.controller.model_dump()),
+        clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=folder,
         digest=digest({name: files[name] for name in used}),
     )
@@ -137,8 +141,10 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
 
 
 def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
-    limits = model.limits
-    per_ampere = model.nameplate_gain_nm_per_a
+    limits, unit = model.limits, model.limits.unit
+    # The schema lets exactly one of the three be given, the checks only those of the joint's kind.
+    gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
+    per_newton = model.nameplate_gain_n_per_a is not None
     return Axis(
         name=model.name,
         node_id=model.node_id,
@@ -146,18 +152,45 @@ def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
         profile=None if model.drive is None else profiles[model.drive],
         identity=None if model.identity is None else Identity(**model.identity.model_dump()),
         counts_per_revolution=model.counts_per_revolution,
-        zero_offset_rad=radians(model.zero_offset_deg),
-        # The schema lets exactly one of the two be given.
-        nameplate_gain=(model.nameplate_gain or 0.0) if per_ampere is None else per_ampere,
-        gain_unit=model.gain_unit or "Nm/A",
+        unit=unit,
+        zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),
+        nameplate_gain=next(gain for gain in gains if gain is not None),
+        gain_unit=model.gain_unit or ("N/A" if per_newton else "Nm/A"),
         limits=Limits(
-            position=(radians(limits.position_deg[0]), radians(limits.position_deg[1])),
-            velocity=radians(limits.velocity_deg_s),
-            acceleration=radians(limits.acceleration_deg_s2),
+            position=(unit.si * limits.position[0], unit.si * limits.position[1]),
+            velocity=unit.si * limits.velocity,
+            acceleration=unit.si * limits.acceleration,
         ),
     )
 
 
+def _conditioning(model: ConditioningModel) -> Conditioning:
+    """Each joint's standstill speed stands in the list of its kind, as the checks have made sure."""
+    millimetres = model.standstill_mm_s or (None,) * len(model.standstill_rad_s)
+    radians = model.standstill_rad_s or (None,) * len(millimetres)
+    rest = model.model_dump(exclude={"standstill_rad_s", "standstill_mm_s"})
+    speeds = (
+        MILLIMETRE.si * (along or 0.0) if about is None else about
+        for about, along in zip(radians, millimetres, strict=True)
+    )
+    return Conditioning(**rest, standstill_rad_s=tuple(speeds))
+
+
 def _payload(model: PayloadModel) -> WeighedPayload:
     known = {} if model.known is None else model.known.model_dump(exclude_none=True)
+    if model.centre_m is not None:
+        known = _drawn(model.mass_kg, model.centre_m, model.inertia_kg_m2)
     return WeighedPayload(model.name, model.mounting, model.mass_kg, model.mass_tolerance_kg, known)
+
+
+def _drawn(
+    mass_kg: float, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
+) -> dict[str, float]:
+    """First moments and, where it is given, the inertia moved to the frame's origin (Steiner)."""
+    centre = np.array(centre_m)
+    known = dict(zip(("mx", "my", "mz"), (mass_kg * centre).tolist(), strict=True))
+    if about_centre_kg_m2 is not None:
+        steiner = mass_kg * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        inertia = np.array(about_centre_kg_m2) + steiner[np.triu_indices(3)]
+        known |= dict(zip(LINK_PARAMETERS[:6], inertia.tolist(), strict=True))
+    return known

@@ -7,6 +7,8 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from daq.configuration.cell import Pacing
+from daq.configuration.clearance import ClearanceModel, WorkspaceModel
+from daq.configuration.joint_unit import DEGREE, MILLIMETRE, JointUnit
 from daq.configuration.yaml_file import StrictModel
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
@@ -54,11 +56,46 @@ class IdentityModel(StrictModel):
 
 
 class LimitsModel(StrictModel):
-    """Of a revolute joint, in degrees as people read them."""
+    """Of a joint as people read them: in degrees, or in mm where it is prismatic."""
 
-    position_deg: tuple[float, float]
-    velocity_deg_s: Positive
-    acceleration_deg_s2: Positive
+    position_deg: tuple[float, float] | None = None
+    velocity_deg_s: Positive | None = None
+    acceleration_deg_s2: Positive | None = None
+    position_mm: tuple[float, float] | None = None
+    velocity_mm_s: Positive | None = None
+    acceleration_mm_s2: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> LimitsModel:
+        degrees = (self.position_deg, self.velocity_deg_s, self.acceleration_deg_s2)
+        millimetres = (self.position_mm, self.velocity_mm_s, self.acceleration_mm_s2)
+        if sorted(part.count(None) for part in (degrees, millimetres)) != [0, 3]:
+            raise ValueError(
+                "position_deg, velocity_deg_s and acceleration_deg_s2, or for a prismatic joint position_mm, "
+                "velocity_mm_s and acceleration_mm_s2"
+            )
+        return self
+
+    @property
+    def unit(self) -> JointUnit:
+        """Of the numbers."""
+        return DEGREE if self.position_mm is None else MILLIMETRE
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """Lower and upper end, in the unit."""
+        # The validator has seen to it that one of the two is there.
+        return self.position_mm or self.position_deg or (0.0, 0.0)
+
+    @property
+    def velocity(self) -> float:
+        """Largest speed, in the unit a second."""
+        return self.velocity_mm_s or self.velocity_deg_s or 0.0
+
+    @property
+    def acceleration(self) -> float:
+        """Largest acceleration, in the unit a second squared."""
+        return self.acceleration_mm_s2 or self.acceleration_deg_s2 or 0.0
 
 
 class AxisModel(StrictModel):
@@ -69,22 +106,33 @@ class AxisModel(StrictModel):
     drive: Name | None = None
     identity: IdentityModel | None = None
     counts_per_revolution: Annotated[int, Field(gt=0, le=2**31)] | None = None
-    zero_offset_deg: float = 0.0
+    zero_offset_deg: float | None = None
+    zero_offset_mm: float | None = None
+    lead_mm: float | None = None
     nameplate_gain_nm_per_a: float | None = None
+    nameplate_gain_n_per_a: float | None = None
     nameplate_gain: float | None = None
     gain_unit: Annotated[str, Field(min_length=1, max_length=60)] | None = None
     limits: LimitsModel
 
     @model_validator(mode="after")
+    def _moving(self) -> AxisModel:
+        if self.lead_mm == 0.0:
+            raise ValueError("a lead_mm that is not zero: the way for a turn, negative for a left-handed screw")
+        return self
+
+    @model_validator(mode="after")
     def _one_gain(self) -> AxisModel:
-        other = self.nameplate_gain is not None
-        if other == (self.nameplate_gain_nm_per_a is not None) or other != (self.gain_unit is not None):
-            raise ValueError("nameplate_gain_nm_per_a, or nameplate_gain together with gain_unit")
+        gains = (self.nameplate_gain_nm_per_a, self.nameplate_gain_n_per_a, self.nameplate_gain)
+        if gains.count(None) != 2 or (self.nameplate_gain is None) != (self.gain_unit is None):
+            raise ValueError(
+                "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain together with gain_unit"
+            )
         return self
 
 
 class KnownModel(StrictModel):
-    """Inertial parameters of a payload beyond its mass, about the last joint's frame (paper eq. 5)."""
+    """Single inertial parameters of a payload beside its mass, about the last joint's frame (paper eq. 5)."""
 
     Ixx: float | None = None
     Ixy: float | None = None
@@ -98,13 +146,27 @@ class KnownModel(StrictModel):
 
 
 class PayloadModel(StrictModel):
-    """A weighed body."""
+    """A weighed body, and what its drawing says of it.
+
+    The centre of mass is in the last joint's frame; the inertia xx, xy, xz, yy, yz, zz is about the centre of mass, in
+    the directions of that frame, as a URDF has it (xy = −∫xy dm).
+    """
 
     name: Name
     mounting: Name
     mass_kg: float
     mass_tolerance_kg: Annotated[float, Field(ge=0)] = 0.0
+    centre_m: tuple[float, float, float] | None = None
+    inertia_kg_m2: tuple[float, float, float, float, float, float] | None = None
     known: KnownModel | None = None
+
+    @model_validator(mode="after")
+    def _one_spelling(self) -> PayloadModel:
+        if self.inertia_kg_m2 is not None and self.centre_m is None:
+            raise ValueError("centre_m beside inertia_kg_m2: the inertia is about the centre of mass")
+        if self.centre_m is not None and self.known is not None:
+            raise ValueError("centre_m and inertia_kg_m2, or single parameters under `known`, not both")
+        return self
 
 
 class ConditioningModel(StrictModel):
@@ -113,7 +175,8 @@ class ConditioningModel(StrictModel):
     position_cutoff_hz: Positive = 40.0
     position_order: Annotated[int, Field(ge=1, le=10)] = 4
     decimation_cutoff_hz: Positive = 20.0
-    standstill_rad_s: tuple[Annotated[float, Field(ge=0)], ...]
+    standstill_rad_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
+    standstill_mm_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
     standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
 
 
@@ -136,6 +199,8 @@ class CellModel(StrictModel):
     payloads: tuple[PayloadModel, ...] = ()
     conditioning: ConditioningModel
     controller: ControllerModel | None = None
+    workspace: WorkspaceModel | None = None
+    clearance: ClearanceModel | None = None
 
     @property
     def drives(self) -> tuple[str, ...]:

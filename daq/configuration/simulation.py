@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from math import radians
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
+from daq.configuration.joint_unit import DEGREE, MILLIMETRE
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.resources import shipped_configurations
@@ -21,7 +21,7 @@ U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
 class AxisSpecModel(StrictModel):
-    """The fields of drivers.simulated.spec.AxisSpec."""
+    """The fields of drivers.simulated.spec.AxisSpec; of a prismatic joint N for Nm, m for rad and kg for kg m²."""
 
     node_id: Annotated[int, Field(ge=1, le=127)]
     vendor_id: U32
@@ -67,7 +67,8 @@ class SimulationModel(StrictModel):
     sync_period_us: Annotated[int, Field(ge=250, le=1_000_000)]
     substeps: Annotated[int, Field(ge=1, le=100)]
     seed: Annotated[int, Field(ge=0)]
-    start_deg: tuple[float, ...]
+    start_deg: tuple[float | None, ...] = ()
+    start_mm: tuple[float | None, ...] = ()
     axes: Annotated[tuple[AxisSpecModel, ...], Field(min_length=1, max_length=32)]
     payloads: dict[str, BodyModel] = Field(default_factory=dict)
     effects: tuple[EffectModel, ...] = ()
@@ -99,7 +100,12 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
         gravity_m_s2=model.gravity_m_s2,
         ratio=np.array(model.ratio, dtype=np.float64),
         axes=tuple(AxisSpec(**axis.model_dump()) for axis in model.axes),
-        start_rad=np.array([radians(angle) for angle in model.start_deg]),
+        start_rad=np.array(
+            [
+                MILLIMETRE.si * (millimetres or 0.0) if degrees is None else DEGREE.si * degrees
+                for degrees, millimetres in _starts(model)
+            ]
+        ),
         payload=None if payload is None else Body(**model.payloads[payload].model_dump()),
         effects=tuple(UndeclaredEffect(e.name, axis_index(e.axis), dict(e.parameters)) for e in model.effects),
         sync_period_us=model.sync_period_us,
@@ -119,13 +125,27 @@ def axis_index(axis: str | int) -> int:
     return number - 1
 
 
+def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
+    """Of each joint: degrees and millimetres, one of them None."""
+    n = len(model.axes)
+    return list(zip(model.start_deg or (None,) * n, model.start_mm or (None,) * n, strict=True))
+
+
 def _check(document: Document, model: SimulationModel) -> None:
     n = len(model.axes)
     faults = []
     if len(model.ratio) != n or any(len(row) != n for row in model.ratio):
         faults.append(Fault(("ratio",), f"{len(model.ratio)} rows", f"{n} × {n}, a row for each motor"))
-    if len(model.start_deg) != n:
+    if len(model.start_deg) != n and (model.start_deg or not model.start_mm):
         faults.append(Fault(("start_deg",), f"{len(model.start_deg)} angles", f"{n}, one for each joint"))
+    elif len(model.start_mm) not in (0, n):
+        faults.append(Fault(("start_mm",), f"{len(model.start_mm)} positions", f"{n}, one for each joint"))
+    else:
+        faults += [
+            Fault(("start_mm" if model.start_mm else "start_deg",), f"joint {joint}: {found}", "deg, or mm, and null")
+            for joint, found in enumerate(_starts(model), start=1)
+            if found.count(None) != 1
+        ]
     if len({axis.node_id for axis in model.axes}) != n:
         faults.append(Fault(("axes",), "a node id used twice", "each node once"))
     faults += [

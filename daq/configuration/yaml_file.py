@@ -19,8 +19,10 @@ MAX_BYTES = 4 * 2**20
 """No configuration is larger; a file that is must be something else."""
 MAX_DEPTH = 40
 """Lists in lists; deeper ones take time and memory beyond their size."""
+MAX_VALUES = 50_000
+"""Keys and values; the largest configuration has a hundredth of that, and a file of 4 MiB could hold two million."""
 MAX_EXPLAINED = 100
-"""Faults for which the nearest known key is looked up; a hostile file has a hundred thousand."""
+"""Faults for which the nearest known key is looked up; a hostile file has tens of thousands."""
 MAX_SHOWN = 8
 """Faults listed in one message."""
 
@@ -96,7 +98,8 @@ def parse_yaml(text: bytes, name: str) -> Document:
         name: what to call it in messages.
 
     Raises:
-        YamlInvalid: it is no single YAML document, or has duplicate keys, aliases, tags, keys that are not text.
+        YamlInvalid: it is no single YAML document, has duplicate keys, aliases, tags, keys that are not text, or is too
+            large, too deep or of too many values.
     """
     if len(text) > MAX_BYTES:
         raise YamlInvalid(
@@ -133,17 +136,19 @@ def parse_yaml(text: bytes, name: str) -> Document:
 
 
 def _refuse_bombs(text: bytes, name: str) -> None:
-    """A few lines of aliases can unfold to gigabytes, and deep nesting takes minutes."""
-    depth = 0
+    """A few lines of aliases can unfold to gigabytes; deep nesting and very many values take minutes."""
+    depth = values = 0
     for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        values += isinstance(event, yaml.NodeEvent)
         alias = isinstance(event, yaml.AliasEvent)
-        if alias or depth > MAX_DEPTH:
+        if alias or depth > MAX_DEPTH or values > MAX_VALUES:
             mark = event.start_mark
+            many = f"more than {MAX_VALUES} values" if values > MAX_VALUES else f"more than {MAX_DEPTH} lists in lists"
             raise YamlInvalid(
                 f"{name}:{mark.line + 1 if mark else '?'}",
-                found="an alias (*name)" if alias else f"more than {MAX_DEPTH} lists in lists",
-                expected="plain values",
+                found="an alias (*name)" if alias else many,
+                expected="plain values" if alias or depth > MAX_DEPTH else "a configuration",
                 remedy="write the value out" if alias else "is this the right file?",
             )
 

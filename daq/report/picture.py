@@ -24,6 +24,9 @@ SKY = "#56B4E9"
 BLACK = "#000000"
 GREY = "#7F7F7F"
 
+QUANTITY = {"Nm": "torque", "N": "force"}
+"""What a joint gives, by its unit: N where it is prismatic."""
+
 DPI = 130
 _PANEL_IN = (5.6, 2.0)
 _TITLE_AND_LEGEND_IN = 1.1

@@ -7,7 +7,19 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from daq.report.picture import BLUE, GREEN, GREY, ORANGE, PURPLE, FloatArray, grid, legend_below, save_png, thinned
+from daq.report.picture import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    QUANTITY,
+    FloatArray,
+    grid,
+    legend_below,
+    save_png,
+    thinned,
+)
 
 _POINTS = 2000
 _BINS = 40
@@ -23,6 +35,7 @@ def plot_residual(
     variable_label: str,
     velocity_rad_s: FloatArray,
     title: str,
+    force: str = "Nm",
 ) -> None:
     """Draw the residual of one axis before and after an effect joined the model.
 
@@ -33,15 +46,18 @@ def plot_residual(
     Args:
         path: of the PNG.
         time_s: shape (k,) [s].
-        before_nm, after_nm: residual torque without and with the effect, shape (k,) [Nm]; NaN where a row was left out.
+        before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN where a row was left
+            out.
         variable: what the effect depends on, shape (k,).
         variable_label: its name and unit.
-        velocity_rad_s: of the axis, shape (k,) [rad/s].
+        velocity_rad_s: of the axis, shape (k,) [rad/s or m/s].
         title: says which axis, which effect and which run it is.
+        force: "Nm", or "N" along a prismatic joint.
 
     Raises:
         OSError: from the file system.
     """
+    title = f"{title}\ngaps: samples left out, most of them at standstill"
     figure, ((before_time, before_scatter), (after_time, after_scatter)) = grid(2, (1.7, 1.0), title, height_in=2.5)
     rows = (
         ("without the effect", before_nm, ORANGE, before_time, before_scatter),
@@ -51,8 +67,8 @@ def plot_residual(
         over_time.plot(*thinned(time_s, residual_nm), color=colour, linewidth=0.8)
         shown = np.isfinite(residual_nm)
         rms_nm = float(np.sqrt(np.mean(residual_nm[shown] ** 2))) if shown.any() else float("nan")
-        over_time.set_title(f"{name}: RMS {rms_nm:.3g} Nm", fontsize=9, loc="left")
-        over_time.set_ylabel("residual torque [Nm]", fontsize=8)
+        over_time.set_title(f"{name}: RMS {rms_nm:.3g} {force}", fontsize=9, loc="left")
+        over_time.set_ylabel(f"residual {QUANTITY[force]} [{force}]", fontsize=8)
         _draw_scatter(scatter, variable, residual_nm, velocity_rad_s)
     after_time.set_xlabel("time [s]", fontsize=8)
     after_scatter.set_xlabel(variable_label, fontsize=8)

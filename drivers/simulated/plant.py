@@ -23,7 +23,9 @@ BRAKE_FACTOR = 2.0
 
 
 class Plant:
-    """A robot of n joints and n motors that moves under the currents of its motors.
+    """A robot of n joints, revolute or prismatic, and n motors that moves under the currents of its motors.
+
+    Of a prismatic joint all quantities are in N for Nm, m for rad and kg for kg m².
 
     Coordinates are the joints and, behind them, each motor that a flexible drive parts from its joints; torques of
     motors are in joint units (τ_joint = Σ r_i g_i i_i, see drive_train.py). Power-on: at rest, brakes closed.
@@ -114,11 +116,26 @@ class Plant:
             if shut:
                 self._bound[row] += brake_nm
 
+    def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
+        """Positions of each joint that show how its inertia varies, so many a joint.
+
+        Args:
+            start_rad: where the joints are at power-on, shape (n,).
+            count: of a revolute joint these are angles of one revolution from its start, because inertia repeats over
+                it; of a prismatic one, places along its travel.
+        """
+        angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        return tuple(
+            np.linspace(lower[joint], upper[joint], count) if _is_prismatic(self._model, joint) else start + angles
+            for joint, start in enumerate(start_rad)
+        )
+
     def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
         """Inertia that each motor turns while the others stand still, in joint units [kg m²], shape (n,).
 
         Args:
-            position_rad: of the joints, shape (n,).
+            position_rad: of the joints [rad or m], shape (n,).
         """
         to_joint = np.linalg.inv(self._rows)
         links = np.array(pin.crba(self._model, self._data, position_rad))
@@ -191,6 +208,12 @@ class Plant:
             self.motor_rad,
         )
         self.time_s += step_s
+
+
+def _is_prismatic(model: pin.Model, joint: int) -> bool:
+    """Whether a joint, counted from 0, slides: Pinocchio has a kind of joint for every axis it may slide along."""
+    kind = str(model.joints[joint + 1].shortname())
+    return "Prismatic" in kind or kind.startswith("JointModelP")
 
 
 def _check_stiffness(drive: Elasticity | Backlash, motor_inertia_kg_m2: float, step_s: float) -> None:

@@ -29,6 +29,8 @@ class Body:
 class AxisSpec:
     """One motor, its amplifier, and the joint of the same number.
 
+    Of a prismatic joint, everything that is said at the joint is in N for Nm, m for rad and kg for kg m².
+
     Attributes:
         node_id: CANopen node id.
         vendor_id, product_code, revision, serial: object 1018h.
@@ -85,9 +87,9 @@ class CellSpec:
     Attributes:
         urdf: text of the URDF with the true inertial parameters of the links.
         gravity_m_s2: in the base frame, (x, y, z).
-        ratio: drive train R, q_motor = R q_joint (eq. 24), shape (n, n).
+        ratio: drive train R, q_motor = R q_joint (eq. 24), shape (n, n); rad/m for a prismatic joint.
         axes: one for each motor.
-        start_rad: joint positions at power-on [rad], shape (n,); encoder counts are zero at joint position zero.
+        start_rad: joint positions at power-on [rad or m], shape (n,); encoder counts are zero at joint position zero.
         payload: mounted body, or None.
         effects: what the plant does beyond the declared model.
         sync_period_us: one SYNC advances the plant by this much.

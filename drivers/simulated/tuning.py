@@ -24,7 +24,7 @@ VELOCITY_FILTER_S = 0.0008
 """Of the differenced encoder: one count a substep is a coarse velocity."""
 
 POSTURES = 3
-"""Angles tried for each joint; inertia repeats over a revolution."""
+"""Positions tried for each joint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +54,13 @@ def tuned(spec: CellSpec, plant: Plant) -> LoopTuning:
         plant: of that cell, for its inertias.
     """
     counts_per_rad = np.array([axis.counts_per_revolution for axis in spec.axes]) / (2.0 * np.pi)
-    # The first joint's angle changes no inertia; of long chains the joints behind the seventh stay where they are.
-    angles = np.linspace(0.0, 2.0 * np.pi, POSTURES, endpoint=False)
+    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
     swept = range(1, min(len(spec.axes), 7))
+    tried = plant.postures(spec.start_rad, POSTURES)
     inertias = []
-    for posture in itertools.product(angles, repeat=len(swept)):
+    for posture in itertools.product(*(tried[joint] for joint in swept)):
         position = spec.start_rad.copy()
-        position[list(swept)] += posture
+        position[list(swept)] = posture
         inertias.append(plant.motor_inertia_at(position))
     inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
     gain = np.array([axis.gain_nm_per_a for axis in spec.axes])

@@ -12,8 +12,9 @@ import yaml
 
 from daq.cli.app import main
 from daq.configuration.cell_model import model_of
+from daq.conversion import load_run
 from daq.errors import ExitCode, RolesExchanged
-from daq.fit import check_signs, load_runs
+from daq.fit import check_signs
 from ident.identify import identify
 
 
@@ -110,9 +111,9 @@ def test_the_wrong_drive_train_shows_in_the_residual(
 
 
 def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> None:
-    runs, cell = load_runs([demonstration / f"{name}.mcap" for name in ("bare-1", "loaded-1")])
-    payload = runs[1].payload
-    exchanged = (replace(runs[0], payload=payload), replace(runs[1], payload=None))
+    (bare, cell), (loaded, _) = (load_run(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1"))
+    payload = loaded.payload
+    exchanged = (replace(bare, payload=payload), replace(loaded, payload=None))
     estimate = identify(model_of(cell), exchanged, cell.conditioning).estimate
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
     with pytest.raises(RolesExchanged, match="exchanged"):

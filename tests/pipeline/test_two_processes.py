@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -26,24 +27,37 @@ def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[P
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=checkout) as process:
         try:
             assert process.stdout is not None
-            line = process.stdout.readline()
-            found = re.search(r"socketcand:can0@127\.0\.0\.1:(\d+)", line)
-            assert found, line
+            told = list(iter(process.stdout.readline, "\n")) + list(iter(process.stdout.readline, "\n"))
+            # What it prints to paste is pasted.
+            bus = "".join(told[told.index("bus:\n") :])
             text = (configs / "cells" / "demo.yaml").read_text().replace("../robots", str(configs / "robots"))
-            bus = f"interface: socketcand\n  channel: can0\n  port: {found.group(1)}"
             path = folder / "cell.yaml"
-            path.write_text(re.sub(r"interface: virtual.*\n  channel: demo", bus, text))
+            path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL))
             yield path
         finally:
             process.send_signal(signal.SIGINT)
             assert process.wait(timeout=20) == 0
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_simulated_cell_in_the_background_of_a_script_can_be_ended(checkout: Path, number: signal.Signals) -> None:
+    """What a script starts with & ignores SIGINT from its birth on."""
+    command = f"trap '' INT; exec {shlex.quote(sys.executable)} -m daq simulate clean --port 0"
+    with subprocess.Popen(
+        ["sh", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=checkout
+    ) as process:
+        assert process.stdout is not None
+        assert "6 amplifiers" in process.stdout.readline()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (ExitCode.OK, "")
+
+
 def test_scan_finds_six_amplifiers(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scan", str(cell), "--json"]) == ExitCode.OK
     nodes = json.loads(capsys.readouterr().out)["nodes"]
-    assert [(node["node_id"], node["axis"], node["verdict"]) for node in nodes] == [
-        (number, f"J{number}", "ok") for number in range(1, 7)
+    assert [(node["node_id"], node["axis"], node["verdict"], node["enabled"]) for node in nodes] == [
+        (number, f"J{number}", "ok", False) for number in range(1, 7)
     ]
 
 
@@ -89,7 +103,12 @@ def test_an_interrupted_recording_stops_the_axes_and_says_so(
     assert out == ""
     assert "Traceback" not in err
     told = f"interrupted: axes stopped; what was recorded is in {part}, which is not usable for a fit"
-    assert told in err.splitlines()
+    assert [line for line in err.splitlines() if line.startswith(told)]
+    assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion"]) == ExitCode.USAGE
+    told = " ".join(capsys.readouterr().err.split())
+    assert "the rest of a recording" in told
+    assert f"`rm {part}`" in told
+    assert "another --out" in told
     assert sorted(tmp_path.iterdir()) == [part, plan]
     capsys.readouterr()
     assert main(["scan", str(cell), "--json"]) == ExitCode.OK

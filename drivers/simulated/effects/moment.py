@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 class Moment:
     """One substep of n joints and motors, N coordinates and m directions of dry friction.
 
-    Coordinates are the joints first, then the motors behind a flexible drive.
+    Coordinates are the joints first, then the motors behind a flexible drive; of a prismatic joint N for Nm, m for rad.
 
     Attributes:
         time_s: since power-on.

@@ -1,0 +1,250 @@
+"""The tables of the paper, in their form: parameters (1, 3), gains (2, 4) and cross-validation (5 to 8)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from rich import box
+from rich.table import Table
+from rich.text import Text
+
+from daq.cross_validation import CrossValidation, Failure
+from ident.calibration import Calibration, Parameter
+
+NONE = "—"
+
+
+@dataclass(frozen=True, slots=True)
+class PaperTable:
+    """A table of text: a title, a heading for each column, rows, and what must be said with it."""
+
+    title: str
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+    def markdown(self) -> str:
+        """As a section of a Markdown page."""
+        lines = [
+            f"## {self.title}",
+            "",
+            _row(self.headings),
+            _row(["---", *["---:"] * (len(self.headings) - 1)]),
+            *(_row(row) for row in self.rows),
+        ]
+        for note in self.notes:
+            lines += ["", note]
+        return "\n".join(lines) + "\n"
+
+    def on_screen(self) -> Table:
+        """For a terminal."""
+        table = Table(
+            title=Text(self.title), title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+        )
+        for index, heading in enumerate(self.headings):
+            table.add_column(Text(heading), justify="left" if index == 0 else "right")
+        for row in self.rows:
+            table.add_row(*map(Text, row))
+        return table
+
+
+def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
+    """Tables 1 and 3: essential parameters with the payload's drawing and with its mass alone.
+
+    Args:
+        number: of the table in the paper.
+        first, second: with the drawing, and with the mass alone.
+        method: as the paper calls it.
+    """
+    values = [{parameter.name: parameter for parameter in c.parameters} for c in (first, second)]
+    names = _in_order([p.name for p in first.parameters], [p.name for p in second.parameters])
+    rows, differences = [], []
+    for name in names:
+        one, other = values[0].get(name), values[1].get(name)
+        difference = _difference_percent(one, other)
+        if difference is not None and (one or other).std > 0.0:  # type: ignore[union-attr]
+            differences.append(difference)
+        rows.append((_short(name), *_parameter(one), *_parameter(other), percent(difference)))
+    errors = "‖ρ‖/‖Y‖", *(cell for c in (first, second) for cell in (f"{c.relative_error_percent.total:.2f} %", "")), ""
+    return PaperTable(
+        title=f"Table {number}: essential parameters, {method}",
+        headings=("parameter", "10 CAD: value", "%σ", "mass alone: value", "%σ", "%e"),
+        rows=(*rows, errors),
+        notes=(
+            f"%e is the difference from the first value; its mean is {percent(_mean(differences))} %. "
+            f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units.",
+        ),
+    )
+
+
+def gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
+    """Tables 2 and 4: a priori and identified gains, with the payload's drawing and with its mass alone.
+
+    Args:
+        number: of the table in the paper.
+        first, second: with the drawing, and with the mass alone.
+        method: as the paper calls it.
+    """
+    rows = tuple(
+        (
+            one.axis,
+            f"{one.nameplate:.4g}",
+            *(
+                cell
+                for g in (one, other)
+                for cell in (f"{g.value:.4g}", percent(g.std_percent), percent(abs(g.change_percent)))
+            ),
+        )
+        for one, other in zip(first.gains, second.gains, strict=True)
+    )
+    means = [_mean([abs(gain.change_percent) for gain in c.gains]) for c in (first, second)]
+    return PaperTable(
+        title=f"Table {number}: drive gains, {method}",
+        headings=("axis", "a priori", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
+        rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
+        notes=("%e is the change from the a priori gain.",),
+    )
+
+
+def condition_table(found: CrossValidation) -> PaperTable:
+    """Table 5."""
+    return PaperTable(
+        title="Table 5: condition number of each run's observation matrix",
+        headings=("", *(run.run for run in found.runs)),
+        rows=(("cond(W)", *(NONE if run.condition is None else f"{run.condition:.0f}" for run in found.runs)),),
+        notes=("Base parameters of the run, its payload taken as part of the last link; rows of each joint weighted.",),
+    )
+
+
+def error_table(found: CrossValidation) -> PaperTable:
+    """Table 6."""
+    labels, axes = tuple(found.calibrations), found.axes
+    rows = []
+    for run in found.runs:
+        errors = [run.errors.get(label) for label in labels]
+        for index, axis in enumerate(axes):
+            rows.append(
+                (f"{run.run}, {axis}", *(NONE if error is None else percent(error.axes[index]) for error in errors))
+            )
+    means = [
+        _mean([value for run in found.runs if (error := run.errors.get(label)) is not None for value in error.axes])
+        for label in labels
+    ]
+    unmet = [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
+    seen = sorted({run.run for run in found.runs if run.seen_by})
+    notes = [f"Seen by a fit: {', '.join(seen)}."] if seen else []
+    return PaperTable(
+        title="Table 6: relative error norms ‖ρ‖/‖Y‖ [%]",
+        headings=("run, joint", *labels),
+        rows=(*rows, ("mean", *(percent(mean) for mean in means))),
+        notes=tuple(notes + unmet),
+    )
+
+
+def mass_tables(found: CrossValidation) -> tuple[PaperTable, ...]:
+    """Tables 7 and 8: one for each payload."""
+    payloads = dict.fromkeys((run.payload.name, run.payload.mounting) for run in found.weighed)
+    return tuple(
+        _mass_table(found, name, mounting, 7 + index if index < 2 else 8)
+        for index, (name, mounting) in enumerate(payloads)
+    )
+
+
+def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -> PaperTable:
+    runs = [run for run in found.weighed if (run.payload.name, run.payload.mounting) == (name, mounting)]
+    labels = dict.fromkeys(label for run in runs for label in run.masses)
+    rows: list[tuple[str, ...]] = []
+    errors: dict[str, list[float]] = {label: [] for label in labels}
+    notes = []
+    for run in runs:
+        masses = {label: run.masses[label] for label in labels}
+        rows.append(
+            (f"{run.run}, kg", *(NONE if isinstance(m, Failure) else f"{m.mass_kg:.3f}" for m in masses.values()))
+        )
+        rows.append(("%σ", *(NONE if isinstance(m, Failure) else percent(m.std_percent) for m in masses.values())))
+        rows.append(
+            (
+                "%σ with the gains'",
+                *(NONE if isinstance(m, Failure) else percent(m.std_with_gains_percent) for m in masses.values()),
+            )
+        )
+        if run.weighed_kg is not None:
+            rows.append(
+                ("%e", *(NONE if isinstance(m, Failure) else percent(m.error_percent) for m in masses.values()))
+            )
+        for label, mass in masses.items():
+            if isinstance(mass, Failure):
+                notes.append(f"{run.run}, {label}: {mass.reason}")
+            elif mass.error_percent is not None:
+                errors[label].append(mass.error_percent)
+    weighed = runs[0].weighed_kg
+    if weighed is not None:
+        rows.append(("mean %e", *(percent(_mean(errors[label])) for label in labels)))
+    of = f"{weighed:g} kg" if weighed is not None else "not weighed"
+    method = (
+        "Robot and payload together from this run and the runs without load (§2.4)"
+        if found.with_bare_runs
+        else "The payload alone, on the robot of the calibration, whose own deviation is not in %σ"
+    )
+    return PaperTable(
+        title=f"Table {number}: payload mass of {name} ({mounting}), {of}",
+        headings=("run", *labels),
+        rows=tuple(rows),
+        notes=(
+            f"{method}; gains held, all ten parameters of the payload unknown. %σ: from the scatter of the moves; "
+            "below it with the σ of the gains, whose errors go together. A scale is a weak check: axes "
+            "can err against each other.",
+            *dict.fromkeys(notes),
+        ),
+    )
+
+
+def page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
+    """A Markdown page of tables; its first line says what it is, so that only its like is ever overwritten."""
+    return f"<!-- format: {marker} -->\n# {title}\n\n" + "\n".join(table.markdown() for table in tables)
+
+
+def percent(value: float | None) -> str:
+    """Two decimals below ten, one above; a dash for nothing."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.0f}"
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
+
+
+def _short(name: str) -> str:
+    leading, *regrouped = name.split()
+    return f"{leading} R" if regrouped else leading
+
+
+def _parameter(parameter: Parameter | None) -> tuple[str, str]:
+    if parameter is None:
+        return NONE, NONE
+    deviation = percent(100.0 * parameter.std / abs(parameter.value)) if parameter.std and parameter.value else NONE
+    return f"{parameter.value:.3g}", deviation
+
+
+def _difference_percent(one: Parameter | None, other: Parameter | None) -> float | None:
+    if one is None or other is None or one.value == 0.0:
+        return None
+    return 100.0 * abs((one.value - other.value) / one.value)
+
+
+def _in_order(first: list[str], second: list[str]) -> list[str]:
+    """Names of both, each where the lists put it."""
+    order = list(first)
+    for index, name in enumerate(second):
+        if name not in order:
+            before = next((n for n in reversed(second[:index]) if n in order), None)
+            order.insert(0 if before is None else order.index(before) + 1, name)
+    return order
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    usable = [value for value in values if math.isfinite(value)]
+    return sum(usable) / len(usable) if usable else None
