@@ -32,8 +32,11 @@ from drivers.scan import FoundNode
 from drivers.simulated.cell import SimulatedCell
 from ident.calibration import Calibration
 from ident.identify import Identification
+from ident.loop import Evidence
 
 MARK = ".drivegain-demo"
+RETRIES = 2
+"""Of a run that came out invalid."""
 PLANS = ("a", "b", "c")
 RUNS = (
     ("bare-1", None, "a"),
@@ -121,10 +124,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Tellin
     nodes = _scan(settings, cell)
     telling.step("plan exciting moves")
     plans = tuple(_plan(settings, cell, index, telling) for index in range(len(PLANS)))
-    recorded = []
-    for index, (name, payload, plan_name) in enumerate(RUNS):
-        telling.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
-        recorded.append(_record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling))
+    recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, telling) for index in range(len(RUNS)))
     telling.step("identify all gains and parameters")
     fitted = fit(logs[:-1], holdout=logs[-1:])
     telling.step("look for what the model lacks")
@@ -137,7 +137,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Tellin
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
     draw(fitted, calibration, truth, out)
-    return Outcome(cell, nodes, plans, tuple(recorded), fitted, calibration, truth, proposal, written)
+    return Outcome(cell, nodes, plans, recorded, fitted, calibration, truth, proposal, written)
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:
@@ -222,6 +222,22 @@ def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
     return made
 
 
+def _record_valid(
+    settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, telling: Telling
+) -> Recorded:
+    """One run, made again where its recorder does not stand for it; the last attempt is kept as it is, for the fit."""
+    name, payload, plan_name = RUNS[index]
+    telling.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+    for attempt in range(1, RETRIES + 1):
+        recorded = _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+        if recorded.log.valid:
+            return recorded
+        # A busy computer lets the simulated cell answer late, or twice in a period.
+        telling.step(f"record {name} again ({attempt} of at most {RETRIES} times): {recorded.log.reason}")
+        recorded.path.unlink()
+    return _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+
+
 def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, telling: Telling) -> Recorded:
     name, payload, _ = RUNS[index]
     spec = load_simulation(settings.simulation, payload)
@@ -256,11 +272,11 @@ def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) 
     return proposal, None if proposal.refusals else apply(proposal, now)
 
 
-def _total(identification: Identification) -> float | None:
+def _total(identification: Identification | Evidence) -> float | None:
     error = identification.holdout_error
     return None if error is None else error.total
 
 
-def _axes(identification: Identification) -> list[float] | None:
+def _axes(identification: Identification | Evidence) -> list[float] | None:
     error = identification.holdout_error
     return None if error is None else list(error.axes)

@@ -1,43 +1,30 @@
-"""Point-to-point moves that excite every parameter: random moves, then exchange (paper §2.3)."""
+"""A plan: point-to-point moves that show every gain, chosen for the experiment that they are made in (paper §2.3)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
-from daq.configuration.cell_model import model_of
+from daq.configuration.joint_unit import JointUnit
 from daq.errors import PlanUnfit
-from drivers.trapezoid import Trapezoid, synchronised
-from ident.excitation import condition, independent_columns, weighted_columns
-from ident.motion import Motion
+from daq.experiment import Experiment, experiment_of
+from daq.plan_search import Draft, Search
+from daq.planned_move import PlannedMove, duration_of, path_of
+from ident.excitation import condition, weighted_columns
+
+__all__ = ["EXCHANGES", "LARGEST_CONDITION", "LARGEST_STD_PERCENT", "Plan", "path_of", "plan", "slowed", "units_of"]
 
 FloatArray = NDArray[np.float64]
 
 LARGEST_CONDITION = 3500.0
 """Of the weighted observation matrix; the paper's trajectories have 1930 to 2817 (Table 5)."""
-SAMPLE_S = 0.02
-POSITION_MARGIN = 0.03
-"""Share of a joint's range that targets keep from its limits."""
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedMove:
-    """One synchronised point-to-point move.
-
-    Attributes:
-        target_rad: joint positions at its end [rad], shape (n,).
-        velocity, acceleration: share of the joints' limits, above 0 up to 1.
-        dwell_s: rest after it [s].
-    """
-
-    target_rad: tuple[float, ...]
-    velocity: float
-    acceleration: float
-    dwell_s: float
+LARGEST_STD_PERCENT = 25.0
+"""Predicted for the worst gain; a plan above it could as well not be made."""
+EXCHANGES = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,30 +35,26 @@ class Plan:
         cell: name of the cell it was made for.
         seed: it was made from.
         condition: of the weighted observation matrix that these moves give.
+        predicted_std_percent: standard deviation of each gain [% of it] when the moves are made once without load and
+            once with the cell's payload, as predicted from nominal parameters; empty in plans of earlier versions.
         duration_s: from the first target to the end of the last dwell [s]; how long the way to the first target takes
             depends on where the robot stands.
         moves: in order.
+        units: in which people read the targets, one a joint.
     """
 
     cell: str
     seed: int
     condition: float
+    predicted_std_percent: tuple[float, ...]
     duration_s: float
     moves: tuple[PlannedMove, ...]
+    units: tuple[JointUnit, ...]
 
 
-def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
-    """The joint trapezoid of a move from where the robot stands."""
-    velocity = np.array([axis.limits.velocity for axis in cell.axes]) * move.velocity
-    acceleration = np.array([axis.limits.acceleration for axis in cell.axes]) * move.acceleration
-    return synchronised(start_rad, np.array(move.target_rad), velocity, acceleration)
-
-
-def duration_of(cell: Cell, moves: Sequence[PlannedMove]) -> float:
-    """From the first target to the end of the last dwell [s]."""
-    targets = [np.array(move.target_rad) for move in moves]
-    ways = (path_of(cell, here, move).duration_s for here, move in zip(targets, moves[1:], strict=False))
-    return float(sum(ways) + sum(move.dwell_s for move in moves))
+def units_of(cell: Cell) -> tuple[JointUnit, ...]:
+    """Of its joints."""
+    return tuple(axis.unit for axis in cell.axes)
 
 
 def plan(
@@ -79,111 +62,78 @@ def plan(
     *,
     seed: int,
     duration_s: float = 40.0,
-    exchanges: int = 400,
+    exchanges: int = EXCHANGES,
     speed: float = 1.0,
     largest_condition: float = LARGEST_CONDITION,
-    progress: Callable[[int, float], None] = lambda _done, _condition: None,
+    largest_std_percent: float = LARGEST_STD_PERCENT,
+    experiment: Experiment | None = None,
+    progress: Callable[[int, float], None] = lambda _done, _worst: None,
 ) -> Plan:
-    """Choose moves inside the joint limits until the observation matrix is well conditioned.
+    """Choose moves that let the worst gain be known as well as the time allows.
 
-    Random targets fill the duration; then targets are exchanged one at a time, and an exchange stays when it lowers the
-    condition number without making the run longer.
+    Random moves fill the duration; then they are exchanged, shifted, stretched and sped up one at a time, and what
+    lowers the predicted standard deviation of the worst gain stays. All moves keep position, velocity and acceleration
+    limits, the workspace and clear of the arm itself, on their whole way.
 
     Args:
-        cell: with robot and limits.
+        cell: with robot, limits and a weighed payload.
         seed: the same seed gives the same plan.
         duration_s: of the run [s].
-        exchanges: tries; every one of them is made.
+        exchanges: tries; every one of them is made. With 0 the random moves are the plan.
         speed: share of the limits that the fastest moves may use.
         largest_condition: a plan worse than this is refused.
-        progress: told the number of tries and the condition so far.
+        largest_std_percent: a plan that predicts more than this for a gain is refused.
+        experiment: that the plan is for, None for the one with the cell's first payload.
+        progress: told the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
-        PlanUnfit: no plan of this length reaches the condition.
+        PlanUnfit: no plan of this length shows every gain, or there is no clear way.
+        ConfigurationInconsistent: the cell declares no payload.
     """
-    rng = np.random.default_rng(seed)
-    draft = _Draft(cell, rng, duration_s, speed)
-    pieces = [draft.columns(index) for index in range(len(draft.moves))]
-    independent = list(independent_columns(draft.model, pieces))
-    informations = [piece[:, independent].T @ piece[:, independent] for piece in pieces]
-    best = condition(np.sum(informations, axis=0))
-    for done in range(1, exchanges + 1):
-        index = int(rng.integers(len(draft.moves)))
-        before = draft.moves[index]
-        draft.moves[index] = draft.random_move()
-        if draft.duration() <= duration_s:
-            trial = list(informations)
-            # A target is the end of one move and the start of the next.
-            for touched in range(index, min(index + 2, len(draft.moves))):
-                piece = draft.columns(touched)[:, independent]
-                trial[touched] = piece.T @ piece
-            value = condition(np.sum(trial, axis=0))
-            if value < best:
-                best, informations, before = value, trial, draft.moves[index]
-        draft.moves[index] = before
-        progress(done, best)
-    if best > largest_condition:
+    experiment = experiment or experiment_of(cell)
+    search = Search(experiment, np.random.default_rng(seed), duration_s, speed)
+    draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
+    found = condition_of(experiment, draft)
+    predicted = experiment.design.std_percent(np.sum(experiment.informations(draft.paths), axis=0))
+    worst = int(np.argmax(predicted))
+    subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
+    remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
+    if found > largest_condition:
         raise PlanUnfit(
-            f"plan of {duration_s:g} s for cell {cell.name!r}",
-            found=f"condition {best:.0f} of the weighted observation matrix after {exchanges} exchanges",
+            subject,
+            found=f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges",
             expected=f"at most {largest_condition:.0f}",
-            remedy="allow a longer run, more exchanges, wider joint limits or higher speed",
+            remedy=remedy,
         )
-    return Plan(cell.name, seed, best, draft.duration(), tuple(draft.moves))
-
-
-class _Draft:
-    """Moves that are still being exchanged."""
-
-    def __init__(self, cell: Cell, rng: np.random.Generator, duration_s: float, speed: float) -> None:
-        self.cell = cell
-        self.model = model_of(cell)
-        self._rng = rng
-        self._speed = speed
-        limits = np.array([axis.limits.position for axis in cell.axes])
-        margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
-        self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
-        # Equal noise in every current reference; only its ratio between the joints matters.
-        self._noise_nm = np.abs([axis.nameplate_gain for axis in cell.axes])
-        self._home = 0.5 * (self._low + self._high)
-        self.moves: list[PlannedMove] = []
-        while True:
-            self.moves.append(self.random_move())
-            if self.duration() > duration_s:
-                self.moves.pop()
-                break
-        if len(self.moves) < 5:
-            raise PlanUnfit(
-                f"plan of {duration_s:g} s for cell {cell.name!r}",
-                found=f"room for {len(self.moves)} moves",
-                expected="at least 5, better 30",
-                remedy="allow a longer run",
-            )
-
-    def random_move(self) -> PlannedMove:
-        # Slow and fast moves both: friction is told from inertia by moves of different speed and acceleration.
-        return PlannedMove(
-            target_rad=tuple(float(value) for value in self._rng.uniform(self._low, self._high)),
-            velocity=float(round(self._speed * self._rng.uniform(0.35, 1.0), 3)),
-            acceleration=float(round(self._speed * self._rng.uniform(0.4, 1.0), 3)),
-            dwell_s=0.1,
+    if predicted[worst] > largest_std_percent:
+        raise PlanUnfit(
+            subject,
+            found=f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}",
+            expected=f"at most {largest_std_percent:g} %",
+            remedy=remedy,
         )
+    return Plan(
+        cell=cell.name,
+        seed=seed,
+        condition=found,
+        predicted_std_percent=tuple(predicted.tolist()),
+        duration_s=duration_of(cell, draft.moves),
+        moves=draft.moves,
+        units=units_of(cell),
+    )
 
-    def _start(self, index: int) -> FloatArray:
-        return np.array(self.moves[index - 1].target_rad) if index else self._home
 
-    def columns(self, index: int) -> FloatArray:
-        path = path_of(self.cell, self._start(index), self.moves[index])
-        times = np.arange(0.5 * SAMPLE_S, path.duration_s, SAMPLE_S)
-        position, velocity, acceleration = (part.T for part in path.at(times))
-        return weighted_columns(self.model, Motion(position, velocity, acceleration), self._noise_nm)
-
-    def duration(self) -> float:
-        return duration_of(self.cell, self.moves)
+def condition_of(experiment: Experiment, draft: Draft) -> float:
+    """Condition number of W without load, rows weighted by nameplate gains."""
+    design = experiment.design
+    # Equal noise in every current reference; only its ratio between the joints matters.
+    noise = np.abs(design.expectation.gains)
+    motion = experiment.excitation(draft.paths)[0].motion
+    return condition(weighted_columns(design.expectation.model, motion, noise)[:, list(design.base.independent)])
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
-    """The same ways at a share of their speed, as for a first run; the condition is that of the plan as it was made."""
+    """The same ways at a share of their speed, as for a first run; the predictions are those of the plan as made."""
     moves = tuple(
         replace(move, velocity=move.velocity * override, acceleration=move.acceleration * override**2)
         for move in plan_.moves

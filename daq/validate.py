@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
@@ -14,11 +14,13 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
 from daq.errors import CalibrationUnreadable, LogsDiffer
-from ident.calibration import Calibration
+from ident.calibration import Calibration, Parameter
 from ident.conditioning import Conditioning
 from ident.dataset import differentiate
 from ident.errors import DataUnfit
+from ident.link import LINK_PARAMETERS
 from ident.model import Model
+from ident.payload import Payload
 from ident.prediction import measured_torque, predict_torque
 from ident.relative_error import RelativeError, relative_error
 from ident.rows import row_filter, row_masks
@@ -92,10 +94,10 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
     known: tuple[str, Model] | None = None
     for log in logs:
         run, described = load_run(log, cell)
-        _check_cell(calibration, log, described)
+        check_cell(calibration, log, described)
         if known is None or known[0] != described.digest:
             known = (described.digest, model_of(described))
-        validations.append(_validation(calibration, conditioning, known[1], log, run, described.digest))
+        validations.append(predicted(calibration, conditioning, known[1], log, run, described.digest))
     return tuple(validations)
 
 
@@ -134,7 +136,12 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
     )
 
 
-def _check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
+def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
+    """Refuse a log of another cell.
+
+    Raises:
+        LogsDiffer: it is one.
+    """
     axes = tuple(gain.axis for gain in calibration.gains)
     if (cell.name, cell.axis_names) != (calibration.cell, axes):
         raise LogsDiffer(
@@ -145,9 +152,43 @@ def _check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
         )
 
 
-def _validation(
+def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
+    """Why a calibration says nothing of a run with this payload; empty where it does.
+
+    Args:
+        calibration: whose payload parameters are named by their mounting.
+        payload: as the log has it, None without load.
+    """
+    if payload is None or set(payload.known) == set(LINK_PARAMETERS):
+        return ""
+    if "m" not in payload.known:
+        return f"is not asked to predict payload {payload.name!r}: its log leaves the mass open, it is to be found"
+    if not _of_mounting(calibration, payload):
+        mountings = sorted({p.name.partition(":")[2] for p in calibration.parameters if ":" in p.name})
+        known = ", ".join(map(repr, mountings)) or "none"
+        return (
+            f"cannot predict payload {payload.name!r}: it knows nothing of mounting {payload.mounting!r}, but {known}"
+        )
+    return ""
+
+
+def predicted(
     calibration: Calibration, conditioning: Conditioning, model: Model, log: Path, run: Run, configuration_sha256: str
 ) -> Validation:
+    """One run under one calibration.
+
+    Args:
+        calibration: with gains and parameters.
+        conditioning: `conditioning_of` the calibration.
+        model: of the log's cell.
+        log: where the run was read.
+        run: of that log.
+        configuration_sha256: of the cell that the log carries.
+
+    Raises:
+        IdentificationError: the calibration cannot speak of this run.
+    """
+    run = replace(run, payload=_left_to_the_log(calibration, run))
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model.drive_train, data, conditioning)
@@ -164,6 +205,26 @@ def _validation(
         predicted_nm=filter_(predict_torque(calibration, model, data)),
         use=use,
     )
+
+
+def _left_to_the_log(calibration: Calibration, run: Run) -> Payload | None:
+    """The run's payload without what the calibration itself says of it, given or identified."""
+    if run.payload is None:
+        return None
+    own = _of_mounting(calibration, run.payload)
+    mass, weighed = own.get("m"), run.payload.known.get("m")
+    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+        raise DataUnfit(
+            run.name,
+            f"carries {weighed:g} kg on mounting {run.payload.mounting!r}; the calibration was told {mass.value:g} kg: "
+            "give each way of mounting a name of its own",
+        )
+    return replace(run.payload, known={name: value for name, value in run.payload.known.items() if name not in own})
+
+
+def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:
+    split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
+    return {name: parameter for name, _, mounting, parameter in split if mounting == payload.mounting}
 
 
 def _acquaintance(calibration: Calibration, digest: str) -> Acquaintance:

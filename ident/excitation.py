@@ -1,17 +1,112 @@
-"""How well a motion that has not been made yet would show the parameters (paper §2.3 and Table 5)."""
+"""What an experiment that has not been made yet would tell of the drive gains (paper §2.3; optimal design).
+
+With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i, e_i of standard
+deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its rows, differentiated by the unknowns and
+divided by σ_i, are
+
+    ∂/∂χ = γ_i (T W)_i / σ_i,      ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,      ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
+
+with τ the whole torque that is expected. The information about all unknowns is the sum of JᵀJ over the rows, and the
+covariance of ln g the inverse of its Schur complement: what is left of the gains' columns beside all others.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.base_parameters import base_parameters
+from ident.base_parameters import BaseParameters, base_parameters
+from ident.conditioning import Conditioning
+from ident.dataset import Dataset
+from ident.drive_train import DriveTrain
+from ident.link import LINK_PARAMETERS
 from ident.model import Model
 from ident.motion import Motion
+from ident.rows import row_filter, row_masks
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+UNSEEN = 1e-9
+"""Share of a column that counts as nothing when the others are taken from it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedPayload:
+    """A mounting as it is expected to be.
+
+    Attributes:
+        known: names of LINK_PARAMETERS that are known of it; the others are unknowns of the fit.
+        parameters: all ten, guessed or estimated where they are not known, shape (10,).
+    """
+
+    known: frozenset[str]
+    parameters: FloatArray
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Indices into LINK_PARAMETERS."""
+        return tuple(index for index, name in enumerate(LINK_PARAMETERS) if name not in self.known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """What is believed of a robot: nominal before a fit, estimated after it.
+
+    Attributes:
+        model: the declared model.
+        gains: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,).
+        parameters: of the model's standard columns, shape (c,); an estimate of base parameters goes to the places of
+            its leading columns, with zeros elsewhere.
+        payloads: the mountings.
+        noise_a: standard deviation of one row of each motor in the unit of its current reference, correlation
+            included (``effective_noise``), shape (n,).
+    """
+
+    model: Model
+    gains: FloatArray
+    parameters: FloatArray
+    payloads: tuple[ExpectedPayload, ...]
+    noise_a: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excitation:
+    """Rows that a motion gives, whatever is mounted.
+
+    Attributes:
+        motion: of the n joints at the centres of k rows.
+        use: rows of each motor that count, shape (n, k); standstill does not (see ident/rows.py).
+    """
+
+    motion: Motion
+    use: BoolArray
+
+
+def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
+    """The rows of a recorded run: its motion where they are centred, and which of them the fit uses."""
+    centres = row_filter(data, conditioning).centres(len(data.time_s))
+    motion = Motion(
+        data.position_rad[:, centres], data.velocity_rad_s[:, centres], data.acceleration_rad_s2[:, centres]
+    )
+    return Excitation(motion, row_masks(drive_train, data, conditioning)[1])
+
+
+def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
+    """Standard deviation of independent rows that say as much as these, whose residual is correlated.
+
+    Slow signals suffer most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance that independent
+    rows would give it (first-order autoregression). Faster motion suffers less, so this is on the safe side.
+
+    Args:
+        noise_a: of one row.
+        lag_one: correlation ρ of a row's residual with the next, from 0 up to below 1.
+    """
+    return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
 
 
 def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> FloatArray:
@@ -28,16 +123,146 @@ def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> Floa
     return np.asarray(columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
 
 
-def independent_columns(model: Model, pieces: Sequence[FloatArray]) -> tuple[int, ...]:
-    """Base parameters that these pieces of weighted columns show, as indices of standard columns."""
-    triangle = np.asarray(np.linalg.qr(np.concatenate(pieces), mode="r"))
-    return base_parameters(triangle, tuple(column.name for column in model.columns)).independent
+def visible(model: Model, motion: Motion) -> BaseParameters:
+    """Base parameters that a motion shows."""
+    columns = weighted_columns(model, motion, np.ones(model.robot.joint_count))
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    return base_parameters(triangle, tuple(column.name for column in model.columns))
 
 
-def condition(information: FloatArray) -> float:
-    """Condition number of the weighted observation matrix W from WᵀW; inf when a column is not seen.
+def condition(triangle_or_rows: FloatArray) -> float:
+    """Condition number of the weighted observation matrix W; inf when a column is not seen."""
+    values = np.linalg.svd(triangle_or_rows, compute_uv=False)
+    return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
 
-    The information of a plan is the sum over its moves.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """The unknowns of an experiment, and the information that excitations give about them.
+
+    The order of the unknowns is base parameters, unknown parameters of each mounting, ln of the gains.
+
+    Attributes:
+        expectation: of the robot.
+        base: its base parameters.
     """
-    values = np.linalg.eigvalsh(information)
-    return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
+
+    expectation: Expectation
+    base: BaseParameters
+
+    @property
+    def others(self) -> int:
+        """Number of unknowns that are not gains."""
+        return len(self.base.independent) + sum(len(payload.unknown) for payload in self.expectation.payloads)
+
+    @property
+    def size(self) -> int:
+        """Number of all unknowns."""
+        return self.others + len(self.expectation.gains)
+
+    def whitened(self, excitation: Excitation) -> FloatArray:
+        """γ_i (T W)_i / σ_i of the base columns and the ten of a payload, zero where a row does not count.
+
+        Returns:
+            shape (n, b + 10, k).
+        """
+        return self.whitened_from(excitation, self.expectation.model.regressor(excitation.motion))
+
+    def whitened_from(self, excitation: Excitation, regressor: FloatArray) -> FloatArray:
+        """The same from a regressor that is there already, shape (n, c, k)."""
+        expected = self.expectation
+        flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
+        columns = regressor[:, np.concatenate((self.base.independent, flange)).astype(np.intp)]
+        motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
+        motors *= excitation.use[:, None, :] / (expected.gains * expected.noise_a)[:, None, None]
+        return np.asarray(motors)
+
+    def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
+        """Of one motion that is made several times, once with each of these payloads, shape (p, p)."""
+        return self.information_of(self.whitened(excitation), payloads)
+
+    def information_of(
+        self, whitened: FloatArray, payloads: Sequence[int | None], blind: int | None = None
+    ) -> FloatArray:
+        """The same from ``whitened`` columns.
+
+        Args:
+            whitened: shape (n, b + 10, k).
+            payloads: what is mounted, each time.
+            blind: motor whose own gain column is made without the known part of the payload's torque: what is left is
+                seen by coupling with the other axes alone.
+        """
+        grams = whitened @ whitened.transpose(0, 2, 1)
+        summed = grams.sum(axis=0)
+        out = np.zeros((self.size, self.size))
+        gains = np.arange(self.others, self.size)
+        for payload in payloads:
+            place, source = self._columns(payload)
+            out[np.ix_(place, place)] += summed[np.ix_(source, source)]
+            torque = np.tile(self.expected(payload), (len(grams), 1))
+            if blind is not None and payload is not None:
+                torque[blind] -= self.known(payload)
+            seen = np.einsum("nab,nb->na", grams, torque)
+            out[np.ix_(place, gains)] -= seen[:, source].T
+            out[gains, gains] += np.einsum("na,na->n", seen, torque)
+        out[self.others :, : self.others] = out[: self.others, self.others :].T
+        return out
+
+    def others_of(self, whitened: FloatArray, payload: int | None) -> FloatArray:
+        """Columns of J that are not of gains, by motor, shape (n, k, others)."""
+        place, source = self._columns(payload)
+        out = np.zeros((len(whitened), whitened.shape[2], self.others))
+        out[:, :, place] = whitened[:, source].transpose(0, 2, 1)
+        return out
+
+    def expected(self, payload: int | None) -> FloatArray:
+        """Parameters with which the columns of ``whitened`` give the whole torque, shape (b + 10,)."""
+        base = self.base.grouping @ self.expectation.parameters
+        mounted = np.zeros(10) if payload is None else self.expectation.payloads[payload].parameters
+        return np.concatenate((base, mounted))
+
+    def known(self, payload: int) -> FloatArray:
+        """The part of ``expected`` that is known of a payload, shape (b + 10,)."""
+        mounted = self.expectation.payloads[payload].parameters.copy()
+        mounted[list(self.expectation.payloads[payload].unknown)] = 0.0
+        return np.concatenate((np.zeros(len(self.base.independent)), mounted))
+
+    def _columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
+        """Which unknowns a run has, and the columns of ``whitened`` that they belong to."""
+        base = len(self.base.independent)
+        place, source = list(range(base)), list(range(base))
+        if payload is not None:
+            unknown = self.expectation.payloads[payload].unknown
+            before = sum(len(other.unknown) for other in self.expectation.payloads[:payload])
+            place += range(base + before, base + before + len(unknown))
+            source += [base + index for index in unknown]
+        return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
+
+    def std_percent(self, information: FloatArray) -> FloatArray:
+        """Standard deviation predicted for each gain, shape (n,) [% of it]; inf where nothing is said of it."""
+        scale = np.sqrt(np.diag(information))
+        scale[scale == 0.0] = 1.0
+        scaled = information / np.outer(scale, scale)
+        gains = slice(self.others, self.size)
+        try:
+            factor = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            return self._std_of_singular(scaled) / scale[gains]
+        last = factor[gains, gains]
+        if float(np.diag(factor).min()) < 1e-5:  # so near to singular that rounding decides
+            return self._std_of_singular(scaled) / scale[gains]
+        inverse = np.linalg.inv(last)
+        return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale[gains])
+
+    def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
+        """Of a system in which some unknowns are not seen: theirs drop out, and gains that hang on them are inf."""
+        others, gains = slice(None, self.others), slice(self.others, None)
+        values, vectors = np.linalg.eigh(scaled[others, others])
+        kept = values > UNSEEN * values[-1]
+        onto = vectors[:, kept].T @ scaled[others, gains]
+        rest = scaled[gains, gains] - onto.T @ (onto / values[kept, None])
+        left, directions = np.linalg.eigh(rest)
+        seen = left > UNSEEN
+        variance = (directions[:, seen] ** 2) @ (1.0 / left[seen])
+        variance[(directions[:, ~seen] ** 2).sum(axis=1) > 1e-6] = np.inf
+        return np.asarray(100.0 * np.sqrt(variance))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -158,15 +159,15 @@ def _write(proposal: Proposal) -> Written | None:
 
 
 def _say_outcome(proposal: Proposal, written: Written | None, yes: bool) -> None:
-    console = Console(soft_wrap=True)
+    console = Console(soft_wrap=True, highlight=False, markup=False)
     if proposal.before == proposal.after:
         console.print("Nothing to write: the controller file has these gains already.")
     elif written is not None:
-        console.print(f"Written to {written.file}, backup {written.backup.name}.", highlight=False)
-        console.print(f"To undo: drivegain rollback --to {proposal.file}", highlight=False)
+        console.print(f"Written to {written.file}, backup {written.backup.name}.")
+        console.print(f"To undo: drivegain rollback --to {shlex.quote(str(proposal.file))}")
     elif not yes:
-        console.print("Dry run, nothing was written. To write exactly this, repeat the command with:", highlight=False)
-        console.print(f"  --yes --base {proposal.base_sha256}", highlight=False)
+        console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
+        console.print(f"  --yes --base {proposal.base_sha256}")
 
 
 APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells/demo.yaml --yes")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
@@ -13,12 +14,14 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.calibration_file import as_document, save
+from daq.cases import CaseFit, Known, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.cli.fit_cases import fit_cases, removed
 from daq.cli.output import check_output
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
-from daq.errors import OutputFailed
-from daq.fit import Fit, calibration_of, fit
+from daq.errors import OutputFailed, UsageError
+from daq.fit import Fit, fit
 from daq.report.fit import draw
 from daq.report.gain_table import gain_table
 from ident.calibration import Calibration
@@ -44,6 +47,21 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file 
 PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is made.")]
 CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
+KnownOption = Annotated[
+    Known,
+    typer.Option(help="Of the payload: its weighed mass, or cad: also what the cell file says of centre and inertia."),
+]
+EssentialOption = Annotated[
+    float | None,
+    typer.Option(
+        min=1.5,
+        help="Keep essential parameters alone: the largest relative σ below this many times the least (10 to 30).",
+    ),
+]
+CasesOption = Annotated[
+    Path | None,
+    typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml, a file each."),
+]
 
 
 def fit_verb(
@@ -53,6 +71,9 @@ def fit_verb(
         typer.Option(help="ls, wls and tls of the paper, or ml; by default ml, and wls when the gains are fixed."),
     ] = None,
     gains: GainsOption = Gains.FREE,
+    known: KnownOption = Known.MASS,
+    essential: EssentialOption = None,
+    cases: CasesOption = None,
     holdout: HoldoutOption = None,
     out: OutOption = None,
     pictures: PicturesOption = None,
@@ -60,24 +81,51 @@ def fit_verb(
     json: JsonOption = False,
 ) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
+    if cases is not None:
+        require_cases_alone(method is not None or known is not Known.MASS or gains is not Gains.FREE, out, pictures)
+        described = None if cell is None else load_cell(cell)
+        fit_cases(logs, holdout or (), described, essential, cases, CALIBRATION, datetime.now(UTC), json=json)
+        return
     check_output(out, (*logs, *(holdout or ()), *(() if cell is None else (cell,))), CALIBRATION)
     with status("identifying"):
-        fitted = fit(
-            logs,
-            holdout=holdout or (),
-            method=method,
-            gains_fixed=gains is Gains.FIXED,
-            cell=None if cell is None else load_cell(cell),
-        )
-        calibration = calibration_of(fitted, datetime.now(UTC))
+        described = None if cell is None else load_cell(cell)
+        fixed = gains is Gains.FIXED
+        if known is Known.MASS:
+            fitted = fit(logs, holdout=holdout or (), method=method, gains_fixed=fixed, cell=described)
+            found = CaseFit(fitted, (), None)
+        else:
+            chosen = method or (Method.WLS if fixed else Method.ML)
+            found = fit_case(reduce_logs(logs, holdout or (), described), chosen, known, gains_fixed=fixed)
+        if essential is not None:
+            found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
+        fitted, calibration = found.fitted, calibration_of_case(found, datetime.now(UTC))
     if out is not None:
         save_calibration(calibration, out)
     if pictures is not None:
         save_pictures(fitted, calibration, pictures)
     if json:
-        print_json({**as_document(calibration), **compared(fitted)})
+        print_json({**as_document(calibration), **compared(fitted), "removed": removed(found)})
     else:
-        show(fitted, calibration, Console(soft_wrap=True, highlight=False))
+        console = Console(soft_wrap=True, highlight=False)
+        show(fitted, calibration, console)
+        if found.essential is not None:
+            kept, names = len(found.essential.system.columns), [step.name for step in found.essential.removed]
+            console.print(f"{kept} essential parameters; taken out: {', '.join(names) or 'none'}", markup=False)
+
+
+def require_cases_alone(chosen: bool, out: Path | None, pictures: Path | None) -> None:
+    """--cases chooses by itself, and writes into its own folder.
+
+    Raises:
+        UsageError: something else was chosen beside it.
+    """
+    if chosen or out is not None or pictures is not None:
+        raise UsageError(
+            "--cases",
+            found="--method, --gains, --known, --out or --pictures beside it",
+            expected="none of them: every case has its own, and a file in the folder",
+            remedy="leave them out, or fit one case without --cases",
+        )
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
@@ -126,9 +174,9 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
         console.print(f"For comparison, the paper's total least squares on the same rows: {values}")
     console.print()
     console.print(error_table(fitted, calibration))
-    filter_ = fitted.final.training.conditioning
+    filter_ = fitted.final.conditioning
     console.print(
-        f"{estimate.rows} rows, {len(fitted.final.training.columns)} base parameters and effects, condition "
+        f"{estimate.rows} rows, {len(fitted.final.columns)} base parameters and effects, condition "
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz: a relative error means nothing without them."
     )

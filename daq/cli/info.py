@@ -12,8 +12,12 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.cli.verb import JsonOption, Verb, print_json, printable
+from daq.configuration.cell import Cell
 from daq.configuration.cell_file import cell_from_bundle
-from daq.log.reader import LogReader
+from daq.conversion import scaling
+from daq.errors import LogIncomplete
+from daq.log.metadata import RunStatistics
+from daq.log.reader import LogHead, LogReader
 from drivers.event import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
@@ -24,18 +28,20 @@ def describe_log(path: Path) -> dict[str, Any]:
     """Everything that is known of a log without converting it, in one pass and bounded memory.
 
     Raises:
-        LogUnreadable: the log cannot be read.
+        LogUnreadable: the log cannot be read, or says of itself what its samples deny; a fit refuses it too.
         ConfigurationError: the cell in it is inconsistent.
     """
     reader = LogReader(path)
-    samples, first_ns, last_ns = 0, None, 0
+    samples, first_ns, last_ns, widths = 0, None, 0, set[int]()
     for block in reader:
         samples += len(block.cycle)
+        widths.add(block.position_counts.shape[1])
         first_ns = int(block.time_ns[0]) if first_ns is None else first_ns
         last_ns = int(block.time_ns[-1])
     head, statistics = reader.head, reader.statistics
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
     run = head.run
+    _check_counts(path, cell, head, statistics, samples, widths)
     return {
         "log": str(path),
         "sha256": reader.digest,
@@ -53,7 +59,7 @@ def describe_log(path: Path) -> dict[str, Any]:
         "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
         "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
         "lost_cycles": statistics.lost_cycles,
-        "missing": dict(zip(cell.axis_names, statistics.missing, strict=False)),
+        "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
         "valid": statistics.valid,
         "reason": statistics.reason,
         "events": [
@@ -65,9 +71,29 @@ def describe_log(path: Path) -> dict[str, Any]:
         "software": run.software,
         "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
         "origin": run.origin,
-        "complete": samples == statistics.samples,
         "attachments": {name: len(data) for name, data in sorted(head.files.items())},
     }
+
+
+def _check_counts(
+    path: Path, cell: Cell, head: LogHead, statistics: RunStatistics, samples: int, widths: set[int]
+) -> None:
+    """What `daq.log.reader.read_log` and `daq.conversion.scaling` ask of a log, without holding it in memory."""
+    scaling(cell, head.readback)
+    axes = len(cell.axes)
+    pairs = (
+        (f"{samples} samples", samples == statistics.samples, f"{statistics.samples}, as its recorder counted"),
+        (f"samples of {sorted(widths)} axes", widths <= {axes}, f"{axes}, as in its cell configuration"),
+        (f"losses of {len(statistics.missing)} axes", len(statistics.missing) == axes, f"{axes}"),
+    )
+    for found, agrees, expected in pairs:
+        if not agrees:
+            raise LogIncomplete(
+                str(path),
+                found=found,
+                expected=expected,
+                remedy="another tool may have cut or changed the log; take the original",
+            )
 
 
 def info(

@@ -24,6 +24,39 @@ TEMPLATES = (
 """Shipped files, and what they are called in the new folder."""
 
 
+HEADS = {
+    "cells": """\
+# The cell {name}. Its numbers are those of the arm that `drivegain demo` moves: replace every one of them.
+""",
+    "controllers": """\
+# Joint drive gains of {name}: put your controller's own file in the place of this one. drivegain changes the numbers
+# that `controller.gains` in the cell file names, and keeps comments, order and spacing.
+""",
+    "imports": """\
+# How CSV files that another controller has recorded become a log; not needed where drivegain records.
+#   drivegain import imports/{name}.yaml --data FOLDER --out run.mcap
+""",
+}
+"""Comment at the head of a new file, by the folder of its template, instead of what the template says of itself."""
+AXES = """\
+axes:
+  # One entry for each motor, from the base to the tool, in the order of the joints in the URDF.
+  #   name                     what people call the axis; messages, tables and logs use it
+  #   node_id                  CANopen node id of its amplifier, 1 to 127
+  #   drive                    drive profile: the name of a file in ../drives/
+  #   identity                 object 1018h as `drivegain scan` shows it, so that no wrong amplifier is ever moved;
+  #                            leave the line out to accept any
+  #   counts_per_revolution    of the motor's encoder, as object 6064h counts
+  #   zero_offset_deg          joint angle of the URDF where the motor's counts are zero
+  #   nameplate_gain_nm_per_a  the manufacturer's gain: Nm at the joint per A of the current reference; negative where
+  #                            the current counts against the joint
+  #   limits                   what a plan may use of the joint, well inside of its mechanical stops
+  # A prismatic axis has lead_mm (its way for a turn), zero_offset_mm, nameplate_gain_n_per_a, and limits position_mm,
+  # velocity_mm_s and acceleration_mm_s2; its standstill speed stands in standstill_mm_s.
+"""
+"""What stands over the axes of a new cell."""
+
+
 def make_folder(folder: Path) -> tuple[Path, ...]:
     """Copy the templates into a new folder; all of them or none.
 
@@ -71,10 +104,12 @@ def _copy(source: str, folder: Path, target: str, name: str) -> Path:
     if path.suffix == ".yaml":
         text = path.read_text(encoding="utf-8")
         text = re.sub(r"^(name|controller): (demo|tx40)$", rf"\1: {name}", text, flags=re.MULTILINE)
+        text = re.sub(r"\A(#.*\n)+", HEADS.get(Path(source).parent.name, r"\g<0>").format(name=name), text)
+        text = text.replace("axes:\n", AXES)
         text = text.replace("../controllers/demo.yaml", f"../controllers/{name}.yaml")
         text = text.replace("../cells/tx40.yaml", f"../cells/{name}.yaml")
-        text = text.replace("interface: virtual ", "interface: socketcan ").replace("channel: demo", "channel: can0")
-        text = text.replace("pacing: lockstep ", "pacing: timed ").replace("unit: Nm(motor, a priori)", "unit: A")
+        text = text.replace("interface: virtual  ", "interface: socketcan").replace("channel: demo", "channel: can0")
+        text = text.replace("pacing: lockstep", "pacing: timed   ").replace("unit: Nm(motor, a priori)", "unit: A")
         path.write_text(text, encoding="utf-8")
     return path
 

@@ -15,15 +15,20 @@ GRACE_S = 10.0
 
 
 @contextmanager
-def interruptible(clock: Callable[[], float] = time.monotonic) -> Iterator[None]:
-    """Turn SIGINT, SIGTERM and SIGHUP within the block into KeyboardInterrupt; pass over those that follow too soon.
+def interruptible(
+    clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
+) -> Iterator[None]:
+    """Turn some signals within the block into KeyboardInterrupt; pass over those that follow too soon.
 
-    By default the latter two end a process at once, and the axes would go on. What follows the first signal is the stop
-    of the axes: a second one, of an impatient person, must not cut that short. Later ones count again, so that nobody
-    is left without a way out. In another thread than the main one nothing changes: Python handles no signals there.
+    By default SIGTERM and SIGHUP end a process at once, and the axes would go on; a shell script starts what it puts
+    into the background (&) deaf to SIGINT, and only a handler of its own makes it hear again. What follows the first
+    signal is the stop of the axes: a second one, of an impatient person, must not cut that short. Later ones count
+    again, so that nobody is left without a way out. In another thread than the main one nothing changes: Python handles
+    no signals there.
 
     Args:
         clock: monotonic time [s].
+        signals: those that interrupt.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -37,7 +42,7 @@ def interruptible(clock: Callable[[], float] = time.monotonic) -> Iterator[None]
             deaf_until_s = clock() + GRACE_S
             raise KeyboardInterrupt
 
-    before = [(number, signal.signal(number, interrupt)) for number in SIGNALS]
+    before = [(number, signal.signal(number, interrupt)) for number in signals]
     try:
         yield
     finally:

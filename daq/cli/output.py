@@ -1,10 +1,13 @@
-"""Where a verb may write: never over what it was given, nor over a file of another kind."""
+"""Where a verb may write: never over what it was given, nor over a file of another kind; and what it says of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
 
+from rich.console import Console
+
+from daq.cli.verb import printable
 from daq.errors import OutputExists
 
 _LOOK_BYTES = 4096
@@ -34,6 +37,19 @@ def check_output(out: Path | None, inputs: Iterable[Path], format_: str) -> None
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )
+
+
+def say_written(console: Console, *paths: Path | None) -> None:
+    """Tell what was written, a line each, as the last thing that a verb says.
+
+    Args:
+        console: for a person.
+        paths: files and folders; None for what nobody asked for.
+    """
+    for path in paths:
+        if path is not None:
+            name = f"{path}/" if path.is_dir() else str(path)
+            console.print(f"Written: {printable(name)}", markup=False, highlight=False)
 
 
 def _head(path: Path) -> bytes:

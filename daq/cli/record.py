@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import shlex
 import uuid
 from pathlib import Path
 from typing import Annotated
@@ -12,12 +13,13 @@ import typer
 from daq.cli.interrupt import interruptible
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell import Cell
+from daq.configuration.cell import Cell, Pacing
 from daq.configuration.cell_file import load_cell
-from daq.errors import ExitCode, UsageError
+from daq.errors import ExitCode, OutputExists, UsageError
 from daq.plan import slowed
 from daq.plan_file import load_plan
 from daq.record import record
+from drivers.errors import DriverError, SampleLost
 from ident.payload import Payload
 
 
@@ -37,8 +39,7 @@ def record_verb(
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or getpass.getuser()
-    part = out.with_name(out.name + ".part")
-    earlier = {path for path in (out, part) if path.exists()}
+    part = _free(out)
     try:
         with interruptible(), progress_bar("recording") as told:
             done = record(
@@ -53,9 +54,18 @@ def record_verb(
                 progress=lambda count, total: told(count, total, "moves"),
             )
     except KeyboardInterrupt as interrupt:
-        made = next((path for path in (out, part) if path not in earlier and path.exists()), None)
+        made = next((path for path in (out, part) if path.exists()), None)
         typer.echo(_interrupted(interrupt, made, out), err=True)
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+    except DriverError as error:
+        if part.exists():
+            error.add_note(f"kept: what was recorded until then is in {part}, which no fit reads; {_way_on(part)}")
+        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
+            error.add_note(
+                "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
+                "lockstep` in the cell file; with a real cell look at the load on bus and computer"
+            )
+        raise
     log = done.log
     if json:
         print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
@@ -63,6 +73,33 @@ def record_verb(
     else:
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
+
+
+def _free(out: Path) -> Path:
+    """Where the log grows until it is finished, before anything is asked of the bus.
+
+    Raises:
+        OutputExists: the log, or the rest of a recording of that name, is there already.
+    """
+    part = out.with_name(out.name + ".part")
+    if out.exists():
+        raise OutputExists(
+            str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
+        )
+    if part.exists():
+        raise OutputExists(
+            str(part),
+            found="the rest of a recording of that name that failed, was interrupted, or still runs",
+            expected="none",
+            remedy=f"no fit reads it; {_way_on(part)}",
+        )
+    return part
+
+
+def _way_on(part: Path) -> str:
+    aside = part.with_name(part.name + ".kept")
+    one, other = shlex.quote(str(part)), shlex.quote(str(aside))
+    return f"to record under this name, remove it (`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
 
 
 def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:
@@ -74,7 +111,7 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
         return f"interrupted: {axes}; nothing was recorded"
     if made == out:
         return f"interrupted: {axes}; all moves had been made, and {out} is complete"
-    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit"
+    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit; {_way_on(made)}"
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:

@@ -24,7 +24,7 @@ from daq.cli.fit import (
     save_calibration,
     save_pictures,
 )
-from daq.cli.output import check_output
+from daq.cli.output import check_output, say_written
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
@@ -69,7 +69,9 @@ def residual_verb(
     if json:
         print_json({**as_document(calibration), **report(closed)})
     else:
-        show(closed, calibration, Console(soft_wrap=True, highlight=False))
+        console = Console(soft_wrap=True, highlight=False)
+        show(closed, calibration, console)
+        say_written(console, out, pictures)
 
 
 def report(fitted: Fit) -> dict[str, Any]:

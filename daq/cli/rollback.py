@@ -13,41 +13,44 @@ from rich.syntax import Syntax
 
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.errors import OutputFailed
-from daq.write_back.controller_write import Written, roll_back
+from daq.write_back.controller_write import Restored, roll_back
 
 
 def rollback(
-    to: Annotated[Path, typer.Option(help="Controller file to restore from its newest backup.")],
+    to: Annotated[Path, typer.Option("--to", help="Controller file to restore from its newest backup.")],
     json: JsonOption = False,
 ) -> None:
-    """Restore the newest backup of a controller file; what it replaces is backed up too, so a second one undoes it."""
+    """Take the last write to a controller file back; what that replaces is backed up too, so a second one undoes it.
+
+    A file that somebody has edited since, and a backup that somebody has changed, are refused.
+    """
     try:
-        written = roll_back(to, datetime.now(UTC))
+        done = roll_back(to, datetime.now(UTC))
     except OSError as error:
         raise OutputFailed.of(to, error) from error
-    diff = _diff(written)
+    diff = _diff(done)
     if json:
         print_json(
             {
-                "file": str(written.file),
-                "restored": str(written.restored),
-                "backup": str(written.backup),
+                "file": str(done.file),
+                "restored": str(done.source),
+                "backup": None if done.backup is None else str(done.backup),
                 "diff": diff,
             }
         )
         return
     console = Console(soft_wrap=True, highlight=False)
     console.print(Syntax(diff, "diff", background_color="default", word_wrap=True))
-    name = written.restored.name if written.restored else ""
-    console.print(f"Restored {name} to {written.file}; what stood there is now {written.backup.name}.")
+    stood = "the file was gone" if done.backup is None else f"what stood there is now {done.backup.name}"
+    console.print(f"Restored {done.source.name} to {done.file}; {stood}.", markup=False)
 
 
-def _diff(written: Written) -> str:
+def _diff(done: Restored) -> str:
     lines = difflib.unified_diff(
-        written.before.decode(errors="replace").splitlines(),
-        written.after.decode(errors="replace").splitlines(),
-        f"{written.file.name} (was)",
-        f"{written.file.name} (restored)",
+        done.before.decode(errors="replace").splitlines(),
+        done.after.decode(errors="replace").splitlines(),
+        f"{done.file.name} (was)",
+        f"{done.file.name} (restored)",
         lineterm="",
         n=1,
     )

@@ -14,11 +14,16 @@ from rich.text import Text
 
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address, drive_axes
 from daq.configuration.cell_file import load_cell
-from daq.record import network_of
 from drivers.errors import NodeMissing
 from drivers.link import nmt_name
+from drivers.network import CanopenNetwork
 from drivers.scan import FoundNode
+from drivers.state import State
+
+ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+"""States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
 
 
 def scan_verb(
@@ -28,7 +33,7 @@ def scan_verb(
 ) -> None:
     """List the nodes on the cell's bus with identity, name and state, beside what the cell configuration expects."""
     declared = load_cell(cell)
-    with network_of(declared) as network:
+    with CanopenNetwork(bus_address(declared), drive_axes(declared)) as network:
         found = network.scan(wait_s=wait)
     rows = scan_rows(declared, found)
     if json:
@@ -36,6 +41,10 @@ def scan_verb(
     else:
         console = Console(soft_wrap=True)
         console.print(scan_table(rows, console.width))
+        for row in rows:
+            if row["enabled"]:
+                name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
+                console.print(Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red"))
     missing = tuple(row["node_id"] for row in rows if row["verdict"] == "missing")
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for node in found), wait)
@@ -66,19 +75,21 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...]) -> list[dict[str, Any]]:
                 "device_name": None if node is None else node.device_name,
                 "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),
                 "state": None if node is None or node.state is None else str(node.state),
+                "enabled": None if node is None or node.state is None else node.state in ENABLED,
                 "verdict": verdict,
             }
         )
     return rows
 
 
-_GAP = 2
+_GAP = 3
 _DISPENSABLE = ("nmt", "vendor", "product", "serial", "state")
 """Left out one after the other where a terminal is too narrow; `--json` has them all."""
+_POWER = {True: "ENABLED", False: "off", None: "?"}
 
 
 def scan_table(rows: list[dict[str, Any]], width: int = 80) -> Table:
-    """The rows for a person, in at most so many columns; node, axis and verdict are always whole."""
+    """The rows for a person, in at most so many columns; node, axis, power and verdict are always whole."""
     columns = {
         "node": [str(row["node_id"]) for row in rows],
         "axis": [printable(row["axis"] or "") for row in rows],
@@ -87,6 +98,7 @@ def scan_table(rows: list[dict[str, Any]], width: int = 80) -> Table:
         "serial": ["" if row["serial"] is None else str(row["serial"]) for row in rows],
         "nmt": [(row["nmt"] or "").lower() for row in rows],
         "state": [(row["state"] or "").lower() for row in rows],
+        "power": [_POWER[row["enabled"]] for row in rows],
         "verdict": [row["verdict"] for row in rows],
     }
     wide = {heading: max(map(cell_len, (heading, *texts))) for heading, texts in columns.items()}
@@ -98,7 +110,7 @@ def scan_table(rows: list[dict[str, Any]], width: int = 80) -> Table:
     for heading, least in wide.items():
         table.add_column(heading.upper() if heading == "nmt" else heading, no_wrap=True, min_width=least)
     for row, texts in zip(rows, zip(*columns.values(), strict=True), strict=True):
-        style = None if row["verdict"] == "ok" else "bold red"
+        style = "bold red" if row["enabled"] or row["verdict"] != "ok" else None
         table.add_row(*map(Text, texts), style=style)
     return table
 

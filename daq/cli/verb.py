@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 import sys
@@ -27,6 +28,29 @@ class Verb:
     name: str
     function: Callable[..., None]
     example: str
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A verb as the list of verbs has it, before it is imported.
+
+    Attributes:
+        name: as technicians say it.
+        place: of its `Verb`, as an entry point is written: module, colon, name.
+        summary: one line for the list.
+    """
+
+    name: str
+    place: str
+    summary: str
+
+    def load(self) -> Verb:
+        """Import it."""
+        module, _, name = self.place.partition(":")
+        verb = getattr(importlib.import_module(module), name)
+        if not isinstance(verb, Verb):
+            raise TypeError(f"{self.place} is no Verb")
+        return verb
 
 
 def json_text(document: Any) -> str:

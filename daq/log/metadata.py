@@ -12,6 +12,8 @@ from ident.link import LINK_PARAMETERS
 from ident.payload import Payload
 
 RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
+LARGEST_COUNT = 2**64
+"""Of cycles: their numbers are uint64 in the log."""
 VERSION = "1"
 """Of the log's contract; a reader refuses a higher one."""
 
@@ -105,8 +107,8 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         known = json.loads(record["payload_known"])
         if not isinstance(known, dict) or not known.keys() <= set(LINK_PARAMETERS):
             raise ValueError(f"known payload parameters {record['payload_known']!r}")
-        numbers = {key: float(value) for key, value in known.items() if not isinstance(value, list | dict)}
-        if len(numbers) < len(known) or not all(map(math.isfinite, numbers.values())) or numbers.get("m", 1.0) <= 0.0:
+        numbers = {key: _number(value) for key, value in known.items()}
+        if not all(map(math.isfinite, numbers.values())) or numbers.get("m", 1.0) <= 0.0:
             raise ValueError(f"known payload {record['payload_known']!r}: not finite numbers with a mass above 0")
         payload = Payload(record["payload"], record["mounting"], numbers)
     rate_hz = float(record["rate_hz"])
@@ -146,12 +148,28 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
         ValueError: an entry is not what it must be.
     """
     missing, valid = json.loads(record["missing"]), json.loads(record["valid"])
-    if not isinstance(valid, bool) or not isinstance(missing, list) or not all(isinstance(m, int) for m in missing):
-        raise ValueError(f"missing {record['missing']!r}, valid {record['valid']!r}")
+    if not isinstance(valid, bool) or not isinstance(missing, list):
+        raise ValueError(f"missing {record['missing']!r}, valid {record['valid']!r}")  # noqa: TRY004 - a foreign record
+    samples, lost_cycles = int(record["samples"]), int(record["lost_cycles"])
+    for count in (samples, lost_cycles, *missing):
+        if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= LARGEST_COUNT:
+            raise ValueError(f"a count of {count!r:.40}")
+    if max(missing, default=0) > samples:
+        raise ValueError(f"{max(missing)} answers missing in {samples} samples")
     return RunStatistics(
-        samples=int(record["samples"]),
-        lost_cycles=int(record["lost_cycles"]),
+        samples=samples,
+        lost_cycles=lost_cycles,
         missing=tuple(missing),
         valid=valid,
         reason=record["reason"],
     )
+
+
+def _number(value: object) -> float:
+    """A number of a foreign JSON document; NaN for anything else, also for an integer that no float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.nan

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -86,6 +86,6 @@ def _axis(tree: Any) -> AxisReadback:
 
 
 def _quantum(name: str, key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0.0:
-        raise ValueError(f"axis {name!r}: {key} is {value!r}, expected a positive number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= sys.float_info.max:
+        raise ValueError(f"axis {name!r}: {key} is {value!r:.40}, expected a positive number")
     return float(value)

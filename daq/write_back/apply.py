@@ -148,7 +148,7 @@ def _check_axes(calibration: Calibration, keys: Mapping[str, str]) -> None:
 
 def _change(gain: Gain, scalar: Scalar) -> GainChange:
     writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    spelling = spell(gain.value, gain.std) if writable else ""
+    spelling = spell(gain.value, gain.std, scalar.text) if writable else ""
     if spelling and float(spelling) == scalar.value:
         spelling = scalar.text  # the same number in the human's own spelling is no change
     return GainChange(

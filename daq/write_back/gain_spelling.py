@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import math
+import re
+
+_EXPONENT = re.compile(r"([eE])[-+]?([0-9]+)$")
 
 
-def spell(value: float, std: float) -> str:
+def spell(value: float, std: float, like: str = "") -> str:
     """A gain as text: two digits beyond the first digit of σ, at least five significant, no more than a float has.
 
-    The text has a point always, so that no reader takes it for an integer.
+    The text has a point always, and its exponent a sign, so that no reader takes it for an integer or for text
+    (YAML 1.1 knows no 1e3).
+
+    Args:
+        value: not zero [unit].
+        std: standard deviation [unit].
+        like: how the number that it replaces is written. Its exponent, its plus and at least as many decimals are
+            kept: they are the habit of whoever reads the file.
     """
+    exponent = _EXPONENT.search(like)
     magnitude = math.floor(math.log10(abs(value)))
     decimals = 4 - magnitude
     if std > 0:
         decimals = max(decimals, 2 - math.floor(math.log10(std)))
+    _, _, fraction = like.removesuffix(exponent[0] if exponent else "").partition(".")
+    if exponent is None:
+        decimals = max(decimals, len(fraction))
     decimals = min(decimals, 16 - magnitude)
-    if magnitude < -5 or magnitude > 12:
-        return f"{value:.{decimals + magnitude}e}"
-    return f"{value:.{max(decimals, 1)}f}"
+    plus = "+" if like.startswith("+") else "-"
+    if exponent or magnitude < -5 or magnitude > 12:
+        mantissa, _, power = f"{value:{plus}.{max(decimals + magnitude, 1)}e}".partition("e")
+        mark, digits = exponent.groups() if exponent else ("e", "00")
+        return f"{mantissa}{mark}{power[0]}{abs(int(power)):0{len(digits)}d}"
+    return f"{value:{plus}.{max(decimals, 1)}f}"

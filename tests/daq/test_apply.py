@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import itertools
 import json
 import math
 import os
+import shlex
 import shutil
 import stat
 from collections.abc import Callable
@@ -34,7 +36,7 @@ NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 @pytest.fixture
 def controller(tmp_path: Path) -> Path:
     """A copy of the demo controller's file in a folder of its own."""
-    path = tmp_path / "controllers" / "demo.yaml"
+    path = tmp_path / "the controllers" / "demo.yaml"
     path.parent.mkdir()
     shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
     return path
@@ -87,7 +89,8 @@ def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -
         expected = expected.replace(old, new)
     expected = expected.replace(b"32.96", b"33.900", 1).replace(b"32.96", b"32.400", 1)
     assert controller.read_bytes() == expected
-    assert written.backup == controller.parent / "demo.yaml.20250102T030405Z.bak"
+    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (before, expected))
+    assert written.backup == controller.parent / f"demo.yaml.20250102T030405Z.{digests}.bak"
     assert written.backup.read_bytes() == before
     assert sorted(controller.parent.iterdir()) == sorted([controller, written.backup])
     assert {stat.S_IMODE(path.stat().st_mode) for path in (controller, written.backup)} == {0o640}
@@ -322,7 +325,8 @@ def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
 
     back = roll_back(controller, NOW + timedelta(minutes=1))
     assert controller.read_bytes() == original
-    assert back.restored == first.backup
+    assert back.source == first.backup
+    assert back.backup is not None
     assert back.backup.read_bytes() == calibrated
 
     roll_back(controller, NOW + timedelta(minutes=2))
@@ -334,28 +338,89 @@ def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path
     apply(_propose(demo_calibration(), controller), NOW)
     for step in (0, -3600, 0, -7200):
         roll_back(controller, NOW + timedelta(seconds=step))
-    names = [path.name for path in backups(controller)]
-    assert names == [f"demo.yaml.20250102T030405Z{suffix}.bak" for suffix in ("", "-1", "-2", "-3", "-4")]
-    contents = [path.read_bytes() for path in backups(controller)]
+    assert [(one.stamp, one.count) for one in backups(controller)] == [("20250102T030405Z", k) for k in range(5)]
+    contents = [one.path.read_bytes() for one in backups(controller)]
     assert all(a != b for a, b in itertools.pairwise(contents))
+
+
+def _make_backup(controller: Path, was: bytes, became: bytes, stamp: str = "20250102T030405Z") -> Path:
+    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (was, became))
+    path = controller.parent / f"demo.yaml.{stamp}.{digests}.bak"
+    path.write_bytes(was)
+    return path
 
 
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
     with pytest.raises(BackupMissing, match="no backup beside it"):
         roll_back(controller, NOW)
-    # A name that a killed writer kept, and a copy that changes nothing, are no way back either.
-    (controller.parent / "demo.yaml.20250102T030405Z.bak").touch()
-    shutil.copyfile(controller, controller.parent / "demo.yaml.20250102T030406Z.bak")
+    # What a writer leaves that was killed before it replaced the file is no way back either.
+    _make_backup(controller, controller.read_bytes(), b"never written")
     with pytest.raises(BackupMissing, match="same content"):
         roll_back(controller, NOW)
+    controller.with_name("demo.yaml.bak").write_text("a human's own")
+    controller.unlink()
+    controller.parent.joinpath("other.yaml").write_text("x: 1\n")
+    with pytest.raises(BackupMissing, match="no backup beside it"):
+        roll_back(controller.with_name("other.yaml"), NOW)
+
+
+def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> None:
+    original = controller.read_bytes()
+    apply(_propose(demo_calibration(), controller), NOW)
+    _make_backup(controller, controller.read_bytes(), b"never written", "20250102T040405Z")
+    roll_back(controller, NOW + timedelta(hours=2))
+    assert controller.read_bytes() == original
 
 
 def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
     before = controller.read_bytes()
-    (controller.parent / "demo.yaml.20250102T030405Z.bak").write_text("drives: [")
+    _make_backup(controller, b"drives: [", before)
     with pytest.raises(ControllerUnfit, match="no YAML"):
         roll_back(controller, NOW)
     assert controller.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"drives: {}\n"])
+def test_a_backup_that_was_gutted_is_not_restored(controller: Path, content: bytes) -> None:
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    written.backup.write_bytes(content)
+    calibrated = controller.read_bytes()
+    for deleted in (False, True):
+        if deleted:
+            controller.unlink()
+        with pytest.raises(ControllerUnfit, match="as its name says"):
+            roll_back(controller, NOW)
+        assert controller.exists() is not deleted
+    assert written.after == calibrated
+    assert list(controller.parent.iterdir()) == [written.backup]
+
+
+def test_a_deleted_file_comes_back(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    controller.chmod(0o640)
+    original = controller.read_bytes()
+    apply(_propose(demo_calibration(), controller), NOW)
+    controller.unlink()
+    assert main(["rollback", "--to", str(controller), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["backup"] is None
+    assert controller.read_bytes() == original
+    assert stat.S_IMODE(controller.stat().st_mode) == 0o640
+    controller.unlink()
+    assert main(["rollback", "--to", str(controller)]) == 0
+    assert "the file was gone" in capsys.readouterr().out
+
+
+def test_an_edit_since_the_write_is_not_lost(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = controller.parent.rename(controller.parent.parent / "my controllers")
+    controller = folder / controller.name
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    edited = controller.read_bytes().replace(b"120.0", b"130.0")
+    controller.write_bytes(edited)
+    assert main(["rollback", "--to", str(controller)]) == 3
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"`diff {shlex.quote(str(written.backup))} {shlex.quote(str(controller))}`" in told
+    assert controller.read_bytes() == edited
 
 
 def test_the_command_shows_writes_and_rolls_back(
@@ -389,8 +454,9 @@ def test_the_command_shows_writes_and_rolls_back(
     assert "J4" in outcome.err
     assert controller.read_bytes() == before
 
-    assert main([*command, "--yes", "--base", dry["base_sha256"], "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["applied"] is True
+    assert main([*command, "--yes", "--base", dry["base_sha256"]]) == 0
+    undo = capsys.readouterr().out.splitlines()[-1].removeprefix("To undo: drivegain ")
+    assert shlex.split(undo) == ["rollback", "--to", str(controller)]
     assert b"-9.2100" in controller.read_bytes()
 
     assert main([*command, "--yes"]) == 0

@@ -78,7 +78,7 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
     assert [scalar.text for scalar in found] == list(case.numbers)
     assert [scalar.value for scalar in found] == [float(number) for number in case.numbers]
 
-    spelt = tuple(spell(gain, 0.003 * abs(gain)) for gain in gains)
+    spelt = tuple(spell(gain, 0.003 * abs(gain), number) for gain, number in zip(gains, case.numbers, strict=True))
     changed = file.with_values(dict(zip(case.keys, spelt, strict=True)))
 
     assert changed.text == case.text(spelt)
@@ -89,11 +89,12 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
 @settings(max_examples=300, deadline=None)
 @given(
     st.floats(1e-9, 1e9).flatmap(lambda gain: st.tuples(st.sampled_from([gain, -gain]), st.floats(1e-6, 0.5))),
+    st.just("") | _numbers,
 )
-def test_a_gain_is_spelt_exactly_enough_for_every_reader(pair: tuple[float, float]) -> None:
+def test_a_gain_is_spelt_exactly_enough_for_every_reader(pair: tuple[float, float], like: str) -> None:
     gain, relative_std = pair
     std = relative_std * abs(gain)
-    text = spell(gain, std)
+    text = spell(gain, std, like)
     error = abs(float(text) - gain)
     # Five significant digits, and less than a hundredth of σ's first digit.
     assert error <= 0.5000001e-4 * 10.0 ** math.floor(math.log10(abs(gain)))
@@ -101,22 +102,30 @@ def test_a_gain_is_spelt_exactly_enough_for_every_reader(pair: tuple[float, floa
     for value in (yaml.safe_load(text), YAML(typ="safe", pure=True).load(text)):
         assert isinstance(value, float)
         assert value == float(text)
-    assert spell(float(text), std) == text
+    assert spell(float(text), std, like) == text
+    assert text.startswith("+") == (like.startswith("+") and gain > 0)
+    if "e" in like.lower():
+        assert like[like.lower().index("e")] in text
 
 
 @pytest.mark.parametrize(
-    ("gain", "std", "text"),
+    ("gain", "std", "like", "text"),
     [
-        (33.9, 0.034, "33.9000"),
-        (-9.2134567, 0.03, "-9.2135"),
-        (6.79, 0.0, "6.7900"),
-        (33912.34, 120.0, "33912.3"),
-        (1.5e-7, 1e-9, "1.5000e-07"),
-        (6.7912345678, 2e-6, "6.79123457"),
+        (33.9, 0.034, "", "33.9000"),
+        (-9.2134567, 0.03, "", "-9.2135"),
+        (6.79, 0.0, "", "6.7900"),
+        (33912.34, 120.0, "", "33912.3"),
+        (1.5e-7, 1e-9, "", "1.5000e-07"),
+        (6.7912345678, 2e-6, "", "6.79123457"),
+        (33.9, 0.034, "3.296e1", "3.39000e+1"),
+        (33.9, 0.034, "3.296E+01", "3.39000E+01"),
+        (33.9, 0.034, "+32.96", "+33.9000"),
+        (-33.9, 0.034, "+32.96", "-33.9000"),
+        (33.9, 0.034, "32.961234", "33.900000"),
     ],
 )
-def test_digits_follow_the_uncertainty(gain: float, std: float, text: str) -> None:
-    assert spell(gain, std) == text
+def test_digits_follow_the_uncertainty_and_the_habit_of_the_file(gain: float, std: float, like: str, text: str) -> None:
+    assert spell(gain, std, like) == text
 
 
 @pytest.mark.parametrize(

@@ -2,26 +2,89 @@
 
 from __future__ import annotations
 
+import inspect
+import io
 import json
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import yaml
+from rich.console import Console
 
 from daq.cli import main
 from daq.cli.app import VERBS
+from daq.cli.output import say_written
+from daq.cli.verb import Listed
+from daq.cli.verb_group import VerbGroup
 from daq.configuration.cell_file import load_cell
 from daq.configuration.importing import load_import
+from daq.errors import ExitCode
 from drivers.event import CellEvent, EventKind
 from tests.daq.logs import DISC, START_NS, demo_content, samples, write
 
 
-@pytest.mark.parametrize("verb", VERBS, ids=[verb.name for verb in VERBS])
-def test_every_help_ends_with_an_example(verb: object, capsys: pytest.CaptureFixture[str]) -> None:
-    name, example = getattr(verb, "name", ""), getattr(verb, "example", "")
-    assert main([name, "--help"]) == 0
-    output = " ".join(capsys.readouterr().out.split())
-    assert example.startswith(f"drivegain {name}")
-    assert output.endswith(f"Example: {example}")
+@pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
+def test_every_help_is_whole_and_ends_with_an_example_to_copy(
+    listed: Listed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb = listed.load()
+    assert verb.name == listed.name
+    kinds = verb.kinds if isinstance(verb, VerbGroup) else ()
+    for command in ([verb.name], *([verb.name, kind.name] for kind in kinds)):
+        assert main([*command, "--help"]) == 0
+        output = capsys.readouterr().out
+        shown = next((kind for kind in kinds if kind.name == command[-1]), verb)
+        assert shown.example.startswith("drivegain " + " ".join(command))
+        assert output.splitlines()[-1].strip() == shown.example
+        # Nothing of a help text is taken for markup: units stand in brackets.
+        told = _squeezed(output)
+        for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
+            (option,) = parameter.annotation.__metadata__
+            assert _squeezed(option.help) in told
+
+
+def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    for listed in VERBS:
+        assert f"{listed.name} {listed.summary}" in lines
+
+
+def test_a_unit_in_a_help_text_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", "--help"]) == 0
+    assert "How long to wait for answers [s]." in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recrod"]) == ExitCode.USAGE
+    assert "Did you mean 'record'?" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["init", "--help"], ["rollback", "--help"]])
+def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) -> None:
+    heavy = ("matplotlib", "pinocchio", "numba", "scipy", "canopen")
+    code = (
+        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});"
+        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=checkout, check=True)
+    assert done.stderr == "[]\n"
+
+
+def test_what_was_written_is_told_line_by_line(tmp_path: Path) -> None:
+    out = io.StringIO()
+    (tmp_path / "[s] pictures").mkdir()
+    say_written(Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures")
+    assert out.getvalue().splitlines() == ["Written: cali\\x1b.yaml", f"Written: {tmp_path}/[s] pictures/"]
+
+
+def _squeezed(text: str) -> str:
+    """Without white space: where a line is broken is no matter."""
+    return "".join(text.split())
 
 
 @pytest.mark.parametrize("arguments", [["no-such-verb"], ["info"], ["info", "--no-such-option", "x"], ["import", "x"]])
@@ -78,6 +141,28 @@ def test_info_of_a_damaged_log_is_exit_code_4(log: Path, capsys: pytest.CaptureF
     assert "checksum" in output.err
 
 
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_an_output_that_cannot_be_written_is_told(log: Path, checkout: Path, more: list[str]) -> None:
+    command = [sys.executable, "-m", "daq", "info", str(log), *more]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+    assert done.returncode == ExitCode.UNEXPECTED
+    assert "no space left" in done.stderr
+    assert not re.search("Traceback|Exception", done.stderr)
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_reader_that_has_seen_enough_is_no_error_to_tell(log: Path, checkout: Path, more: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        command = [sys.executable, "-m", "daq", "info", str(log), *more]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (ExitCode.UNEXPECTED, "")
+
+
 def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "new" / "press-4"
     assert main(["init", str(folder)]) == 0
@@ -90,7 +175,15 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
     assert cell.controller_path == folder / "controllers/press-4.yaml"
     assert cell.controller_path.is_file()
     assert load_import(folder / "imports/press-4.yaml").cell.resolve() == folder / "cells/press-4.yaml"
-    assert "#" in (folder / "cells/press-4.yaml").read_text(encoding="utf-8")
+    for path in folder.rglob("*.yaml"):
+        head = re.match(r"(#.*\n)+", path.read_text(encoding="utf-8"))
+        assert head, path
+        assert not re.search("simulated|TX-40|tx40", head[0])
+        assert path.parent.name == "drives" or "press-4" in head[0]
+    text = (folder / "cells/press-4.yaml").read_text(encoding="utf-8")
+    (axis, *_) = yaml.safe_load(text)["axes"]
+    explained = re.findall(r"^  #   (\w+) ", text, re.MULTILINE)
+    assert explained == list(axis)
     assert [path.name for path in folder.parent.iterdir()] == ["press-4"]
 
 

@@ -11,10 +11,11 @@ from rich.console import Console
 from daq.cli.app import main, show_error
 from daq.configuration.yaml_file import MAX_EXPLAINED, StrictModel, parse_yaml, read_model
 from daq.errors import ExitCode, OutputFailed, SchemaMismatch
-from daq.log.metadata import run_from_record, run_record
+from daq.log.metadata import RunStatistics, run_from_record, run_record, statistics_from_record, statistics_record
+from daq.log.readback import readback_from_bytes
 from daq.log.writer import LogWriter
 from drivers.errors import DriveFault
-from tests.daq.logs import DISC, content, joints
+from tests.daq.logs import DISC, content, demo_content, joints, samples, write
 
 
 @pytest.mark.parametrize(
@@ -25,6 +26,10 @@ from tests.daq.logs import DISC, content, joints
         ("payload_known", '{"m": -4.59}'),
         ("payload_known", '{"m": 0}'),
         ("payload_known", '{"m": {"m": 1}}'),
+        ("payload_known", '{"m": null}'),
+        ("payload_known", '{"m": true}'),
+        ("payload_known", '{"m": "4.59"}'),
+        ("payload_known", '{"m": 1' + 400 * "0" + "}"),
         ("started_wall_ns", "-99999999999999999999999"),
         ("started_wall_ns", "9" * 40),
         ("rate_hz", "nan"),
@@ -37,12 +42,67 @@ def test_hostile_metadata_is_a_value_error(key: str, value: str) -> None:
         run_from_record({**record, key: value})
 
 
-def test_a_hundred_thousand_unknown_keys_are_counted_and_not_all_explained() -> None:
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("samples", "-1"),
+        ("samples", "9" * 30),
+        ("lost_cycles", "-3"),
+        ("missing", "[-1, 0]"),
+        ("missing", "[true, 0]"),
+        ("missing", "[0, 0.5]"),
+        ("missing", "[101, 0]"),
+        ("missing", "[1" + 400 * "0" + ", 0]"),
+        ("valid", '"yes"'),
+    ],
+)
+def test_hostile_counts_are_a_value_error(key: str, value: str) -> None:
+    statistics = RunStatistics(100, 2, (0, 3), valid=True)
+    record = statistics_record(statistics)
+    assert statistics_from_record(record) == statistics
+    with pytest.raises(ValueError, match=r".+"):
+        statistics_from_record({**record, key: value})
+
+
+@pytest.mark.parametrize("number", ["0", "-1e-9", "NaN", "Infinity", "1" + 400 * "0", "true", "null", '"1"'])
+def test_a_hostile_quantum_is_a_value_error(number: str) -> None:
+    text = '{"axes": [{"name": "J1", "current_per_unit": %s}]}'
+    assert readback_from_bytes((text % "0.002").encode()).axes[0].current_per_unit == 0.002
+    with pytest.raises(ValueError, match="positive number"):
+        readback_from_bytes((text % number).encode())
+
+
+@pytest.mark.parametrize(
+    ("statistics", "says"),
+    [
+        ({"samples": "7"}, "7, as its recorder counted"),
+        ({"missing": "[0, 0]"}, "losses of 2 axes"),
+        ({"missing": "[0, 0, 0, 0, 0, -1]"}, "drivegain.statistics"),
+    ],
+)
+def test_info_refuses_the_counts_that_a_fit_refuses(
+    statistics: dict[str, str],
+    says: str,
+    checkout: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    genuine = statistics_record
+    monkeypatch.setattr("daq.log.writer.statistics_record", lambda given: {**genuine(given), **statistics})
+    log = write(tmp_path / "a.mcap", demo_content(checkout), samples([[k] * 6 for k in range(300)]))
+    assert main(["info", str(log), "--json"]) == ExitCode.DATA_UNFIT
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert says in output.err
+
+
+def test_very_many_unknown_keys_are_counted_and_not_all_explained() -> None:
     class Small(StrictModel):
         name: str
 
-    keys = "\n".join(f"key{number}: 1" for number in range(100_000))
-    with pytest.raises(SchemaMismatch, match=f"{100_000 - MAX_EXPLAINED} more faults"):
+    keys = "\n".join(f"key{number}: 1" for number in range(20_000))
+    with pytest.raises(SchemaMismatch, match=f"{20_000 - MAX_EXPLAINED} more faults"):
         read_model(parse_yaml(f"name: x\n{keys}".encode(), "file.yaml"), Small)
 
 

@@ -294,6 +294,24 @@ def test_a_rate_that_makes_the_joints_too_fast(bench: Bench, capsys: pytest.Capt
     _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
 
 
+@pytest.mark.parametrize("wrong", [0.1, 1.0, 10.0])
+def test_a_rate_that_is_ten_times_off_is_noticed(
+    bench: Bench, wrong: float, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """At 1 kHz the joints reach 80 to 90 % of the slowest limit."""
+    seconds = np.arange(1000)[:, None] / 1000.0
+    bench.joint_deg = 30.0 * np.sin(2.0 * np.pi * seconds + np.arange(6))
+    bench.current_a = np.cos(seconds * 140.0 + np.arange(6))
+    bench.joint_deg[500, 2] += 1.0  # one outlier is not taken for a wrong rate
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    bench.describe(rate_hz=1000.0 * wrong)
+    if wrong > 1.0:
+        _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+    else:
+        assert bench.run() == 0
+    assert ("no joint is faster than" in caplog.text) is (wrong < 1.0)
+
+
 def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     bench.current_a[120, 3] = 1e300
     bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))

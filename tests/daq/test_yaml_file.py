@@ -97,6 +97,8 @@ def test_all_mistakes_come_at_once_with_their_lines() -> None:
         ("1: x\n", ":1", "key '1'"),
         ("a: \xff\x00", "", ""),
         ("[" * 3000, ":1", "lists in lists"),
+        ("a: [" + "1," * 60_000 + "]", ":1", "more than 50000 values"),
+        ("\n".join(f"k{k}: 1" for k in range(30_000)), ":25000", "more than 50000 values"),
     ],
 )
 def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, found: str) -> None:

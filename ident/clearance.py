@@ -1,0 +1,267 @@
+"""Whether an arm keeps clear of itself, of obstacles and of the walls of its workspace, along a whole move.
+
+Links are capsules. A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point
+of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k over the whole of it, with k the joints
+between the two and ℓ_k the longest lever from joint k to the capsule. A stretch of half-width h about s is clear when
+the distance at s is at least h times that; else it is halved. So nothing is jumped over, whatever the speed.
+Distances are those of coal (GJK).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pinocchio import coal
+
+from ident.kinematics import Poses, poses
+from ident.robot import JointKind, Robot
+
+FloatArray = NDArray[np.float64]
+
+BASE = -1
+"""Index of the link that does not move."""
+RESOLUTION_M = 0.004
+"""A stretch in which nothing moves farther than this, and which is still not known to be clear, counts as blocked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capsule:
+    """All points within a radius of a segment.
+
+    Attributes:
+        name: for messages.
+        link: index of the joint that it moves with, BASE for the base.
+        start_m, end_m: of the segment, in that joint's frame (3 numbers each).
+        radius_m: above zero.
+    """
+
+    name: str
+    link: int
+    start_m: tuple[float, float, float]
+    end_m: tuple[float, float, float]
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Axis-aligned in the base frame.
+
+    Attributes:
+        name: for messages.
+        lower_m, upper_m: opposite corners.
+    """
+
+    name: str
+    lower_m: tuple[float, float, float]
+    upper_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What must keep apart.
+
+    Attributes:
+        capsules: of the arm and of what it carries.
+        pairs: indices of capsules that must keep apart.
+        boxes: obstacles; capsules of the base may touch them.
+        workspace: in which the confined capsules must stay, None for no bounds.
+        confined: indices of capsules.
+        minimum_m: distance that must be kept.
+    """
+
+    capsules: tuple[Capsule, ...]
+    pairs: tuple[tuple[int, int], ...]
+    boxes: tuple[Box, ...]
+    workspace: Box | None
+    confined: tuple[int, ...]
+    minimum_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Obstruction:
+    """Why a way is not clear.
+
+    Attributes:
+        first, second: what comes too near to what.
+        distance_m: found there; negative when they overlap.
+        position: of the joints there [rad or m].
+    """
+
+    first: str
+    second: str
+    distance_m: float
+    position: tuple[float, ...]
+
+
+class Checker:
+    """A scene made ready for many questions: each asks for the distance of two things."""
+
+    def __init__(self, robot: Robot, scene: Scene) -> None:
+        self.robot = robot
+        self.scene = scene
+        bodies = [*(_of_capsule(capsule) for capsule in scene.capsules), *(_of_box(box) for box in scene.boxes)]
+        moving = [index for index, capsule in enumerate(scene.capsules) if capsule.link != BASE]
+        boxes = range(len(scene.capsules), len(bodies))
+        self._bodies = bodies
+        self._questions = [*scene.pairs, *((index, box) for index in moving for box in boxes)]
+        self._confined = scene.confined if scene.workspace is not None else ()
+
+    def margins(self, position: FloatArray) -> FloatArray:
+        """Distance beyond the minimum of the nearest two things; negative where it is not kept [m].
+
+        Args:
+            position: of the joints [rad or m], shape (n, k).
+
+        Returns:
+            shape (k,); inf where there is nothing to be near to.
+        """
+        far = np.full(len(self._questions) + len(self._confined), np.inf)
+        return np.asarray(self._margins(position, far).min(axis=0, initial=np.inf))
+
+    def apart(self, position: FloatArray) -> FloatArray:
+        """Share of the samples in which each of the scene's pairs does not touch, shape (pairs,)."""
+        far = np.full(len(self._questions) + len(self._confined), np.inf)
+        margins = self._margins(position, far)[: len(self.scene.pairs)]
+        return np.asarray((margins + self.scene.minimum_m > 0.0).mean(axis=1))
+
+    def obstruction(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
+        """One that lies on a straight line in joint space, None when all of it is clear.
+
+        Args:
+            start, end: positions of the joints [rad or m], shape (n,).
+        """
+        travel = self._travel(start, end)
+        middles, half = np.array([0.5]), 0.5
+        while len(middles):
+            position = start[:, None] + (end - start)[:, None] * middles
+            needed = half * travel
+            margins = self._margins(position, needed)
+            unsure = margins < needed[:, None]
+            blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
+            if blocked.any():
+                question, sample = np.argwhere(blocked)[0]
+                return self._told(int(question), float(margins[question, sample]), position[:, sample])
+            half /= 2.0
+            open_ = middles[unsure.any(axis=0)]
+            middles = np.concatenate((open_ - half, open_ + half))
+        return None
+
+    def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
+        """Of each question, shape (questions, k); where spheres around both are farther apart than needed, theirs."""
+        at = poses(self.robot, position)
+        placed = [_Placed.of(body, at) for body in self._bodies]
+        out = np.empty((len(needed), position.shape[1]))
+        request = coal.DistanceRequest()
+        for row, (first, second) in enumerate(self._questions):
+            a, b = placed[first], placed[second]
+            between = np.linalg.norm(a.middle_m - b.middle_m, axis=1)
+            out[row] = between - a.body.sphere_m - b.body.sphere_m - self.scene.minimum_m
+            for sample in np.flatnonzero(out[row] < needed[row]).tolist():
+                result = coal.DistanceResult()
+                distance = coal.distance(a.body.shape, a.pose(sample), b.body.shape, b.pose(sample), request, result)
+                out[row, sample] = distance - self.scene.minimum_m
+        if self.scene.workspace is not None:
+            lower, upper = np.array(self.scene.workspace.lower_m), np.array(self.scene.workspace.upper_m)
+            for row, index in enumerate(self._confined, start=len(self._questions)):
+                capsule = self.scene.capsules[index]
+                ends = [_at(at, capsule.link, np.array(point)) for point in (capsule.start_m, capsule.end_m)]
+                inside = [np.minimum(end - lower, upper - end).min(axis=1) for end in ends]
+                out[row] = np.minimum(*inside) - capsule.radius_m
+        return out
+
+    def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """Bound on the way of any point of one thing as the other sees it, for each question [m]."""
+        pairs = [*self._questions, *((index, len(self.scene.capsules)) for index in self._confined)]
+        return np.array([self._relative_travel(first, second, start, end) for first, second in pairs])
+
+    def _relative_travel(self, first: int, second: int, start: FloatArray, end: FloatArray) -> float:
+        capsules = self.scene.capsules
+        links = [capsules[index].link if index < len(capsules) else BASE for index in (first, second)]
+        chains = [self._chain(link) for link in links]
+        total = 0.0
+        for index, chain, other in ((first, chains[0], chains[1]), (second, chains[1], chains[0])):
+            if index >= len(capsules):
+                continue
+            lever = max(float(np.linalg.norm(point)) for point in (capsules[index].start_m, capsules[index].end_m))
+            for joint in chain:  # from the capsule towards the base
+                if joint in other:
+                    break
+                declared = self.robot.joints[joint]
+                way = abs(float(end[joint] - start[joint]))
+                prismatic = declared.kind is JointKind.PRISMATIC
+                total += way * (1.0 if prismatic else lever)
+                lever += float(np.linalg.norm(declared.translation_m))
+                lever += max(abs(float(start[joint])), abs(float(end[joint]))) if prismatic else 0.0
+        return total
+
+    def _chain(self, link: int) -> list[int]:
+        chain = []
+        while link != BASE:
+            chain.append(link)
+            link = self.robot.joints[link].parent
+        return chain
+
+    def _told(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
+        where = tuple(float(value) for value in position)
+        if question < len(self._questions):
+            first, second = (self._bodies[index].name for index in self._questions[question])
+            return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
+        confined = self.scene.capsules[self._confined[question - len(self._questions)]]
+        return Obstruction(confined.name, "the end of the workspace", margin_m, where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Body:
+    """A shape on a link: its pose there, and the radius of a sphere around it."""
+
+    name: str
+    shape: coal.CollisionGeometry
+    link: int
+    rotation: FloatArray
+    middle_m: FloatArray
+    sphere_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A body in the base frame over k samples."""
+
+    body: _Body
+    rotation: FloatArray
+    middle_m: FloatArray
+
+    @classmethod
+    def of(cls, body: _Body, at: Poses) -> _Placed:
+        return cls(body, at.rotation[body.link + 1] @ body.rotation, _at(at, body.link, body.middle_m))
+
+    def pose(self, sample: int) -> coal.Transform3s:
+        return coal.Transform3s(self.rotation[sample], self.middle_m[sample])
+
+
+def _at(at: Poses, link: int, point_m: FloatArray) -> FloatArray:
+    return np.asarray(at.origin_m[link + 1] + at.rotation[link + 1] @ point_m)
+
+
+def _of_capsule(capsule: Capsule) -> _Body:
+    start, end = np.array(capsule.start_m), np.array(capsule.end_m)
+    length = float(np.linalg.norm(end - start))
+    # coal's capsules lie along z; one without length is a sphere.
+    shape = coal.Capsule(capsule.radius_m, length) if length > 0.0 else coal.Sphere(capsule.radius_m)
+    rotation = _z_towards((end - start) / length) if length > 0.0 else np.eye(3)
+    return _Body(capsule.name, shape, capsule.link, rotation, (start + end) / 2, length / 2 + capsule.radius_m)
+
+
+def _of_box(box: Box) -> _Body:
+    lower, upper = np.array(box.lower_m), np.array(box.upper_m)
+    sphere = float(np.linalg.norm(upper - lower)) / 2
+    return _Body(box.name, coal.Box(*(upper - lower)), BASE, np.eye(3), (lower + upper) / 2, sphere)
+
+
+def _z_towards(direction: FloatArray) -> FloatArray:
+    """A rotation that takes z to a unit vector."""
+    least = np.eye(3)[np.argmin(np.abs(direction))]
+    x = np.cross(least, direction)
+    x /= np.linalg.norm(x)
+    return np.column_stack((x, np.cross(direction, x), direction))

@@ -1,0 +1,171 @@
+"""`make bench`: speed and memory against figaroh, growth to 4 million samples, and the processor time of a whole fit.
+
+Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
+One core: every child process gets one thread for its linear algebra, figaroh's too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident.robot import robot_from_urdf
+from tests.bench.finished_logs import finished_logs
+from tests.bench.synthetic import measurements
+
+OUT = Path("out/bench")
+RESULT = Path("out/bench.json")
+FIGAROH_VENV = Path("out/bench-venv")
+FIGAROH = "figaroh==1.0.2"
+URDF = Path("configs/robots/tx40.urdf")
+SAMPLES = 100_000
+SIZES = (100_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
+ENVIRONMENT = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def main() -> int:
+    """All three, one after the other."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3, help="of the comparison with figaroh; the median counts")
+    parser.add_argument("--largest", type=int, default=SIZES[-1], help="samples, of the growth")
+    arguments = parser.parse_args()
+    OUT.mkdir(parents=True, exist_ok=True)
+    comparison = _comparison(arguments.repeats)
+    growth = _growth(tuple(size for size in SIZES if size <= arguments.largest))
+    whole_fit = _whole_fit(arguments.repeats)
+    result = {
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": _machine(),
+        "comparison": comparison,
+        "growth": growth,
+        "fit": whole_fit,
+    }
+    RESULT.write_text(json.dumps(result, indent=2) + "\n")
+    _tell(f"\nwritten: {RESULT}")
+    return 0
+
+
+def _comparison(repeats: int) -> dict[str, Any]:
+    python = _figaroh_python()
+    data = OUT / "measurements.npz"
+    _tell(f"{SAMPLES} samples × 6 axes: rows of 84 standard parameters, base parameters, least squares; one core")
+    pieces = list(measurements(robot_from_urdf(URDF.read_text()), SAMPLES))
+    joined = [
+        np.concatenate([getattr(motion, name) for motion, _ in pieces], axis=1)
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
+    ]
+    torque = np.concatenate([torque for _, torque in pieces], axis=1)
+    np.savez(data, q=joined[0], v=joined[1], a=joined[2], torque=torque)
+    predicted = {"ours": OUT / "predicted-ours.npy", "figaroh": OUT / "predicted-figaroh.npy"}
+    commands = {
+        "ours": [sys.executable, "-m", "tests.bench.our_fit"],
+        "figaroh": [str(python), "tests/bench/figaroh_fit.py"],
+    }
+    found = {
+        name: _json_of([*command, str(data), str(URDF), str(predicted[name]), str(repeats)])
+        for name, command in commands.items()
+    }
+    ours, theirs = (np.load(predicted[name]) for name in ("ours", "figaroh"))
+    difference = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs)))
+    _tell(
+        "\n| | processor time s, median (all) | base parameters | residual norm Nm | peak MB |\n|---|---|---|---|---|"
+    )
+    for name, figures in found.items():
+        totals = [run["total"] for run in figures["seconds"]]
+        figures["median_seconds"] = statistics.median(totals)
+        _tell(
+            f"| {name} | {figures['median_seconds']:.3f} ({', '.join(f'{total:.3f}' for total in totals)}) "
+            f"| {figures['base_parameters']} | {figures['residual_norm_nm']:.9g} | {figures['peak_mb']:.0f} |"
+        )
+    ratio = found["figaroh"]["median_seconds"] / found["ours"]["median_seconds"]
+    _tell(f"ratio {ratio:.1f}; predicted torques differ by {difference:.1e} of the largest")
+    return {"samples": SAMPLES, **found, "ratio": ratio, "largest_relative_difference": difference}
+
+
+def _growth(sizes: tuple[int, ...]) -> list[dict[str, Any]]:
+    _tell("\n| samples | processor time s | µs a sample | against the first | peak MB | residual std Nm (true: 1) |")
+    _tell("|---" * 6 + "|")
+    rows: list[dict[str, Any]] = []
+    for size in sizes:
+        row = _json_of([sys.executable, "-m", "tests.bench.growth", str(URDF), str(size)])
+        row["microseconds_a_sample"] = 1e6 * row["seconds"] / size
+        row["against_first"] = row["microseconds_a_sample"] / (rows or [row])[0]["microseconds_a_sample"]
+        rows.append(row)
+        _tell(
+            f"| {size} | {row['seconds']:.2f} | {row['microseconds_a_sample']:.2f} | {row['against_first']:.2f} "
+            f"| {row['peak_mb']:.0f} | {row['residual_std_nm']:.4f} |"
+        )
+    return rows
+
+
+def _whole_fit(repeats: int) -> dict[str, Any]:
+    logs = finished_logs(OUT, _tell)
+    command = [sys.executable, "-m", "daq", "fit", *map(str, logs), "--method", "ml", "--json"]
+    runs = []
+    for _ in range(repeats):
+        calibration = OUT / "calibration.yaml"
+        calibration.unlink(missing_ok=True)
+        with subprocess.Popen(
+            [*command, "--out", str(calibration)], stdout=subprocess.DEVNULL, env=ENVIRONMENT
+        ) as child:
+            _, status, usage = os.wait4(child.pid, 0)
+            child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode:
+            raise SystemExit(f"`{' '.join(command)}` ended with {child.returncode}")
+        runs.append({"user": usage.ru_utime, "system": usage.ru_stime, "peak_mb": usage.ru_maxrss / 1024.0})
+    seconds = statistics.median(run["user"] + run["system"] for run in runs)
+    _tell(f"\nfit by ml, two finished logs of 60 s at 1 kHz to calibration.yaml: {seconds:.2f} s of processor time")
+    for run in runs:
+        _tell(f"  user {run['user']:.2f} s, system {run['system']:.2f} s, peak {run['peak_mb']:.0f} MB")
+    return {"seconds": seconds, "runs": runs}
+
+
+def _figaroh_python() -> Path:
+    """figaroh has an environment of its own: it brings another Pinocchio than ours."""
+    python = FIGAROH_VENV / "bin" / "python"
+    installed = FIGAROH_VENV / ".installed"
+    if not installed.exists() or installed.read_text() != FIGAROH:
+        _tell(f"installing {FIGAROH} into {FIGAROH_VENV} (once)")
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", "--clear", str(FIGAROH_VENV)], check=True)
+        install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-qq", FIGAROH]
+        subprocess.run(install, check=True)
+        installed.write_text(FIGAROH)
+    return python
+
+
+def _json_of(command: list[str]) -> dict[str, Any]:
+    """What a child process prints; what it complains of is not ours to show unless it fails."""
+    child = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, check=False)
+    if child.returncode:
+        raise SystemExit(f"`{' '.join(command)}` ended with {child.returncode}:\n{child.stderr}")
+    return dict(json.loads(child.stdout.splitlines()[-1]))
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "load_average": os.getloadavg(),
+    }
+
+
+def _tell(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

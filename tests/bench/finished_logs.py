@@ -1,0 +1,59 @@
+"""Two finished logs of 60 s at 1 kHz, without load and with the weighed payload, from the simulated cell.
+
+Recorded over the real driver path once, and kept: a log has its final name only when it is whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.plan import plan
+from daq.plan_file import load_plan, save_plan
+from daq.record import record
+from daq.resources import shipped_configurations
+from drivers.bus import open_bus
+from drivers.simulated.cell import SimulatedCell
+
+DURATION_S = 60.0
+SEED = 20
+RUNS = (("bare", None), ("loaded", "disc"))
+
+
+def finished_logs(folder: Path, tell: Callable[[str], None]) -> tuple[Path, ...]:
+    """The logs in ``folder``; what is missing is recorded."""
+    cell_file = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(cell_file)
+    plan_path = folder / "plan.yaml"
+    if not plan_path.exists():
+        tell(f"planning a run of {DURATION_S:g} s")
+        save_plan(plan(cell, seed=SEED, duration_s=DURATION_S), plan_path)
+    moves = load_plan(plan_path, cell)
+    payloads = {declared.name: declared.payload for declared in cell.payloads}
+    logs = tuple(folder / f"{name}.mcap" for name, _ in RUNS)
+    for index, (log, (name, payload)) in enumerate(zip(logs, RUNS, strict=True)):
+        if log.exists():
+            continue
+        log.with_name(log.name + ".part").unlink(missing_ok=True)
+        tell(f"recording {name} for {DURATION_S:g} s")
+        spec = load_simulation(shipped_simulation("clean"), payload)
+        bus = open_bus(bus_address(cell))
+        try:
+            with SimulatedCell(replace(spec, seed=SEED + index), bus):
+                record(
+                    cell_file,
+                    cell,
+                    moves,
+                    log,
+                    payload=None if payload is None else payloads[payload],
+                    operator="bench",
+                    granted_by="the benchmark: a simulated cell",
+                    run_id=f"bench-{name}",
+                )
+        finally:
+            bus.shutdown()
+    return logs

@@ -1,0 +1,56 @@
+"""The job by drivegain in a fresh process.
+
+python -m tests.bench.our_fit DATA.npz ROBOT.urdf PREDICTED.npy REPEATS     prints one JSON object
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.motion import Motion
+from ident.robot import robot_from_urdf
+from tests.bench.torque_fit import PIECE_SAMPLES, fill_rows, fit_torques, standard_rows
+
+FloatArray = NDArray[np.float64]
+
+
+def _pieces(data: dict[str, FloatArray]) -> Iterator[tuple[Motion, FloatArray]]:
+    for first in range(0, data["q"].shape[1], PIECE_SAMPLES):
+        part = slice(first, first + PIECE_SAMPLES)
+        yield Motion(data["q"][:, part], data["v"][:, part], data["a"][:, part]), data["torque"][:, part]
+
+
+def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:
+    """Time it, and keep what it predicts."""
+    data = dict(np.load(data_path))
+    robot = robot_from_urdf(Path(urdf).read_text())
+    seconds = []
+    for _ in range(int(repeats)):
+        begin = time.process_time()
+        fit = fit_torques(robot, _pieces(data))
+        seconds.append({"total": time.process_time() - begin})
+    predicted = []
+    for motion, torque in _pieces(data):
+        room = standard_rows(robot, torque.shape[1])
+        fill_rows(robot, motion, room)
+        predicted.append(fit.predict(room))
+    np.save(predicted_path, np.concatenate(predicted, axis=1))
+    found = {
+        "seconds": seconds,
+        "base_parameters": len(fit.values),
+        "residual_norm_nm": fit.residual_norm,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    }
+    sys.stdout.write(json.dumps(found) + "\n")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

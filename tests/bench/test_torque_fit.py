@@ -1,0 +1,62 @@
+"""The job that is timed is done right; how fast is nobody's assertion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.drive_train import DriveTrain
+from ident.model import Model
+from ident.motion import Motion
+from ident.robot import robot_from_urdf
+from tests.bench.motion import RATE_HZ, sinusoids
+from tests.bench.synthetic import NOISE_NM, measurements
+from tests.bench.torque_fit import fill_rows, fit_torques, names, standard_rows
+from tests.ident.arms import ARMS, TX40, Arm
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
+def test_its_rows_are_those_of_the_model(arm: Arm) -> None:
+    robot = robot_from_urdf(arm.urdf)
+    motion = sinusoids(robot.joint_count, 1).motion(np.linspace(0.0, 10.0, 50))
+    rows = standard_rows(robot, 50)
+    fill_rows(robot, motion, rows)
+    model = Model(robot, DriveTrain(np.eye(robot.joint_count)))
+    assert tuple(column.name for column in model.columns) == names(robot.joint_count)
+    assert np.array_equal(rows, model.regressor(motion))
+
+
+def test_velocity_and_acceleration_are_derivatives() -> None:
+    step_s = 1e-5
+    time_s = np.linspace(0.0, 20.0, 30)
+    course = sinusoids(3, 2)
+    before, here, after = (course.motion(time_s + shift * step_s) for shift in (-1, 0, 1))
+    slope = (after.position_rad - before.position_rad) / (2.0 * step_s)
+    assert np.max(np.abs(slope - here.velocity_rad_s)) < 1e-7
+    slope = (after.velocity_rad_s - before.velocity_rad_s) / (2.0 * step_s)
+    assert np.max(np.abs(slope - here.acceleration_rad_s2)) < 1e-6
+
+
+def test_a_course_does_not_depend_on_its_pieces() -> None:
+    course = sinusoids(2, 3)
+    pieces = list(course.pieces(1000, 300))
+    assert [piece.position_rad.shape[1] for piece in pieces] == [300, 300, 300, 100]
+    joined = np.concatenate([piece.acceleration_rad_s2 for piece in pieces], axis=1)
+    assert np.array_equal(joined, course.motion(np.arange(1000) / RATE_HZ).acceleration_rad_s2)
+
+
+def test_agrees_with_dense_least_squares() -> None:
+    robot = robot_from_urdf(TX40.urdf)
+    pieces = list(measurements(robot, 6000))
+    fit = fit_torques(robot, pieces)
+    assert len(fit.values) == 58
+    torque = np.concatenate([measured for _, measured in pieces], axis=1)
+    parts = ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
+    whole = Motion(*(np.concatenate([getattr(motion, part) for motion, _ in pieces], axis=1) for part in parts))
+    rows = standard_rows(robot, 6000)
+    fill_rows(robot, whole, rows)
+    dense = np.moveaxis(rows, 1, 2).reshape(-1, rows.shape[1])
+    best = dense @ np.linalg.lstsq(dense, torque.ravel())[0]
+    assert np.max(np.abs(fit.predict(rows).ravel() - best)) < 1e-8 * np.max(np.abs(best))
+    assert fit.residual_norm == pytest.approx(float(np.linalg.norm(torque.ravel() - best)), rel=1e-10)
+    assert fit.residual_norm / np.sqrt(torque.size) == pytest.approx(NOISE_NM, rel=0.03)

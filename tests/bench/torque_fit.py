@@ -1,0 +1,105 @@
+"""The job that is timed: rows of the standard parameters, base parameters, ordinary least squares; from measured
+joint torques, sample by sample, as the classical tools do it. Nothing larger than a piece of rows is ever held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from ident.base_parameters import BaseParameters, base_parameters
+from ident.link import LINK_PARAMETERS
+from ident.motion import Motion
+from ident.regressor import fill_rigid, moved_links
+from ident.robot import Robot
+from ident.tsqr import qr_merge, qr_update
+
+FloatArray = NDArray[np.float64]
+
+PIECE_SAMPLES = 2048
+DRIVE_PARAMETERS = ("Ia", "fv", "fs", "off")
+WIDTH = len(LINK_PARAMETERS) + len(DRIVE_PARAMETERS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TorqueFit:
+    """Base parameters and their values.
+
+    Attributes:
+        base: the regrouping.
+        values: of the base parameters, shape (b,).
+        residual_norm: ‖τ − W χ‖ over all rows [Nm].
+    """
+
+    base: BaseParameters
+    values: FloatArray
+    residual_norm: float
+
+    def predict(self, standard: FloatArray) -> FloatArray:
+        """Joint torques of rows of the standard parameters, shape (n, c, k) → (n, k)."""
+        return np.asarray(np.einsum("jck,c->jk", standard[:, list(self.base.independent)], self.values))
+
+
+def names(joints: int) -> tuple[str, ...]:
+    """Of the standard parameters, joint by joint."""
+    return tuple(f"{name}{number + 1}" for number in range(joints) for name in LINK_PARAMETERS + DRIVE_PARAMETERS)
+
+
+def standard_rows(robot: Robot, samples: int) -> FloatArray:
+    """Room for the rows of so many samples, shape (n, 14 n, k): the offsets' ones, and zeros that stay zeros."""
+    count = robot.joint_count
+    room = np.zeros((count, WIDTH * count, samples))
+    for joint in range(count):
+        room[joint, WIDTH * joint + WIDTH - 1] = 1.0
+    return room
+
+
+def fill_rows(robot: Robot, motion: Motion, out: FloatArray) -> None:
+    """Write the rows of a piece of motion into ``standard_rows`` of its length."""
+    count, samples = motion.position_rad.shape
+    position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    by_link = out.reshape(count, count, WIDTH, samples)
+    fill_rigid(robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)])
+    for joint in range(count):
+        own = by_link[joint, joint, len(LINK_PARAMETERS) :]
+        own[0], own[1] = acceleration[joint], velocity[joint]
+        np.sign(velocity[joint], out=own[2])
+
+
+def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> TorqueFit:
+    """Identify from motions and the joint torques [Nm] measured in them, shape (n, k) each."""
+    count = robot.joint_count
+    drives = range(len(LINK_PARAMETERS), WIDTH)
+    places = tuple(
+        (
+            *(WIDTH * link + p for link in links for p in range(len(LINK_PARAMETERS))),
+            *(WIDTH * joint + p for p in drives),
+        )
+        for joint, links in enumerate(moved_links(robot))
+    )
+    triangles: list[FloatArray | None] = [None] * count
+    room = standard_rows(robot, 0)
+    for motion, torque in pieces:
+        if room.shape[2] != torque.shape[1]:
+            room = standard_rows(robot, torque.shape[1])
+        fill_rows(robot, motion, room)
+        for joint, columns in enumerate(places):
+            rows = np.concatenate((room[joint, columns], torque[joint][None]))
+            triangles[joint] = qr_update(triangles[joint], rows)
+    last = WIDTH * count
+    whole = qr_merge(
+        (
+            (triangle, (*columns, last))
+            for triangle, columns in zip(triangles, places, strict=True)
+            if triangle is not None
+        ),
+        last + 1,
+    )
+    base = base_parameters(whole[:, :last], names(count))
+    # R of [W_b | τ]: the least-squares solution is above, the residual's norm in the corner.
+    small = qr_update(None, whole[:, [*base.independent, last]].T)
+    values = solve_triangular(small[:-1, :-1], small[:-1, -1])
+    return TorqueFit(base, np.asarray(values), float(abs(small[-1, -1])))

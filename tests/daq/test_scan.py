@@ -1,0 +1,70 @@
+"""What `drivegain scan` makes of the nodes that it found."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from daq.cli.scan import scan_rows, scan_table
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from drivers.axis import Identity
+from drivers.scan import FoundNode
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs/cells/demo.yaml")
+
+
+def _node(node_id: int, statusword: int | None, serial: int | None = None) -> FoundNode:
+    identity = Identity(0x29A, 0x40200, 1000 + node_id if serial is None else serial)
+    return FoundNode(node_id, identity, 1, "drive", 0x7F, statusword)
+
+
+def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
+    out = io.StringIO()
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes), width))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("statusword", "enabled"),
+    [
+        (0x0237, True),  # operation enabled
+        (0x0217, True),  # quick stop active: the motor is braked under power
+        (0x020F, True),  # fault reaction active
+        (0x0233, False),  # switched on
+        (0x0231, False),
+        (0x0250, False),
+        (0x0208, False),
+        (None, None),
+    ],
+)
+def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled: bool | None) -> None:
+    nodes = (_node(1, 0x250), _node(2, statusword))
+    rows = scan_rows(cell, nodes)
+    assert [row["enabled"] for row in rows] == [False, enabled, None, None, None, None]
+    assert [row["verdict"] for row in rows] == ["ok", "ok", *["missing"] * 4]
+    for width in (40, 80, 200):
+        text = _shown(cell, nodes, width)
+        assert ("ENABLED" in text) is bool(enabled)
+        assert "…" not in text
+
+
+def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> None:
+    nodes = tuple(_node(number, 0x237) for number in range(1, 7))
+    for width in (50, 80, 200):
+        lines = _shown(cell, nodes, width).splitlines()
+        assert max(cell_len(line.rstrip()) for line in lines) <= width
+        assert sum("ENABLED" in line for line in lines) == 6
+
+
+def test_identity_and_power_are_told_apart(cell: Cell) -> None:
+    (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),))
+    assert (row["verdict"], row["enabled"]) == ("other identity", True)

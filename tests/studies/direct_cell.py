@@ -1,0 +1,253 @@
+"""Runs of a simulated cell without a bus: the same plant, loops, nodes and moves, and no frames back and forth.
+
+The coverage study needs hundreds of runs, and most of a recorded run's time is frames and threads. What moves the
+cell is unchanged: `drivers.motion.execute` walks the moves of `daq.record.motor_moves` through the nodes' own CiA 402
+state machines, and the amplifiers round and add noise as they do on the bus. `tests.studies.coverage_runs --check`
+compares it with a recording over the bus, count by count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import cast
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import drive_axes
+from daq.conversion import Scaling, moves, scaling
+from daq.log.readback import AxisReadback, Readback
+from daq.plan import Plan
+from daq.record import motor_limits, motor_moves
+from drivers.event import CellEvent
+from drivers.mapping import SETPOINT_PDOS, Direction, records, write_record
+from drivers.motion import execute
+from drivers.move import MotionPermission
+from drivers.network import MODE_OF_OPERATION, PROFILE_POSITION_MODE, CanopenNetwork
+from drivers.pacing import LockstepSync
+from drivers.profile import ObjectEntry
+from drivers.sample import Sample
+from drivers.sdo import ObjectAccess
+from drivers.simulated.amplifier import AmplifierSet
+from drivers.simulated.node import NmtCommand, Node
+from drivers.simulated.plant import Plant
+from drivers.simulated.readings import Readings, take
+from drivers.simulated.spec import CellSpec
+from drivers.simulated.tuning import tuned
+from drivers.stream import SyncStream
+from ident.payload import Payload
+from ident.run import Run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawRun:
+    """The samples of one run as the amplifiers tell them.
+
+    Attributes:
+        name: of the run.
+        payload: what was mounted, as declared.
+        position_counts: int32, shape (k, n).
+        current_raw: per mille of rated current, int16, shape (k, n).
+        limited: whether a limit acted (6041h, bit of the drive profile), shape (k, n).
+        move: number of the move, shape (k,).
+        ampere_per_unit: of the raw current, as the drives' own objects say, shape (n,).
+    """
+
+    name: str
+    payload: Payload | None
+    position_counts: NDArray[np.int32]
+    current_raw: NDArray[np.int16]
+    limited: NDArray[np.bool_]
+    move: NDArray[np.int64]
+    ampere_per_unit: NDArray[np.float64]
+
+
+def simulate_run(cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Payload | None) -> RawRun:
+    """Power a simulated cell on, make a plan's moves, power it off.
+
+    Args:
+        cell: as declared: limits and drive train of the moves.
+        spec: its truth, with the mounted body and the seed of its noise.
+        plan: the moves.
+        name: of the run.
+        payload: what is mounted, as declared; None without load.
+
+    Raises:
+        DriverError: the moves leave the limits, or an axis did not follow.
+        FrictionUnsolved, SpecInvalid, EffectUnknown: from the simulated cell.
+    """
+    stream = DirectStream(cell, spec)
+    scale = _scaling(cell, stream.ampere_per_unit)
+    first = next(stream)
+    permission = MotionPermission("a simulated cell", motor_limits(cell, scale))
+    planned = motor_moves(cell, plan, scale, first.position_counts)
+    samples = [first]
+    # The walk asks of network and stream what DirectStream has, and no more.
+    with closing(execute(stream.network, cast(SyncStream, stream), planned, permission)) as walk:
+        samples += walk
+    time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    move = moves(tuple(stream.events), time_ns)
+    if move is None:
+        raise ValueError(f"run {name}: the plan has no moves")
+    status = np.array([sample.statusword for sample in samples], dtype=np.uint16)
+    bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
+    masks = np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16)
+    return RawRun(
+        name=name,
+        payload=payload,
+        position_counts=np.array([sample.position_counts for sample in samples], dtype=np.int32),
+        current_raw=np.array([sample.current_raw for sample in samples], dtype=np.int16),
+        limited=(status & masks) != 0,
+        move=move,
+        ampere_per_unit=np.array(stream.ampere_per_unit),
+    )
+
+
+def run_of(raw: RawRun, cell: Cell) -> Run:
+    """A raw run in SI units, as `daq.conversion` makes it of a log."""
+    if cell.sync is None:
+        raise ValueError(f"cell {cell.name}: no sync period")
+    scale = _scaling(cell, raw.ampere_per_unit)
+    return Run(
+        name=raw.name,
+        time_s=np.arange(len(raw.move), dtype=np.float64) / (1e6 / cell.sync.period_us),
+        position_rad=scale.joint_position(raw.position_counts.astype(np.int64)),
+        current_a=raw.current_raw * scale.current_per_unit,
+        payload=raw.payload,
+        move=raw.move,
+        valid=~raw.limited,
+    )
+
+
+def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> Scaling:
+    answers = (AxisReadback(name, float(scale)) for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True))
+    return scaling(cell, Readback(tuple(answers)))
+
+
+class DirectStream:
+    """A stream of samples of a simulated cell that is called instead of being sent frames.
+
+    It has what `drivers.motion.execute` uses of a `SyncStream` and of its network.
+
+    Attributes:
+        network: what the walk asks of a network: its nodes and the names of its axes.
+        pacing: of the samples' time.
+        max_missing_cycles: none is ever missing.
+        events: in their order.
+        time_ns: of the last sample.
+        ampere_per_unit: of the raw current, from the drives' own scale objects.
+    """
+
+    def __init__(self, cell: Cell, spec: CellSpec) -> None:
+        if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
+            raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
+        n = len(spec.axes)
+        self.pacing = LockstepSync(spec.sync_period_us * 1000)
+        self.max_missing_cycles = 0
+        self.events: list[CellEvent] = []
+        self.time_ns = 0
+        self._cycle = 0
+        self._plant = Plant(spec)
+        self._amplifiers = AmplifierSet(spec, tuned(spec, self._plant), ())
+        self._amplifiers.prime(self._plant.motor_rad)
+        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
+        self._readings = take(self._amplifiers, self._rated_a)
+        self._enabled = np.zeros(n, dtype=np.int64)
+        self._substeps = spec.substeps
+        self._outgoing: list[can.Message] = []
+        self._nodes = tuple(
+            Node(index, axis, self._amplifiers, self._current_readings, lambda _can_id, _data: None)
+            for index, axis in enumerate(spec.axes)
+        )
+        axes = drive_axes(cell)
+        self.network = cast(CanopenNetwork, SimpleNamespace(axes=axes, node_ids=tuple(axis.node_id for axis in axes)))
+        accesses = [_DirectAccess(node) for node in self._nodes]
+        for access in accesses:
+            access.prepare()
+        self.ampere_per_unit = tuple(
+            axis.profile.current_scale.factor * math.prod(map(access.read, axis.profile.current_scale.objects))
+            for axis, access in zip(axes, accesses, strict=True)
+        )
+
+    def __next__(self) -> Sample:
+        return self.advance()
+
+    def check(self) -> None:
+        """No fault waits: a drive that leaves OPERATION ENABLED is seen in its statusword."""
+
+    def send(self, messages: Sequence[can.Message]) -> None:
+        """Frames for the next SYNC."""
+        self._outgoing.extend(messages)
+
+    def drop_outgoing(self) -> None:
+        """Forget the frames that wait for the next SYNC."""
+        self._outgoing.clear()
+
+    def emit(self, event: CellEvent) -> None:
+        """Keep an event of the walk's."""
+        self.events.append(event)
+
+    def advance(self) -> Sample:
+        """One SYNC period, in the order of drivers.simulated.cell.SimulatedCell."""
+        outgoing, self._outgoing = self._outgoing, []
+        for message in outgoing:
+            for node in self._nodes:
+                node.receive_pdo(message.arbitration_id, bytes(message.data))
+        for node in self._nodes:
+            node.begin_cycle()
+        plant, amplifiers = self._plant, self._amplifiers
+        loops = amplifiers.loops
+        loops["limited"] = 0
+        if not np.array_equal(loops["enabled"], self._enabled):
+            self._enabled = loops["enabled"].copy()
+            plant.set_brakes(self._enabled == 0)
+        current_a = loops["current_a"]
+        for _ in range(self._substeps):
+            plant.step(current_a)
+            amplifiers.control(plant.motor_rad)
+        amplifiers.report()
+        readings = self._readings = take(amplifiers, self._rated_a)
+        for node in self._nodes:
+            node.end_cycle()
+        self.time_ns = self._cycle * self.pacing.period_ns
+        statuswords = tuple(node.drive.statusword(readings) for node in self._nodes)
+        sample = Sample(
+            self._cycle, self.time_ns, tuple(readings.position), tuple(readings.current_demand), statuswords
+        )
+        self._cycle += 1
+        return sample
+
+    def _current_readings(self) -> Readings:
+        return self._readings
+
+
+@dataclass(frozen=True, slots=True)
+class _DirectAccess:
+    """The objects of one node, as drivers.sdo.ObjectAccess reads and writes them, without SDO frames."""
+
+    node: Node
+
+    @property
+    def node_id(self) -> int:
+        return self.node.node_id
+
+    def read(self, entry: ObjectEntry) -> int:
+        return int.from_bytes(self.node.read(entry.index, entry.subindex), "little", signed=entry.signed)
+
+    def write(self, entry: ObjectEntry, value: int) -> None:
+        data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
+        self.node.write(entry.index, entry.subindex, data)
+
+    def prepare(self) -> None:
+        """What `CanopenNetwork.prepare` does to a node that has just been powered on: it needs no SYNC for that."""
+        self.node.boot(0.0)
+        for record in records(Direction.RPDO, self.node_id, SETPOINT_PDOS):
+            write_record(cast(ObjectAccess, self), record)
+        self.write(MODE_OF_OPERATION, PROFILE_POSITION_MODE)
+        self.node.command_nmt(NmtCommand.START, 0.0)

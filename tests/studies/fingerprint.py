@@ -1,0 +1,62 @@
+"""Fingerprints of what a study has made, so that what is finished and still the same is not made again."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from pathlib import Path
+
+from daq.atomic_file import replace_file
+
+ROOMS = ("daq", "drivers", "ident")
+CHECKOUT = Path(__file__).parents[2]
+
+
+def digest(*things: object) -> str:
+    """sha256 of tuples, frozen dataclasses, texts and numbers, by their exact `repr`, hex."""
+    return hashlib.sha256(repr(things).encode()).hexdigest()
+
+
+def digest_of_source(module: str) -> str:
+    """Of a module and of all modules of this repository that it imports, in turn, hex; docstrings and comments apart.
+
+    Args:
+        module: dotted name.
+    """
+    sources: dict[str, str] = {}
+    waiting = [module]
+    while waiting:
+        name = waiting.pop()
+        path = CHECKOUT / Path(*name.split(".")).with_suffix(".py")
+        if name in sources or not path.is_file():
+            continue
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ROOMS:
+                # `from ident.estimators import wls` may name a module as well as a function.
+                waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        sources[name] = ast.dump(_Wordless().visit(tree))
+    return digest(*sorted(sources.items()))
+
+
+def is_finished(path: Path, fingerprint: str) -> bool:
+    """Whether a file is there and was marked with this fingerprint."""
+    mark = _mark(path)
+    return path.is_file() and mark.is_file() and mark.read_text().strip() == fingerprint
+
+
+def finish(path: Path, fingerprint: str) -> None:
+    """Mark a file that stands."""
+    replace_file(_mark(path), f"{fingerprint}\n".encode())
+
+
+def _mark(path: Path) -> Path:
+    return path.with_name(path.name + ".fingerprint")
+
+
+class _Wordless(ast.NodeTransformer):
+    """Takes the docstrings out: texts that stand as statements."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if is_text else node

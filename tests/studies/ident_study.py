@@ -1,0 +1,174 @@
+"""How far the gains are off, by estimator and noise floor, and whether the error bars are true.
+
+Run by `make ident-study`; records what is missing (record_study.py, over the real driver path; coverage_runs.py, the
+plant alone), writes out/ident-study.json and prints the tables of docs/estimators.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.configuration.cell_file import load_cell
+from daq.configuration.cell_model import model_of
+from daq.conversion import load_run
+from ident.comparison import ESTIMATORS
+from ident.conditioning import Conditioning
+from ident.estimators.least_squares import wls
+from ident.estimators.maximum_likelihood import ml
+from ident.model import Model
+from ident.reduction import reduce_runs
+from ident.run import Run
+from ident.system import System
+from tests.studies.coverage_runs import CELLS, load_coverage, make_coverage
+from tests.studies.coverage_runs import OUT as COVERAGE
+from tests.studies.record_study import CELL, FLOORS, SEEDS, StudyLogs, record_study
+
+FloatArray = NDArray[np.float64]
+
+OUT = Path("out/ident-study.json")
+PLATE = "plate"
+NORMAL_95 = 1.959964
+"""Half-width of a 95 % interval in standard deviations: some hundred moves leave nothing of Student's t."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One estimator on one cell.
+
+    Attributes:
+        error_percent: of each gain.
+        second_payload_percent: of the second payload's mass on each of its trajectories, found with these gains.
+        relative_error_percent: of the fit.
+    """
+
+    error_percent: tuple[float, ...]
+    second_payload_percent: tuple[float, ...]
+    relative_error_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """One estimator on all cells of a noise floor; payload masses are means of absolute errors."""
+
+    mean_percent: float
+    max_percent: float
+    second_payload_percent: float
+    second_payload_max_percent: float
+    relative_error_percent: float
+
+
+def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str, Score]:
+    """Every estimator on one cell of the study.
+
+    The second payload is weighed as in the paper's Table 8: gains fixed, classical IDIM-WLS on the runs without load
+    and one trajectory with the payload, of which nothing is known.
+    """
+    system = _system(model, [load_run(path)[0] for path in logs.fit], conditioning)
+    bare = [run for run in (load_run(path)[0] for path in logs.fit) if run.payload is None]
+    weighing = [_system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload]
+    true = np.array(logs.truth.gains_nm_per_a)
+    mass = logs.truth.payloads[PLATE].mass_kg
+    scores = {}
+    for estimator in ESTIMATORS:
+        found = estimator.run(system)
+        scores[estimator.name] = Score(
+            error_percent=tuple(float(error) for error in 100.0 * (found.gains / true - 1.0)),
+            second_payload_percent=tuple(100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing),
+            relative_error_percent=found.relative_error(system).total,
+        )
+    return scores
+
+
+def _system(model: Model, runs: Sequence[Run], conditioning: Conditioning) -> System:
+    reduction = reduce_runs(model, runs, conditioning)
+    return reduction.system(reduction.base(), reduction.payload_columns())
+
+
+def _mass(system: System, gains: FloatArray) -> float:
+    found = wls(system, gains)
+    names = [column.name for column in found.unknowns]
+    return float(found.parameters[next(i for i, name in enumerate(names) if name.startswith("m:"))])
+
+
+def summarise(scores: Sequence[Score]) -> Summary:
+    """Over the cells of a noise floor."""
+    errors = np.abs([one.error_percent for one in scores])
+    masses = np.abs([one.second_payload_percent for one in scores])
+    return Summary(
+        mean_percent=float(errors.mean()),
+        max_percent=float(errors.max()),
+        second_payload_percent=float(masses.mean()),
+        second_payload_max_percent=float(masses.max()),
+        relative_error_percent=float(np.mean([one.relative_error_percent for one in scores])),
+    )
+
+
+def coverage(model: Model, conditioning: Conditioning) -> tuple[FloatArray, FloatArray]:
+    """Share of the cells whose 95 % interval holds the true gain [%], and root mean square of the scores, by axis."""
+    scores = []
+    for cell in load_coverage():
+        found = ml(_system(model, cell.runs, conditioning))
+        scores.append((found.gains - np.array(cell.truth.gains_nm_per_a)) / found.gains_std)
+        if len(scores) % 10 == 0:
+            _tell(f"coverage: {len(scores)} cells")
+    inside = np.abs(scores) <= NORMAL_95
+    return 100.0 * inside.mean(axis=0), np.sqrt(np.mean(np.square(scores), axis=0))
+
+
+def _tell(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Record, score, tell."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.ident_study", description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--floors", nargs="+", choices=tuple(FLOORS), default=list(FLOORS))
+    parser.add_argument("--cells", type=int, default=CELLS, help="of the coverage study; 0 leaves it out")
+    options = parser.parse_args(arguments)
+    cell = load_cell(CELL)
+    model, axes = model_of(cell), cell.axis_names
+    logs = record_study(options.seeds, options.floors, told=_tell)
+    result: dict[str, Any] = {estimator.name: {} for estimator in ESTIMATORS}
+    lines = ["| floor % | estimator | gain error mean / max % | second payload mean / max % |", "|---|---|---|---|"]
+    cells: list[dict[str, Any]] = []
+    for floor in options.floors:
+        scored = [(one.seed, score(one, model, cell.conditioning)) for one in logs if one.floor == floor]
+        for seed, of in scored:
+            cells += [{"floor": floor, "seed": seed, "estimator": name, **asdict(one)} for name, one in of.items()]
+        for estimator in ESTIMATORS:
+            told = summarise([of[estimator.name] for _, of in scored])
+            result[estimator.name][floor] = asdict(told)
+            lines.append(
+                f"| {told.relative_error_percent:.1f} | {estimator.name} | {told.mean_percent:.2f} / "
+                f"{told.max_percent:.2f} | {told.second_payload_percent:.2f} / {told.second_payload_max_percent:.2f} |"
+            )
+    if options.cells:
+        if len(list(COVERAGE.glob("*.npz"))) != options.cells:
+            make_coverage(options.cells, told=_tell)
+        inside, spread = coverage(model, cell.conditioning)
+        result["coverage_percent"] = {axis: float(share) for axis, share in zip(axes, inside, strict=True)}
+        result["score_rms"] = {axis: float(size) for axis, size in zip(axes, spread, strict=True)}
+        lines += ["", "| axis | " + " | ".join(axes) + " |", "|---" * (len(axes) + 1) + "|"]
+        shares, sizes = (" | ".join(texts) for texts in ((f"{x:.0f}" for x in inside), (f"{x:.2f}" for x in spread)))
+        lines.append(f"| 95 % intervals that hold the truth, % | {shares} |")
+        lines.append(f"| error / σ, root mean square | {sizes} |")
+    result["cells"] = cells
+    OUT.parent.mkdir(parents=True, exist_ok=True)
+    OUT.write_text(json.dumps(result, indent=2) + "\n")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,276 @@
+"""Recordings for the study of the estimators, over the real driver path: virtual bus, CANopen, MCAP.
+
+`python -m tests.studies.record_study --seeds 1 2 --floors 3.5` records what is missing and keeps what was recorded of
+the same cell, plan and software. Scoring code calls `record_study` for the same, or `study_logs` for what is there:
+
+    for logs in study_logs(SEEDS, ("3.5",)):
+        fitted = fit(logs.fit, holdout=logs.validation)
+        error = fitted.final.estimate.gains / logs.truth.gains_nm_per_a - 1
+
+Layout: out/ident-study/<floor>/<seed>/<run>.mcap with truth.json beside, out/ident-study/plans/<seed>-<plan>.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from daq.atomic_file import replace_file
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.log.metadata import VERSION
+from daq.plan import Plan, plan
+from daq.plan_file import load_plan, save_plan
+from daq.record import record
+from daq.resources import shipped_configurations
+from daq.version import software
+from drivers.bus import open_bus
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.spec import CellSpec
+from tests.studies.direct_cell import simulate_run
+from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
+from tests.studies.side_by_side import side_by_side
+from tests.studies.study_cells import Truth, declared_payload, spec_of, study_cell, truth_from, truth_of
+
+OUT = Path("out/ident-study")
+SEEDS = tuple(range(1, 9))
+FLOORS = {"3.5": 1.0, "10": 2.93}
+"""Relative error of the fit [%] and the factor of the clean cell's current noise that gives it (noise_floor.py)."""
+DURATION_S = 40.0
+PROCESSES = 2
+CELL = shipped_configurations() / "cells" / "demo.yaml"
+
+
+@dataclass(frozen=True, slots=True)
+class StudyRun:
+    """One run of each cell of the study.
+
+    Attributes:
+        name: stem of its log.
+        payload: mounted body, None without load.
+        plan: letter of its plan; each seed has its own.
+    """
+
+    name: str
+    payload: str | None
+    plan: str
+
+
+FIT = (
+    StudyRun("bare-1", None, "a"),
+    StudyRun("disc-1", "disc", "a"),
+    StudyRun("bare-2", None, "b"),
+    StudyRun("disc-2", "disc", "b"),
+)
+VALIDATION = (StudyRun("unused-bare", None, "c"), StudyRun("unused-disc", "disc", "c"))
+SECOND_PAYLOAD = (
+    StudyRun("plate-1", "plate", "d"),
+    StudyRun("plate-2", "plate", "e"),
+    StudyRun("plate-3", "plate", "f"),
+)
+RUNS = FIT + VALIDATION + SECOND_PAYLOAD
+
+
+@dataclass(frozen=True, slots=True)
+class StudyLogs:
+    """The logs of one cell of the study.
+
+    Attributes:
+        seed, floor: which cell.
+        truth: for scoring alone.
+        fit: two runs without load and two with the disc, of the weighed mass alone.
+        validation: one without load and one with the disc, that no fit may use.
+        second_payload: three runs with the plate, of which the logs say nothing but that it is mounted.
+    """
+
+    seed: int
+    floor: str
+    truth: Truth
+    fit: tuple[Path, ...]
+    validation: tuple[Path, ...]
+    second_payload: tuple[Path, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _PlanTask:
+    out: Path
+    seed: int
+    plan: str
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _RunTask:
+    out: Path
+    seed: int
+    floor: str
+    run: StudyRun
+
+
+def record_study(
+    seeds: Sequence[int],
+    floors: Sequence[str],
+    *,
+    out: Path = OUT,
+    duration_s: float = DURATION_S,
+    processes: int = PROCESSES,
+    told: Callable[[str], None] = lambda _: None,
+) -> tuple[StudyLogs, ...]:
+    """Record what is missing of some cells of the study.
+
+    Args:
+        seeds, floors: which cells; floors by their names in FLOORS.
+        out: folder of the study.
+        duration_s: of each run [s].
+        processes: side by side.
+        told: what was done, a line a plan or run.
+
+    Raises:
+        TaskFailed: planning or recording failed; what was finished before is kept.
+    """
+    letters = sorted({run.plan for run in RUNS})
+    plans = [_PlanTask(out, seed, letter, duration_s) for seed in seeds for letter in letters]
+    runs = [_RunTask(out, seed, floor, run) for floor in floors for seed in seeds for run in RUNS]
+    for floor in floors:
+        for seed in seeds:
+            truth = truth_of(study_cell(seed, FLOORS[floor]))
+            path = _folder(out, floor, seed) / "truth.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            replace_file(path, (json.dumps(asdict(truth), indent=1) + "\n").encode())
+    (out / "plans").mkdir(parents=True, exist_ok=True)
+    for line in side_by_side(_plan, plans, processes):
+        told(line)
+    for line in side_by_side(_record, runs, processes):
+        told(line)
+    return study_logs(seeds, floors, out=out)
+
+
+def study_logs(seeds: Sequence[int], floors: Sequence[str], *, out: Path = OUT) -> tuple[StudyLogs, ...]:
+    """The recorded logs of some cells of the study, floor by floor.
+
+    Raises:
+        FileNotFoundError: one of them has not been recorded.
+    """
+    return tuple(_logs(out, floor, seed) for floor in floors for seed in seeds)
+
+
+def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
+    folder = _folder(out, floor, seed)
+    fit, validation, second = (
+        tuple(folder / f"{run.name}.mcap" for run in runs) for runs in (FIT, VALIDATION, SECOND_PAYLOAD)
+    )
+    missing = [str(path) for path in (*fit, *validation, *second) if not path.is_file()]
+    if missing:
+        raise FileNotFoundError(
+            f"found no {', '.join(missing)}; record with "
+            f"`python -m tests.studies.record_study --seeds {seed} --floors {floor}`"
+        )
+    truth = truth_from(json.loads((folder / "truth.json").read_text()))
+    return StudyLogs(seed, floor, truth, fit, validation, second)
+
+
+def _plan(task: _PlanTask) -> str:
+    """One plan, unless it is there and was made by the same planner."""
+    cell = load_cell(CELL)
+    path = task.out / "plans" / f"{task.seed}-{task.plan}.yaml"
+    number = 10 * task.seed + ord(task.plan) - ord("a")
+    fingerprint = digest(digest_of_source("daq.plan"), cell.digest, number, task.duration_s)
+    if is_finished(path, fingerprint):
+        return f"plan {path.stem}: kept"
+    begun_s = time.perf_counter()
+    made = plan(cell, seed=number, duration_s=task.duration_s)
+    save_plan(made, path)
+    finish(path, fingerprint)
+    return f"plan {path.stem}: {len(made.moves)} moves, condition {made.condition:.0f}, {_since(begun_s)}"
+
+
+def _record(task: _RunTask) -> str:
+    """One run, unless its log is there and was recorded of the same cell, plan and software."""
+    cell = load_cell(CELL)
+    # From the file, as a technician's recording would be: the log then belongs to the plan that can be read.
+    moves = load_plan(task.out / "plans" / f"{task.seed}-{task.run.plan}.yaml", cell)
+    spec = spec_of(study_cell(task.seed, FLOORS[task.floor]), task.run.payload, RUNS.index(task.run))
+    path = _folder(task.out, task.floor, task.seed) / f"{task.run.name}.mcap"
+    fingerprint = _fingerprint(cell, spec, moves, task.run)
+    title = f"{task.floor} %, seed {task.seed}, {task.run.name}"
+    if is_finished(path, fingerprint):
+        return f"{title}: kept"
+    for leftover in (path, path.with_name(path.name + ".part")):
+        leftover.unlink(missing_ok=True)
+    begun_s = time.perf_counter()
+    bus = open_bus(bus_address(cell))
+    try:
+        with SimulatedCell(spec, bus):
+            recorded = record(
+                CELL,
+                cell,
+                moves,
+                path,
+                payload=None if task.run.payload is None else declared_payload(task.run.payload),
+                operator="study",
+                granted_by="the study of the estimators: a simulated cell",
+                run_id=f"study-{task.floor}-{task.seed}-{task.run.name}",
+            )
+    finally:
+        bus.shutdown()
+    if not recorded.log.valid:
+        raise RuntimeError(f"{path}: {recorded.log.reason}; record again on a machine with less to do")
+    finish(path, fingerprint)
+    return f"{title}: {recorded.log.samples} samples, {path.stat().st_size / 1e6:.1f} MB, {_since(begun_s)}"
+
+
+def _folder(out: Path, floor: str, seed: int) -> Path:
+    return out / floor / str(seed)
+
+
+def _fingerprint(cell: Cell, spec: CellSpec, moves: Plan, run: StudyRun) -> str:
+    """Of everything that decides what is in a log, but the time of day.
+
+    Of the simulator and the walk of the moves it takes what they do, not how they are written: the samples of the first
+    move, which the direct path gives as they would be in the log.
+    """
+    declared = None if run.payload is None else declared_payload(run.payload)
+    truth = (spec.urdf, spec.gravity_m_s2, spec.ratio.tolist(), spec.axes, spec.start_rad.tolist(), spec.payload)
+    simulation = (*truth, spec.effects, spec.sync_period_us, spec.substeps, spec.seed)
+    probe = simulate_run(cell, spec, replace(moves, moves=moves.moves[:1]), run.name, declared)
+    samples = (probe.position_counts.tobytes(), probe.current_raw.tobytes(), probe.move.tobytes())
+    return digest(software(), VERSION, cell.digest, simulation, moves.moves, declared, samples)
+
+
+def _since(begun_s: float) -> str:
+    return f"{time.perf_counter() - begun_s:.1f} s"
+
+
+def _tell(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Record what is missing."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.record_study", description=__doc__)
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
+    parser.add_argument("--floors", choices=tuple(FLOORS), nargs="+", default=list(FLOORS))
+    parser.add_argument("--duration", type=float, default=DURATION_S, help="of each run [s]")
+    parser.add_argument("--processes", type=int, default=PROCESSES)
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args(arguments)
+    record_study(
+        options.seeds,
+        options.floors,
+        out=options.out,
+        duration_s=options.duration,
+        processes=options.processes,
+        told=_tell,
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,240 @@
+"""The simulated cells of the studies: each seed has a truth of its own, drawn around the clean cell.
+
+Nothing that records or fits reads a truth: the simulator is built from it, and the scoring is given `Truth`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+
+from daq.configuration.simulation import load_simulation, shipped_simulation
+from drivers.simulated.spec import AxisSpec, Body, CellSpec
+from ident.link import LINK_PARAMETERS
+from ident.payload import Payload
+
+PAYLOADS = ("disc", "plate")
+GAIN_SPREAD = 0.10
+"""Half-widths of uniform draws, as a share of the clean cell's value: gains keep their sign."""
+FRICTION_SPREAD = 0.30
+INERTIA_SPREAD = 0.20
+LINK_SPREAD = 0.10
+"""Of each link's mass and, with it, of its inertia about its centre of mass: another density."""
+LINK_CENTRE_M = 0.005
+"""Half-widths of uniform displacements of a centre of mass [m]."""
+PAYLOAD_CENTRE_M = 0.010
+PAYLOAD_INERTIA_SPREAD = 0.20
+CAD_CENTRE_STD_M = 0.001
+CAD_INERTIA_STD = 0.03
+"""How far the CAD model of a payload is off, standard deviations: mounted 1 mm beside the drawing, simple solids."""
+
+
+@dataclass(frozen=True, slots=True)
+class PayloadTruth:
+    """One body that can be mounted.
+
+    Attributes:
+        mass_kg: true, and as weighed: a wrong weight is no business of these studies.
+        parameters: the ten true inertial parameters in the frame of the last joint, by LINK_PARAMETERS.
+        cad: the ten as a CAD model gives them: the weighed mass, centre and inertia with the errors stated above.
+    """
+
+    mass_kg: float
+    parameters: dict[str, float]
+    cad: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a fit of a study's cell is scored with.
+
+    Attributes:
+        seed: of the cell.
+        noise_factor: of the current noise, against the clean cell.
+        gains_nm_per_a: true joint drive gains, by axis.
+        payloads: by name.
+        axes: everything true of each axis (drivers.simulated.spec.AxisSpec).
+    """
+
+    seed: int
+    noise_factor: float
+    gains_nm_per_a: tuple[float, ...]
+    payloads: dict[str, PayloadTruth]
+    axes: tuple[dict[str, Any], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StudyCell:
+    """One simulated cell; what is mounted and the noise of a run are chosen by `spec_of`.
+
+    Attributes:
+        seed: it was drawn from.
+        noise_factor: of the current noise, against the clean cell.
+        bare: without load.
+        bodies: that can be mounted, by name.
+    """
+
+    seed: int
+    noise_factor: float
+    bare: CellSpec
+    bodies: dict[str, Body]
+
+
+def study_cell(seed: int, noise_factor: float = 1.0) -> StudyCell:
+    """Draw a cell.
+
+    The noise factor changes the noise alone: cells of one seed have one truth on every noise floor.
+
+    Args:
+        seed: the same seed gives the same cell.
+        noise_factor: of the current noise, against the clean cell.
+
+    Raises:
+        ConfigurationError: from the clean cell's file.
+    """
+    path = shipped_simulation("clean")
+    bare = load_simulation(path)
+    axes_rng, links_rng, payload_rng = (
+        np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(part,))) for part in range(3)
+    )
+    bodies = {}
+    for name in PAYLOADS:
+        body = load_simulation(path, name).payload
+        if body is None:
+            raise ValueError(f"payload {name} of {path}: no body")
+        bodies[name] = _drawn_body(body, payload_rng)
+    spec = replace(
+        bare,
+        urdf=_drawn_links(bare.urdf, links_rng),
+        axes=tuple(_drawn_axis(axis, axes_rng, noise_factor) for axis in bare.axes),
+    )
+    return StudyCell(seed, noise_factor, spec, bodies)
+
+
+def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
+    """The cell as it is for one run.
+
+    Args:
+        cell: drawn.
+        payload: name of the mounted body, or None.
+        run: each run of a cell has a noise of its own.
+    """
+    body = None if payload is None else cell.bodies[payload]
+    return replace(cell.bare, payload=body, seed=1000 * cell.seed + run)
+
+
+def truth_of(cell: StudyCell) -> Truth:
+    """What a fit of this cell is scored with."""
+    rng = np.random.default_rng(np.random.SeedSequence(cell.seed, spawn_key=(3,)))
+    payloads = {}
+    for name, body in cell.bodies.items():
+        drawing = Body(
+            body.mass_kg,
+            _triple(np.array(body.centre_m) + CAD_CENTRE_STD_M * rng.standard_normal(3)),
+            _scaled_inertia(body, 1.0 + CAD_INERTIA_STD * float(rng.standard_normal())),
+        )
+        payloads[name] = PayloadTruth(body.mass_kg, link_parameters(body), link_parameters(drawing))
+    return Truth(
+        cell.seed,
+        cell.noise_factor,
+        tuple(axis.gain_nm_per_a for axis in cell.bare.axes),
+        payloads,
+        tuple(asdict(axis) for axis in cell.bare.axes),
+    )
+
+
+def truth_from(document: dict[str, Any]) -> Truth:
+    """What `dataclasses.asdict` made of a truth, read back from JSON."""
+    return Truth(
+        seed=document["seed"],
+        noise_factor=document["noise_factor"],
+        gains_nm_per_a=tuple(document["gains_nm_per_a"]),
+        payloads={name: PayloadTruth(**payload) for name, payload in document["payloads"].items()},
+        axes=tuple(document["axes"]),
+    )
+
+
+def declared_payload(name: str) -> Payload:
+    """What a log of the study says of a payload: the weighed mass of the disc alone, of the plate nothing.
+
+    The plate's mass is what the study looks for (paper, Tables 7 and 8).
+    """
+    known = {"m": study_masses()["disc"]} if name == "disc" else {}
+    return Payload(name, "flange-a", known)
+
+
+def study_masses() -> dict[str, float]:
+    """Masses of the payloads [kg]; every seed has the same."""
+    path = shipped_simulation("clean")
+    bodies = {name: load_simulation(path, name).payload for name in PAYLOADS}
+    return {name: body.mass_kg for name, body in bodies.items() if body is not None}
+
+
+def link_parameters(body: Body) -> dict[str, float]:
+    """The ten inertial parameters of a body in the frame that it is fixed to, by LINK_PARAMETERS."""
+    xx, xy, xz, yy, yz, zz = body.inertia_kg_m2
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    parts = pin.Inertia(body.mass_kg, np.array(body.centre_m), inertia).toDynamicParameters()
+    m, mx, my, mz, ixx, ixy, iyy, ixz, iyz, izz = (float(part) for part in parts)
+    return dict(zip(LINK_PARAMETERS, (ixx, ixy, ixz, iyy, iyz, izz, mx, my, mz, m), strict=True))
+
+
+def _drawn_axis(axis: AxisSpec, rng: np.random.Generator, noise_factor: float) -> AxisSpec:
+    def around(value: float, spread: float) -> float:
+        return value * (1.0 + spread * float(rng.uniform(-1.0, 1.0)))
+
+    return replace(
+        axis,
+        gain_nm_per_a=around(axis.gain_nm_per_a, GAIN_SPREAD),
+        motor_inertia_kg_m2=around(axis.motor_inertia_kg_m2, INERTIA_SPREAD),
+        viscous_nm_s_rad=around(axis.viscous_nm_s_rad, FRICTION_SPREAD),
+        coulomb_nm=around(axis.coulomb_nm, FRICTION_SPREAD),
+        motor_viscous_nm_s_rad=around(axis.motor_viscous_nm_s_rad, FRICTION_SPREAD),
+        motor_coulomb_nm=around(axis.motor_coulomb_nm, FRICTION_SPREAD),
+        offset_nm=around(axis.offset_nm, FRICTION_SPREAD),
+        current_noise_a=noise_factor * axis.current_noise_a,
+    )
+
+
+def _drawn_body(body: Body, rng: np.random.Generator) -> Body:
+    """The same mass, mounted a little elsewhere, and of another shape as far as its inertia goes."""
+    centre = np.array(body.centre_m) + PAYLOAD_CENTRE_M * rng.uniform(-1.0, 1.0, 3)
+    scale = 1.0 + PAYLOAD_INERTIA_SPREAD * float(rng.uniform(-1.0, 1.0))
+    return replace(body, centre_m=_triple(centre), inertia_kg_m2=_scaled_inertia(body, scale))
+
+
+def _drawn_links(urdf: str, rng: np.random.Generator) -> str:
+    """Every link with another density and another centre of mass: still a body that can exist."""
+    # The text is a file of this repository, no stranger's.
+    robot = ElementTree.fromstring(urdf)
+    for inertial in robot.iterfind("link/inertial"):
+        scale = 1.0 + LINK_SPREAD * float(rng.uniform(-1.0, 1.0))
+        shift = LINK_CENTRE_M * rng.uniform(-1.0, 1.0, 3)
+        origin, mass, inertia = (_child(inertial, tag) for tag in ("origin", "mass", "inertia"))
+        centre = np.array([float(value) for value in origin.attrib["xyz"].split()]) + shift
+        origin.attrib["xyz"] = " ".join(repr(float(value)) for value in centre)
+        mass.attrib["value"] = repr(scale * float(mass.attrib["value"]))
+        for key, value in inertia.attrib.items():
+            inertia.attrib[key] = repr(scale * float(value))
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _child(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    found = element.find(tag)
+    if found is None:
+        raise ValueError(f"the plant's URDF: a link's inertial has no <{tag}>")
+    return found
+
+
+def _scaled_inertia(body: Body, scale: float) -> tuple[float, float, float, float, float, float]:
+    xx, xy, xz, yy, yz, zz = (scale * value for value in body.inertia_kg_m2)
+    return xx, xy, xz, yy, yz, zz
+
+
+def _triple(values: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
