@@ -9,14 +9,19 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test check gain-study wheel lock clean
+.PHONY: help setup demo test check bench ident-study gain-study paper planning-study robot-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
-	@echo "make gain-study  errors of the gains over several clean simulated cells (docs/estimators.md); minutes"
+	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
+	@echo "make ident-study  errors by estimator and noise floor, and whether error bars are true (docs/estimators.md); 40 min"
+	@echo "make gain-study  the demonstration on several clean cells; minutes"
+	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/paper.md); minutes"
+	@echo "make planning-study  planned against random moves (docs/planning.md); minutes"
+	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/robots.md); minutes"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
 	@echo "make clean   remove .venv and everything made"
@@ -51,8 +56,23 @@ check: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+bench: setup
+	$(BIN)/python -m tests.bench
+
+ident-study: setup
+	$(BIN)/python -m tests.studies.ident_study
+
 gain-study: setup
 	$(BIN)/python -m tests.studies.clean_cells
+
+paper: setup
+	$(BIN)/python -m tests.studies.paper_tables
+
+planning-study: setup
+	$(BIN)/python -m tests.studies.planning
+
+robot-study: setup
+	$(BIN)/python -m tests.studies.any_robot
 
 wheel: setup
 	$(BIN)/python -m pip wheel -qq --no-deps --no-build-isolation --wheel-dir dist .

@@ -65,7 +65,7 @@ class CheckedRun:
         run: its name.
         condition: of its weighted observation matrix, None where the run alone does not show the base parameters.
         errors: ‖ρ‖/‖Y‖ by label of the calibration; calibrations that cannot predict the run are not in it.
-        left_out: why one of them cannot, empty where all can.
+        left_out: why some of them cannot, empty where all can.
         seen_by: labels of calibrations whose fit has seen it.
     """
 
@@ -132,12 +132,12 @@ def cross_validate(
         run, described = load_run(log, cell)
         model = model_of(described)
         found: dict[str, Validation] = {}
-        left_out = ""
+        reasons: dict[str, list[str]] = {}
         for label, calibration in calibrations.items():
             check_cell(calibration, log, described)
             reason = unpredictable(calibration, run.payload)
             if reason:
-                left_out = f"{label} {reason}"
+                reasons.setdefault(reason, []).append(label)
             else:
                 found[label] = predicted(calibration, conditioning, model, log, run, described.digest)
         if first in found:
@@ -153,7 +153,10 @@ def cross_validate(
                 run=run.name,
                 condition=_condition(reduction, calibrations[first]),
                 errors={label: validation.error for label, validation in found.items()},
-                left_out=left_out,
+                left_out="; ".join(
+                    reason if len(labels) == len(calibrations) else f"{reason} ({', '.join(labels)})"
+                    for reason, labels in reasons.items()
+                ),
                 seen_by=tuple(label for label, v in found.items() if v.acquaintance is Acquaintance.FIT),
             )
         )

@@ -165,7 +165,14 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "error_after_percent": _total(after),
         "error_before_percent_axes": _axes(before),
         "error_after_percent_axes": _axes(after),
-        "plans": [{"moves": len(plan.moves), "condition": plan.condition} for plan in outcome.plans],
+        "plans": [
+            {
+                "moves": len(plan.moves),
+                "condition": plan.condition,
+                "predicted_std_percent": list(plan.predicted_std_percent),
+            }
+            for plan in outcome.plans
+        ],
         "logs": [
             {
                 "log": run.path.name,
@@ -210,13 +217,13 @@ def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
 
 
 def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
-    exchanges = 200
+    exchanges = 800
     made = plan(
         cell,
         seed=10 * settings.seed + index,
         duration_s=settings.duration_s,
         exchanges=exchanges,
-        progress=lambda done, value: telling.progress(done, exchanges, f"plan {PLANS[index]}, condition {value:.0f}"),
+        progress=lambda done, std: telling.progress(done, exchanges, f"plan {PLANS[index]}, worst gain σ {std:.2f} %"),
     )
     save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
     return made

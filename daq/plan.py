@@ -6,23 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
 from daq.configuration.joint_unit import JointUnit
 from daq.errors import PlanUnfit
 from daq.experiment import Experiment, experiment_of
-from daq.plan_search import Draft, Search
-from daq.planned_move import PlannedMove, duration_of, path_of
-from ident.excitation import condition, weighted_columns
-
-__all__ = ["EXCHANGES", "LARGEST_CONDITION", "LARGEST_STD_PERCENT", "Plan", "path_of", "plan", "slowed", "units_of"]
-
-FloatArray = NDArray[np.float64]
+from daq.plan_search import Search
+from daq.planned_move import PlannedMove, duration_of
 
 LARGEST_CONDITION = 3500.0
 """Of the weighted observation matrix; the paper's trajectories have 1930 to 2817 (Table 5)."""
-LARGEST_STD_PERCENT = 25.0
+LARGEST_STD_PERCENT = 10.0
 """Predicted for the worst gain; a plan above it could as well not be made."""
 EXCHANGES = 3000
 
@@ -91,10 +85,10 @@ def plan(
         ConfigurationInconsistent: the cell declares no payload.
     """
     experiment = experiment or experiment_of(cell)
-    search = Search(experiment, np.random.default_rng(seed), duration_s, speed)
+    search = Search(experiment, np.random.default_rng(seed), duration_s, speed, largest_condition)
     draft = search.improve(search.random_moves(), exchanges, lambda done, found: progress(done, float(np.max(found))))
-    found = condition_of(experiment, draft)
-    predicted = experiment.design.std_percent(np.sum(experiment.informations(draft.paths), axis=0))
+    information = np.sum(experiment.informations(draft.paths), axis=0)
+    predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
     worst = int(np.argmax(predicted))
     subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
@@ -121,15 +115,6 @@ def plan(
         moves=draft.moves,
         units=units_of(cell),
     )
-
-
-def condition_of(experiment: Experiment, draft: Draft) -> float:
-    """Condition number of W without load, rows weighted by nameplate gains."""
-    design = experiment.design
-    # Equal noise in every current reference; only its ratio between the joints matters.
-    noise = np.abs(design.expectation.gains)
-    motion = experiment.excitation(draft.paths)[0].motion
-    return condition(weighted_columns(design.expectation.model, motion, noise)[:, list(design.base.independent)])
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:

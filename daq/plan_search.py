@@ -37,6 +37,8 @@ FEWEST_MOVES = 5
 MOST_TRIES = 100
 """Random postures or ways that are tried from one place before it counts as shut in."""
 MOST_RETREATS = 30
+MOST_STARTS = 10
+"""Random plans that are begun before the run counts as too short."""
 PLACES = 3
 """Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says."""
 
@@ -78,12 +80,20 @@ class Draft:
 class Search:
     """Random moves, and their exchange."""
 
-    def __init__(self, experiment: Experiment, rng: np.random.Generator, duration_s: float, speed: float) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        rng: np.random.Generator,
+        duration_s: float,
+        speed: float,
+        largest_condition: float,
+    ) -> None:
         self._experiment = experiment
         self._cell = experiment.cell
         self._rng = rng
         self._duration_s = duration_s
         self._speed = speed
+        self._largest_condition = largest_condition
         limits = np.array([axis.limits.position for axis in self._cell.axes])
         margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
         self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
@@ -94,24 +104,35 @@ class Search:
         Raises:
             PlanUnfit: it has no room for five moves, or no clear way is found.
         """
+        most: list[PlannedMove] = []
+        for _ in range(MOST_STARTS):
+            moves, paths = self._filled()
+            if len(moves) >= FEWEST_MOVES:
+                return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
+            most = max(most, moves, key=len)
+        raise self._unfit(f"room for {len(most)} moves", "at least 5, better 30", "allow a longer run")
+
+    def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
         moves, paths = [self._clear_start()], list[Trapezoid]()
-        retreats = 0
+        left, retreats = self._duration_s - DWELL_S, 0
         while True:
             move = self._clear_move(np.array(moves[-1].target_rad))
-            if move is None:  # a corner that the random targets before it led into
-                retreats += 1
-                if retreats > MOST_RETREATS:
-                    raise self._blocked("way")
-                moves, paths = (moves[:-1], paths[:-1]) if paths else ([self._clear_start()], [])
+            if move is not None:
+                path = path_of(self._cell, np.array(moves[-1].target_rad), move)
+                left -= path.duration_s + move.dwell_s
+                if left < 0.0:
+                    return moves, paths
+                moves.append(move)
+                paths.append(path)
                 continue
-            path = path_of(self._cell, np.array(moves[-1].target_rad), move)
-            if Draft(tuple(moves), tuple(paths), ()).duration_s + path.duration_s + move.dwell_s > self._duration_s:
-                break
-            moves.append(move)
-            paths.append(path)
-        if len(moves) < FEWEST_MOVES:
-            raise self._unfit(f"room for {len(moves)} moves", "at least 5, better 30", "allow a longer run")
-        return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
+            # A corner that the random targets before it led into.
+            retreats += 1
+            if retreats > MOST_RETREATS:
+                raise self._blocked("way")
+            if paths:
+                left += paths.pop().duration_s + moves.pop().dwell_s
+            else:
+                moves = [self._clear_start()]
 
     def improve(self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]) -> Draft:
         """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed.
@@ -121,23 +142,29 @@ class Search:
             tries: proposals; every one of them is made.
             progress: told the number of tries and the predicted deviations so far [%].
         """
-        design = self._experiment.design
-        best = design.std_percent(np.sum(draft.informations, axis=0))
+        best, worst = self._judge(draft, np.inf)
         done = 0
         while done < tries:
             count = min(ROUND, tries - done)
-            proposals = [self._proposal(draft.moves) for _ in range(count)]
-            judged: list[tuple[float, int, Draft, FloatArray]] = []
-            for candidate in self._drafts(draft, proposals):
-                if candidate.duration_s <= self._duration_s:
-                    found = design.std_percent(np.sum(candidate.informations, axis=0))
-                    judged.append((_worst(found), len(judged), candidate, found))
+            chosen = draft
             # One a round: proposals that were made from the same moves do not go together.
-            if judged and min(judged)[0] < _worst(best):
-                _, _, draft, best = min(judged)
+            for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
+                value, found = self._judge(candidate, best)
+                if value < best:
+                    chosen, best, worst = candidate, value, found
+            draft = chosen
             done += count
-            progress(done, best)
+            progress(done, worst)
         return draft
+
+    def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
+        """What the search lowers, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
+        information = np.sum(draft.informations, axis=0)
+        found = self._experiment.design.std_percent(information)
+        value = _worst(found)
+        if value < to_beat:  # the condition can only raise it
+            value *= max(1.0, self._experiment.design.condition(information) / self._largest_condition) ** 2
+        return value, found
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
         rng = self._rng

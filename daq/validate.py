@@ -162,13 +162,9 @@ def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
     if payload is None or set(payload.known) == set(LINK_PARAMETERS):
         return ""
     if "m" not in payload.known:
-        return f"is not asked to predict payload {payload.name!r}: its log leaves the mass open, it is to be found"
+        return f"payload {payload.name!r} is not predicted: the log leaves its mass open"
     if not _of_mounting(calibration, payload):
-        mountings = sorted({p.name.partition(":")[2] for p in calibration.parameters if ":" in p.name})
-        known = ", ".join(map(repr, mountings)) or "none"
-        return (
-            f"cannot predict payload {payload.name!r}: it knows nothing of mounting {payload.mounting!r}, but {known}"
-        )
+        return f"payload {payload.name!r} is not predicted: nothing is known of mounting {payload.mounting!r}"
     return ""
 
 

@@ -130,12 +130,6 @@ def visible(model: Model, motion: Motion) -> BaseParameters:
     return base_parameters(triangle, tuple(column.name for column in model.columns))
 
 
-def condition(triangle_or_rows: FloatArray) -> float:
-    """Condition number of the weighted observation matrix W; inf when a column is not seen."""
-    values = np.linalg.svd(triangle_or_rows, compute_uv=False)
-    return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
     """The unknowns of an experiment, and the information that excitations give about them.
@@ -237,6 +231,12 @@ class Design:
             place += range(base + before, base + before + len(unknown))
             source += [base + index for index in unknown]
         return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
+
+    def condition(self, information: FloatArray) -> float:
+        """Condition number of the observation matrix W, rows weighted by their noise; inf when a column is not seen."""
+        base = len(self.base.independent)
+        values = np.linalg.eigvalsh(information[:base, :base])
+        return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
 
     def std_percent(self, information: FloatArray) -> FloatArray:
         """Standard deviation predicted for each gain, shape (n,) [% of it]; inf where nothing is said of it."""

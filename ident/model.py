@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ident.drive_train import DriveTrain
 from ident.link import LINK_PARAMETERS, LINK_UNITS
 from ident.motion import Motion
-from ident.regressor import rigid_regressor
+from ident.regressor import fill_rigid
 from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
@@ -96,14 +96,11 @@ class Model:
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
-        rigid = rigid_regressor(self.robot, position, velocity, acceleration)
+        by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
+        fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, :10])
         for joint in range(count):
-            first = 14 * joint
-            out[:, first : first + 10] = rigid[:, 10 * joint : 10 * joint + 10]
-            out[joint, first + 10] = acceleration[joint]
-            out[joint, first + 11] = velocity[joint]
-            out[joint, first + 12] = sign[joint]
-            out[joint, first + 13] = 1.0
+            own = by_link[joint, joint]
+            own[10], own[11], own[12], own[13] = acceleration[joint], velocity[joint], sign[joint], 1.0
         direction = self.drive_train.direction
         motor_speed = direction @ velocity
         for index, motor in enumerate(self.drive_train.coupled):

@@ -29,7 +29,7 @@ from ident.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
-BLOCK_SAMPLES = 2048
+BLOCK_SAMPLES = 1024
 """Samples computed at once: their screws and products stay in a core's own cache."""
 
 
@@ -100,9 +100,11 @@ class _Link:
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Arrays that every block uses again: V, A and the movers' screws of each link (the base is the last), and Y."""
+    """Arrays that every block uses again: V, A and the movers' screws of each link (the base is the last), X_f times
+    the parent's (flat, room for the longest), and Y."""
 
     screws: tuple[FloatArray, ...]
+    products: FloatArray
     inertia: FloatArray
     moments: FloatArray
 
@@ -140,7 +142,8 @@ def _work(robot: Robot, links: tuple[_Link, ...], samples: int) -> _Work:
     screws = [np.empty((6, 2 + len(link.movers), samples)) for link in links]
     for link, array in zip(links, screws, strict=True):
         array[:, -1] = link.own[:, None]
-    return _Work((*screws, base), np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
+    products = np.empty(18 * (1 + robot.joint_count) * samples)
+    return _Work((*screws, base), products, np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
 
 
 def _move(
@@ -148,7 +151,9 @@ def _move(
 ) -> None:
     before, here = work.screws[link.parent], work.screws[index]
     factors = (np.cos(position), np.sin(position)) if link.revolute else (position,)
-    parts = (link.transforms @ before.reshape(6, -1)).reshape(-1, *before.shape)
+    flat = before.reshape(6, -1)
+    parts = work.products[: len(link.transforms) * flat.shape[1]].reshape(-1, *before.shape)
+    np.matmul(link.transforms, flat, out=parts.reshape(-1, flat.shape[1]))
     carried = parts[0]
     for number, factor in enumerate(factors, start=1):
         parts[number] *= factor

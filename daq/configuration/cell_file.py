@@ -179,14 +179,20 @@ def _conditioning(model: ConditioningModel) -> Conditioning:
 def _payload(model: PayloadModel) -> WeighedPayload:
     known = {} if model.known is None else model.known.model_dump(exclude_none=True)
     if model.centre_m is not None:
-        known = _drawn(model.mass_kg, model.centre_m, model.inertia_kg_m2)
+        known = drawn_parameters(model.mass_kg, model.centre_m, model.inertia_kg_m2)
     return WeighedPayload(model.name, model.mounting, model.mass_kg, model.mass_tolerance_kg, known)
 
 
-def _drawn(
+def drawn_parameters(
     mass_kg: float, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
 ) -> dict[str, float]:
-    """First moments and, where it is given, the inertia moved to the frame's origin (Steiner)."""
+    """First moments and, where it is given, the inertia moved to the frame's origin (Steiner), by LINK_PARAMETERS.
+
+    Args:
+        mass_kg: of the body.
+        centre_m: of mass, shape (3,).
+        about_centre_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass, in the directions of the frame.
+    """
     centre = np.array(centre_m)
     known = dict(zip(("mx", "my", "mz"), (mass_kg * centre).tolist(), strict=True))
     if about_centre_kg_m2 is not None:

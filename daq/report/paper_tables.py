@@ -14,6 +14,7 @@ from daq.cross_validation import CrossValidation, Failure
 from ident.calibration import Calibration, Parameter
 
 NONE = "—"
+SIGMA_NOTE = "%σ as of the method: eqs. (10) of wls and (23) of tls take rows as independent, and say too little."
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
         notes=(
             f"%e is the difference from the first value; its mean is {percent(_mean(differences))} %. "
             f"R: other parameters are regrouped with this one. {NONE} for %σ: given. SI units.",
+            SIGMA_NOTE,
         ),
     )
 
@@ -104,7 +106,7 @@ def gain_table(number: int, first: Calibration, second: Calibration, method: str
         title=f"Table {number}: drive gains, {method}",
         headings=("axis", "a priori", "10 CAD: gain", "%σ", "%e", "mass alone: gain", "%σ", "%e"),
         rows=(*rows, ("mean", "", "", "", percent(means[0]), "", "", percent(means[1]))),
-        notes=("%e is the change from the a priori gain.",),
+        notes=("%e is the change from the a priori gain.", SIGMA_NOTE),
     )
 
 
@@ -124,6 +126,8 @@ def error_table(found: CrossValidation) -> PaperTable:
     rows = []
     for run in found.runs:
         errors = [run.errors.get(label) for label in labels]
+        if not run.errors:
+            continue
         for index, axis in enumerate(axes):
             rows.append(
                 (f"{run.run}, {axis}", *(NONE if error is None else percent(error.axes[index]) for error in errors))
@@ -132,7 +136,11 @@ def error_table(found: CrossValidation) -> PaperTable:
         _mean([value for run in found.runs if (error := run.errors.get(label)) is not None for value in error.axes])
         for label in labels
     ]
-    unmet = [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
+    reasons: dict[str, list[str]] = {}
+    for run in found.runs:
+        if run.left_out:
+            reasons.setdefault(run.left_out, []).append(run.run)
+    unmet = [f"{', '.join(runs)}: {reason}." for reason, runs in reasons.items()]
     seen = sorted({run.run for run in found.runs if run.seen_by})
     notes = [f"Seen by a fit: {', '.join(seen)}."] if seen else []
     return PaperTable(

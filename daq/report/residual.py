@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from daq.report.picture import (
     BLUE,
@@ -20,6 +20,9 @@ from daq.report.picture import (
     save_png,
     thinned,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _POINTS = 2000
 _BINS = 40

@@ -1,7 +1,8 @@
 """`make bench`: speed and memory against figaroh, growth to 4 million samples, and the processor time of a whole fit.
 
 Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
-One core: every child process gets one thread for its linear algebra, figaroh's too.
+Each job runs in a child process of its own, and this one stays small: Linux counts what a parent holds to the peak of
+its children. One core: every child process gets one thread for its linear algebra, figaroh's too.
 """
 
 from __future__ import annotations
@@ -19,15 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from ident.robot import robot_from_urdf
-from tests.bench.finished_logs import finished_logs
-from tests.bench.synthetic import measurements
-
 OUT = Path("out/bench")
 RESULT = Path("out/bench.json")
 FIGAROH_VENV = Path("out/bench-venv")
 FIGAROH = "figaroh==1.0.2"
 URDF = Path("configs/robots/tx40.urdf")
+LOGS = ("bare", "loaded")
 SAMPLES = 100_000
 SIZES = (100_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
 ENVIRONMENT = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -59,13 +57,8 @@ def _comparison(repeats: int) -> dict[str, Any]:
     python = _figaroh_python()
     data = OUT / "measurements.npz"
     _tell(f"{SAMPLES} samples × 6 axes: rows of 84 standard parameters, base parameters, least squares; one core")
-    pieces = list(measurements(robot_from_urdf(URDF.read_text()), SAMPLES))
-    joined = [
-        np.concatenate([getattr(motion, name) for motion, _ in pieces], axis=1)
-        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
-    ]
-    torque = np.concatenate([torque for _, torque in pieces], axis=1)
-    np.savez(data, q=joined[0], v=joined[1], a=joined[2], torque=torque)
+    make = [sys.executable, "-m", "tests.bench.synthetic", str(URDF), str(SAMPLES), str(data)]
+    subprocess.run(make, env=ENVIRONMENT, check=True)
     predicted = {"ours": OUT / "predicted-ours.npy", "figaroh": OUT / "predicted-figaroh.npy"}
     commands = {
         "ours": [sys.executable, "-m", "tests.bench.our_fit"],
@@ -109,8 +102,9 @@ def _growth(sizes: tuple[int, ...]) -> list[dict[str, Any]]:
 
 
 def _whole_fit(repeats: int) -> dict[str, Any]:
-    logs = finished_logs(OUT, _tell)
-    command = [sys.executable, "-m", "daq", "fit", *map(str, logs), "--method", "ml", "--json"]
+    subprocess.run([sys.executable, "-m", "tests.bench.finished_logs", str(OUT)], check=True)
+    logs = [str(OUT / f"{name}.mcap") for name in LOGS]
+    command = [sys.executable, "-m", "daq", "fit", *logs, "--method", "ml", "--json"]
     runs = []
     for _ in range(repeats):
         calibration = OUT / "calibration.yaml"

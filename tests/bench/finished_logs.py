@@ -1,11 +1,13 @@
 """Two finished logs of 60 s at 1 kHz, without load and with the weighed payload, from the simulated cell.
 
 Recorded over the real driver path once, and kept: a log has its final name only when it is whole.
+
+python -m tests.bench.finished_logs FOLDER     records what is missing
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,22 +26,24 @@ SEED = 20
 RUNS = (("bare", None), ("loaded", "disc"))
 
 
-def finished_logs(folder: Path, tell: Callable[[str], None]) -> tuple[Path, ...]:
-    """The logs in ``folder``; what is missing is recorded."""
+def main(path: str) -> None:
+    """Record what is missing."""
+    folder = Path(path)
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(cell_file)
     plan_path = folder / "plan.yaml"
     if not plan_path.exists():
-        tell(f"planning a run of {DURATION_S:g} s")
+        sys.stdout.write(f"planning a run of {DURATION_S:g} s\n")
         save_plan(plan(cell, seed=SEED, duration_s=DURATION_S), plan_path)
     moves = load_plan(plan_path, cell)
     payloads = {declared.name: declared.payload for declared in cell.payloads}
-    logs = tuple(folder / f"{name}.mcap" for name, _ in RUNS)
-    for index, (log, (name, payload)) in enumerate(zip(logs, RUNS, strict=True)):
+    for index, (name, payload) in enumerate(RUNS):
+        log = folder / f"{name}.mcap"
         if log.exists():
             continue
         log.with_name(log.name + ".part").unlink(missing_ok=True)
-        tell(f"recording {name} for {DURATION_S:g} s")
+        sys.stdout.write(f"recording {name} for {DURATION_S:g} s\n")
+        sys.stdout.flush()
         spec = load_simulation(shipped_simulation("clean"), payload)
         bus = open_bus(bus_address(cell))
         try:
@@ -56,4 +60,7 @@ def finished_logs(folder: Path, tell: Callable[[str], None]) -> tuple[Path, ...]
                 )
         finally:
             bus.shutdown()
-    return logs
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -81,13 +81,17 @@ def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> To
         for joint, links in enumerate(moved_links(robot))
     )
     triangles: list[FloatArray | None] = [None] * count
-    room = standard_rows(robot, 0)
+    indices = tuple(np.array(columns) for columns in places)
+    room, own = standard_rows(robot, 0), np.zeros((WIDTH * count + 1, 0))
     for motion, torque in pieces:
-        if room.shape[2] != torque.shape[1]:
-            room = standard_rows(robot, torque.shape[1])
+        samples = torque.shape[1]
+        if room.shape[2] != samples:
+            room, own = standard_rows(robot, samples), np.zeros((WIDTH * count + 1, samples))
         fill_rows(robot, motion, room)
-        for joint, columns in enumerate(places):
-            rows = np.concatenate((room[joint, columns], torque[joint][None]))
+        for joint, columns in enumerate(indices):
+            rows = own[: len(columns) + 1]
+            np.take(room[joint], columns, axis=0, out=rows[:-1], mode="clip")  # "raise" would go through a copy
+            rows[-1] = torque[joint]
             triangles[joint] = qr_update(triangles[joint], rows)
     last = WIDTH * count
     whole = qr_merge(
