@@ -13,7 +13,7 @@ import numpy as np
 from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.errors import ConfigurationInconsistent
-from daq.fit import Fit, _Reading, calibration_of, check_signs
+from daq.fit import Fit, Reading, calibration_of, check_signs
 from ident.calibration import Calibration, Parameter, Source
 from ident.errors import DataUnfit
 from ident.essential import Essential, essential
@@ -109,7 +109,7 @@ def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell |
     Raises:
         DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
     """
-    reading = _Reading(logs, cell)
+    reading = Reading(logs, cell)
     model, conditioning = model_of(reading.cell), reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning)
     unseen = reduce_runs(model, reading.runs(holdout, "holdout"), conditioning, payloads=used.payloads)

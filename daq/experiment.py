@@ -102,7 +102,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     """
     mounted = _payload(cell, payload)
     model = model_of(cell)
-    expected = nominal_payload(model.robot, mounted.payload)
+    expected = nominal_payload(model.robot, mounted.drawn)
     velocity = np.array([axis.limits.velocity for axis in cell.axes])
     acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
     lively = _lively(cell, velocity, acceleration)

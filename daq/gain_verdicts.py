@@ -14,6 +14,7 @@ from daq.experiment import LAG_ONE, experiment_of
 from daq.extra_moves import extra_moves
 from daq.fit import Fit
 from ident.dataset import differentiate
+from ident.estimate import Method
 from ident.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
 from ident.identify import Identification
 from ident.link import LINK_PARAMETERS
@@ -23,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a fit by ``ml`` with free gains; the logs are read again.
+    """Judge every gain of a fit with free gains; the logs are read again.
 
     The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
     scaled from the prediction as the fit's deviation is: moves tell of it, not the size of the noise.
@@ -35,12 +36,14 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     estimate, system = found.estimate, found.system
     standard = np.zeros(len(found.model.columns))
     standard[list(system.base.independent)] = estimate.parameters[: len(system.base.independent)]
+    # ml's noise is that of the current references, the others' that of the joint torques.
+    noise = estimate.axis_noise / (1.0 if estimate.method is Method.ML else np.abs(estimate.gains))
     expectation = Expectation(
         model=found.model,
         gains=estimate.gains,
         parameters=standard,
         payloads=_payloads(found),
-        noise_a=effective_noise(estimate.axis_noise, LAG_ONE),
+        noise_a=effective_noise(noise, LAG_ONE),
     )
     design = Design(expectation, system.base)
     judged = verdicts(design, list(_excitations(fitted)), _extras(fitted))
@@ -48,10 +51,11 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     return tuple(_scaled(gain, float(std)) for gain, std in zip(judged, true, strict=True))
 
 
-def all_good(fitted: Fit) -> bool:
-    """Whether every gain is known so well that nobody needs to ask by what."""
+def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """The verdicts, or none where the gains were given or all are known so well that nobody needs to ask by what."""
     estimate = fitted.final.estimate
-    return bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
+    good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
+    return () if good else gain_verdicts(fitted)
 
 
 def _payloads(found: Identification) -> tuple[ExpectedPayload, ...]:

@@ -37,8 +37,8 @@ ESTIMATORS = (
     Estimator("ls", ls),
     Estimator("wls", wls),
     Estimator("tls, unscaled", lambda system: tls(system, Scaling.NONE)),
-    Estimator("tls, rows weighted (the paper)", lambda system: tls(system, Scaling.ROWS)),
-    Estimator("tls, unit-norm columns", lambda system: tls(system, Scaling.COLUMNS)),
+    Estimator("tls, rows (paper)", lambda system: tls(system, Scaling.ROWS)),
+    Estimator("tls, columns", lambda system: tls(system, Scaling.COLUMNS)),
     Estimator("tls, both", lambda system: tls(system, Scaling.BOTH)),
     Estimator("ml", ml),
 )

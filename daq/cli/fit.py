@@ -16,15 +16,20 @@ from rich.table import Table
 from daq.calibration_file import as_document, save
 from daq.cases import CaseFit, Known, calibration_of_case, essential_fit, fit_case, reduce_logs
 from daq.cli.fit_cases import fit_cases, removed
-from daq.cli.output import check_output
+from daq.cli.output import check_output, say_written
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed, UsageError
-from daq.fit import Fit, fit
+from daq.fit import Fit, compare_estimators, fit
+from daq.gain_verdicts import needed_verdicts
+from daq.report.comparison import comparison_document, comparison_tables
+from daq.report.current_signal import actual_current_note
+from daq.report.excitation import advice, cannot_tell, verdict_document
 from daq.report.fit import draw
 from daq.report.gain_table import gain_table
 from ident.calibration import Calibration
+from ident.comparison import Comparison
 from ident.estimate import Method
 
 CALIBRATION = "drivegain-calibration"
@@ -62,6 +67,10 @@ CasesOption = Annotated[
     Path | None,
     typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml, a file each."),
 ]
+CompareOption = Annotated[
+    bool,
+    typer.Option("--compare", help="Also run every estimator, under the cell's filters and half and twice of them."),
+]
 
 
 def fit_verb(
@@ -74,6 +83,7 @@ def fit_verb(
     known: KnownOption = Known.MASS,
     essential: EssentialOption = None,
     cases: CasesOption = None,
+    compare: CompareOption = False,
     holdout: HoldoutOption = None,
     out: OutOption = None,
     pictures: PicturesOption = None,
@@ -103,14 +113,42 @@ def fit_verb(
         save_calibration(calibration, out)
     if pictures is not None:
         save_pictures(fitted, calibration, pictures)
+    side_by_side = None
+    if compare:
+        with status("comparing estimators") as told:
+            side_by_side = compare_estimators(fitted, told)
     if json:
-        print_json({**as_document(calibration), **compared(fitted), "removed": removed(found)})
+        print_json({**as_document(calibration), **report(found, side_by_side)})
     else:
         console = Console(soft_wrap=True, highlight=False)
         show(fitted, calibration, console)
-        if found.essential is not None:
-            kept, names = len(found.essential.system.columns), [step.name for step in found.essential.removed]
-            console.print(f"{kept} essential parameters; taken out: {', '.join(names) or 'none'}", markup=False)
+        tell(found, side_by_side, console)
+        say_written(console, out, pictures)
+
+
+def report(found: CaseFit, comparison: Comparison | None) -> dict[str, Any]:
+    """What --json says beside the calibration."""
+    fitted = found.fitted
+    axes = fitted.cell.axis_names
+    told = {**compared(fitted), "removed": removed(found)}
+    told["verdicts"] = [verdict_document(gain, axes) for gain in needed_verdicts(fitted)]
+    if comparison is not None:
+        told["comparison"] = comparison_document(comparison, axes)
+    return told
+
+
+def tell(found: CaseFit, comparison: Comparison | None, console: Console) -> None:
+    """What the fit rests on and what it cannot tell, for a person."""
+    fitted = found.fitted
+    for line in (*cannot_tell(fitted), *advice(fitted, needed_verdicts(fitted))):
+        console.print(line, markup=False)
+    if comparison is not None:
+        for table in comparison_tables(comparison, fitted.cell.axis_names):
+            console.print()
+            console.print(table)
+    if found.essential is not None:
+        kept, names = len(found.essential.system.columns), [step.name for step in found.essential.removed]
+        console.print(f"{kept} essential parameters; taken out: {', '.join(names) or 'none'}", markup=False)
 
 
 def require_cases_alone(chosen: bool, out: Path | None, pictures: Path | None) -> None:
@@ -169,6 +207,9 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
     """Gains, errors and what they rest on, for a person."""
     estimate = fitted.final.estimate
     console.print(gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}"))
+    note = actual_current_note(fitted.cell)
+    if note is not None:
+        console.print(note)
     if fitted.paper is not None:
         values = ", ".join(f"{value:.4g}" for value in fitted.paper.gains)
         console.print(f"For comparison, the paper's total least squares on the same rows: {values}")
@@ -180,11 +221,6 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz: a relative error means nothing without them."
     )
-    if not estimate.gains_fixed:
-        console.print(
-            "What these data cannot tell: a wrong payload mass scales all gains alike and leaves no residual; "
-            "a gear efficiency that is the same in both directions is part of its gain."
-        )
 
 
 def error_table(fitted: Fit, calibration: Calibration) -> Table:

@@ -56,6 +56,15 @@ axes:
 """
 """What stands over the axes of a new cell."""
 
+PAYLOADS = """\
+payloads:
+  # mass_kg is what must be weighed. What a drawing says may stand beside it, for `drivegain fit --known cad`:
+  #   centre_m: [x, y, z]                       centre of mass in the frame of the last joint
+  #   inertia_kg_m2: [xx, xy, xz, yy, yz, zz]   about the centre of mass, signs as in a URDF (xy = -integral of xy dm)
+  # Single parameters about the frame's origin go under known: {mz: 0.4}. Every way of mounting has a name of its own.
+"""
+"""What stands over the payloads of a new cell."""
+
 
 def make_folder(folder: Path) -> tuple[Path, ...]:
     """Copy the templates into a new folder; all of them or none.
@@ -105,7 +114,7 @@ def _copy(source: str, folder: Path, target: str, name: str) -> Path:
         text = path.read_text(encoding="utf-8")
         text = re.sub(r"^(name|controller): (demo|tx40)$", rf"\1: {name}", text, flags=re.MULTILINE)
         text = re.sub(r"\A(#.*\n)+", HEADS.get(Path(source).parent.name, r"\g<0>").format(name=name), text)
-        text = text.replace("axes:\n", AXES)
+        text = text.replace("axes:\n", AXES).replace("payloads:\n", PAYLOADS)
         text = text.replace("../controllers/demo.yaml", f"../controllers/{name}.yaml")
         text = text.replace("../cells/tx40.yaml", f"../cells/{name}.yaml")
         text = text.replace("interface: virtual  ", "interface: socketcan").replace("channel: demo", "channel: can0")

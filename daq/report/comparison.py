@@ -10,7 +10,7 @@ from rich.table import Table
 from ident.comparison import Comparison, Trial
 
 
-def comparison_table(comparison: Comparison, axes: tuple[str, ...]) -> Table:
+def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
     """Gains under the declared filters, and by how much they change between half and twice the cut-offs.
 
     Args:
@@ -18,28 +18,25 @@ def comparison_table(comparison: Comparison, axes: tuple[str, ...]) -> Table:
         axes: names, one a gain.
     """
     first = comparison.trials[0]
-    filters = f"filters {first.position_cutoff_hz:g} Hz / {first.decimation_cutoff_hz:g} Hz"
-    table = Table(
-        title=f"Gains by every estimator ({filters}; in brackets, the spread between half and twice these cut-offs)",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        show_edge=False,
-        pad_edge=False,
-    )
-    table.add_column("estimator")
-    for axis in axes:
-        table.add_column(axis, justify="right", no_wrap=True)
-    table.add_column("‖ρ‖/‖Y‖ [%]", justify="right", no_wrap=True)
+    filters = f"{first.position_cutoff_hz:g} Hz / {first.decimation_cutoff_hz:g} Hz"
+    gains = _table(f"Gains by every estimator, filters {filters}", (*axes, "‖ρ‖/‖Y‖ %"))
+    spreads = _table("Spread of the gains between half and twice these cut-offs [%]", axes)
     for trial in comparison.declared:
         if trial.gains is None:
-            table.add_row(trial.estimator, *("-" for _ in axes), trial.reason)
-            continue
+            gains.add_row(trial.estimator, *("-" for _ in axes), trial.reason)
+        else:
+            values = (f"{gain:.4g}" for gain in trial.gains)
+            gains.add_row(trial.estimator, *values, f"{trial.relative_error_percent:.2f}")
         spread = comparison.spread_percent(trial.estimator)
-        cells = (
-            f"{gain:.4g} ({'-' if spread is None else f'{spread[index]:.1f} %'})"
-            for index, gain in enumerate(trial.gains)
-        )
-        table.add_row(trial.estimator, *cells, f"{trial.relative_error_percent:.2f}")
+        spreads.add_row(trial.estimator, *("-" if spread is None else f"{spread[i]:.2f}" for i in range(len(axes))))
+    return gains, spreads
+
+
+def _table(title: str, headings: tuple[str, ...]) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table.add_column("estimator", no_wrap=True)
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     return table
 
 

@@ -14,7 +14,7 @@ from daq import gain_verdicts as verdicts_module
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.fit import Fit, fit
-from daq.gain_verdicts import all_good, gain_verdicts
+from daq.gain_verdicts import gain_verdicts, needed_verdicts
 from daq.resources import shipped_configurations
 from ident.run import Run
 from ident.verdict import GOOD_PERCENT, Verdict
@@ -45,7 +45,7 @@ def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) 
     found = gain_verdicts(fitted)
     own = 100.0 * estimate.gains_std / np.abs(estimate.gains)
     assert [gain.std_percent for gain in found] == pytest.approx(own.tolist())
-    assert all_good(fitted) == bool(np.all(own <= GOOD_PERCENT))
+    assert (not needed_verdicts(fitted)) == bool(np.all(own <= GOOD_PERCENT))
     weak = [gain for gain in found if gain.verdict is not Verdict.GOOD]
     assert weak
     for gain in weak:

@@ -31,9 +31,9 @@ def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(noi
 
 
 def test_ml_hangs_on_the_filters_less_than_the_papers_tls_and_tls_on_its_scaling(noisy: Comparison) -> None:
-    assert np.mean(_of(noisy, "ml")) < 0.5 * np.mean(_of(noisy, "tls, rows weighted (the paper)"))
+    assert np.mean(_of(noisy, "ml")) < 0.5 * np.mean(_of(noisy, "tls, rows (paper)"))
     gains = {trial.estimator: trial.gains for trial in noisy.declared}
-    unscaled, rows = gains["tls, unscaled"], gains["tls, rows weighted (the paper)"]
+    unscaled, rows = gains["tls, unscaled"], gains["tls, rows (paper)"]
     assert unscaled is not None
     assert rows is not None
     assert np.max(np.abs(unscaled / rows - 1.0)) > 0.002
