@@ -80,7 +80,8 @@ def as_document(calibration: Calibration) -> dict[str, object]:
             name: list(value) if isinstance(value, list) else value for name, value in calibration.filter.items()
         },
         "sources": [
-            {"name": source.name, "sha256": source.sha256, "role": source.role} for source in calibration.sources
+            {"name": source.name, "sha256": source.sha256, "role": source.role, "partial": source.partial}
+            for source in calibration.sources
         ],
         "configuration_sha256": calibration.configuration_sha256,
         "created": calibration.created,

@@ -55,11 +55,12 @@ class EffectEntry(StrictModel):
 
 
 class SourceEntry(StrictModel):
-    """One log."""
+    """One log; files of earlier versions do not say whether it was partial, because none could be."""
 
     name: str
     sha256: str
     role: str
+    partial: bool = False
 
 
 class CalibrationDocument(StrictModel):
@@ -116,7 +117,7 @@ def calibration_of(entries: CalibrationDocument) -> Calibration:
         condition=entries.condition,
         rows=entries.rows,
         filter=dict(entries.filter),
-        sources=tuple(Source(s.name, s.sha256, s.role) for s in entries.sources),
+        sources=tuple(Source(s.name, s.sha256, s.role, s.partial) for s in entries.sources),
         configuration_sha256=entries.configuration_sha256,
         created=entries.created,
         software=entries.software,

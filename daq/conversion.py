@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from math import pi
 from pathlib import Path
@@ -25,6 +26,7 @@ from daq.log.reader import Log, SampleBlock, read_log
 from drivers.event import CellEvent, EventKind
 from ident.run import Run
 
+_LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
 LIMIT_MARGIN = 0.05
 """Share of a joint's range by which positions may leave its limits."""
@@ -100,13 +102,17 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
 
 
 def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
-    """Read a log as a run, with the cell that it carries, or with another description of it.
+    """Read a log as a run, with the cell that it carries, or with another description of it; warns of a partial one.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.
         ConfigurationError: the cell in the log is inconsistent.
     """
     log = read_log(path)
+    if log.partial:
+        _LOG.warning(
+            "%s is PARTIAL: saved from a recording that was never finished; nothing of it is written back", path
+        )
     known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
     return run_from_log(log, known), known
 
@@ -145,6 +151,7 @@ def run_from_log(log: Log, cell: Cell) -> Run:
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
         valid=valid,
+        partial=log.partial,
     )
 
 

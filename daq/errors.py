@@ -43,6 +43,7 @@ DaqError
 │   ├── SchemaMismatch          unknown key, missing key, wrong type
 │   └── ConfigurationInconsistent  each value is well-formed, together they describe no cell
 └── OutputFailed                the disk is full, the folder is read-only                     exit 1
+    └── DiskSpaceShort          too little room for a recording, before it or during it
 
 drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4.
 """
@@ -256,6 +257,10 @@ class OutputFailed(DaqError):
             expected="a folder that can be written, with room",
             remedy="nothing was changed; free space or rights, or choose another folder",
         )
+
+
+class DiskSpaceShort(OutputFailed):
+    """Too little room on the disk for a recording: it does not begin, or the axes were stopped and the log finished."""
 
 
 EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
-from daq.errors import LogRepeated, LogsDiffer, RolesExchanged
+from daq.errors import LogRepeated, LogsDiffer, RolesExchanged, UsageError
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.comparison import Comparison, compare
 from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimate import Estimate, Method
 from ident.estimators.total_least_squares import tls
@@ -57,7 +58,7 @@ class Fit:
         return gather(self.identification, used, unseen)
 
 
-class _Reading:
+class Reading:
     """Logs of one cell, read one after the other, and what was met on the way."""
 
     def __init__(self, logs: Sequence[Path], cell: Cell | None) -> None:
@@ -96,7 +97,7 @@ class _Reading:
                     remedy="name other logs",
                 )
             self._seen[run.digest] = log
-            self.sources.append(Source(run.name, run.digest, role))
+            self.sources.append(Source(run.name, run.digest, role, run.partial))
             yield run
 
 
@@ -129,7 +130,7 @@ def fit(
 def _fit(
     logs: Sequence[Path], holdout: Sequence[Path], method: Method | None, gains_fixed: bool, cell: Cell | None
 ) -> Fit:
-    reading = _Reading(logs, cell)
+    reading = Reading(logs, cell)
     declared = reading.cell
     nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
     result = identify(
@@ -144,6 +145,32 @@ def _fit(
         check_signs(result.estimate, nameplate)
     paper = None if gains_fixed else tls(result.system)
     return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper)
+
+
+def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
+    """Every estimator on the logs of a fit, which are read again for each filter.
+
+    Args:
+        fitted: with free gains.
+        progress: told what is being done.
+
+    Raises:
+        UsageError: its gains were held fixed.
+    """
+    if fitted.final.estimate.gains_fixed:
+        raise UsageError(
+            "--compare",
+            found="--gains fixed",
+            expected="free gains: it is their estimators that differ",
+            remedy="leave out one of the two",
+        )
+    found = fitted.identification
+    return compare(
+        found.model,
+        lambda: (load_run(log, fitted.cell)[0] for log in fitted.logs),
+        found.conditioning,
+        progress,
+    )
 
 
 def _culprit(logs: Sequence[Path], cell: Cell | None) -> str:

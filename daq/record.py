@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +16,14 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address, drive_axes
 from daq.configuration.cell_file import bundle
 from daq.conversion import Scaling, scaling
-from daq.errors import ConfigurationInconsistent
+from daq.current_check import check_currents
+from daq.disk_space import DiskRoom, FreeBytes, free_bytes, largest_log_bytes
+from daq.errors import ConfigurationInconsistent, DiskSpaceShort
 from daq.log.metadata import RunInfo, RunStatistics
 from daq.log.readback import readback_of_drives
 from daq.log.writer import LogContent, LogWriter
-from daq.plan import Plan, path_of
+from daq.plan import Plan
+from daq.planned_move import path_of
 from daq.version import software
 from drivers.errors import MotionRefused
 from drivers.event import CellEvent, EventKind, EventSink
@@ -36,6 +39,10 @@ FloatArray = NDArray[np.float64]
 
 LOCKSTEP_TIMEOUT_S = 5.0
 """A simulated cell on a busy machine may be that late, and nothing real waits meanwhile."""
+ALLOWANCE_S = 10.0
+"""Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
+SPACE_CHECK_S = 0.1
+"""Of recorded time, between two looks at the room on the disk."""
 ROUNDING = 1.001
 """Whole counts may ask a drive for this much more than a limit."""
 
@@ -47,14 +54,20 @@ class Clocks:
     wall_ns: Callable[[], int] = time.time_ns
     monotonic_ns: Callable[[], int] = time.monotonic_ns
 
+    def wall_minus_monotonic_ns(self) -> int:
+        """The offset of the two now [ns], as near as two readings can be."""
+        before, wall, after = self.monotonic_ns(), self.wall_ns(), self.monotonic_ns()
+        return wall - (before + after) // 2
+
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A finished recording: its log, what the log holds and what the bus did."""
+    """A finished recording: its log, what the log holds, what the bus did, and what to know of its currents."""
 
     path: Path
     log: RunStatistics
     stream: StreamStatistics
+    warnings: tuple[str, ...] = ()
 
 
 def network_of(cell: Cell) -> CanopenNetwork:
@@ -77,6 +90,7 @@ def record(
     granted_by: str | None,
     run_id: str,
     clocks: Clocks | None = None,
+    free: FreeBytes = free_bytes,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
@@ -91,29 +105,34 @@ def record(
         granted_by: who allows the motion; None refuses it.
         run_id: unique.
         clocks: wall and monotonic time.
+        free: room on the disk of a folder.
         progress: told the moves done and their number.
 
     Raises:
         MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
+        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
+            marked invalid.
         ConfigurationInconsistent, OutputExists, OutputFailed: see daq/errors.py.
         DriverError: from the bus; the axes were stopped. What was recorded until then stays in an unfinished log
-            (`.part`), which no fit reads.
+            (`.part`), which no fit reads and `daq.salvage` makes a partial log of.
     """
     clocks = clocks or Clocks()
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
     with network_of(cell) as network:
         network.prepare()
+        warnings = check_currents(cell, network.scales())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
+        started_ns = clocks.monotonic_ns()
         run = RunInfo(
             run_id=run_id,
             rate_hz=1e6 / _sync(cell).period_us,
             payload=payload,
             operator=operator,
             software=software(),
-            started_wall_ns=clocks.wall_ns(),
-            started_monotonic_ns=clocks.monotonic_ns(),
+            started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
+            started_monotonic_ns=started_ns,
         )
         early: list[CellEvent] = []
         sinks: list[EventSink] = [early.append]
@@ -129,6 +148,10 @@ def record(
         moves = motor_moves(cell, plan, scale, start_counts)
         check_moves(start_counts, moves, permission, cell.axis_names)
         content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
+        room = DiskRoom(out, free)
+        duration_s = duration_of(moves, start_counts, run.rate_hz) + ALLOWANCE_S
+        room.require(largest_log_bytes(cell.axis_names, run.rate_hz, duration_s, content.files))
+        short: DiskSpaceShort | None = None
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
 
@@ -145,10 +168,51 @@ def record(
             for sample in first:
                 log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
-                for sample in samples:
-                    log.write(sample)
-            log.conclude(*_verdict(stream.statistics))
-        return Recorded(out, log.statistics, stream.statistics)
+                try:
+                    keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * run.rate_hz)))
+                except DiskSpaceShort as error:
+                    short = error
+            valid, reason = _verdict(stream.statistics)
+            if short is not None:
+                valid, reason = False, f"stopped after {done} of {len(moves)} moves: {short.found}"
+            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+        if short is not None:
+            raise short
+        return Recorded(out, log.statistics, stream.statistics, warnings)
+
+
+def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: DiskRoom, check_every: int) -> None:
+    """Log every sample of a walk, and end the walk when they cannot be kept any more.
+
+    Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
+    confirm; only closed, it would have nobody to tell.
+
+    Args:
+        samples: of `drivers.motion.execute`.
+        log: open.
+        room: for it.
+        check_every: samples, between two looks at the room.
+
+    Raises:
+        DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.
+    """
+    for number, sample in enumerate(samples):
+        try:
+            log.write(sample)
+            if number % check_every == 0:
+                room.check()
+        except BaseException as error:
+            samples.throw(error)
+            raise
+
+
+def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
+    """How long the moves of motors take, with their dwells, from where the axes stand [s]."""
+    total_s, here = 0.0, tuple(start_counts)
+    for move in moves:
+        total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
+        here = move.target_counts
+    return total_s
 
 
 def until_complete(stream: SyncStream) -> tuple[Sample, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -33,6 +32,7 @@ from drivers.mapping import (
     write_record,
 )
 from drivers.profile import ObjectEntry
+from drivers.scale import ScaleReading, read_scale
 from drivers.scan import FoundNode, read_identity, require, scan
 from drivers.sdo import Clock, SdoPolicy
 from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
@@ -103,6 +103,7 @@ class CanopenNetwork:
         self.node_ids = tuple(axis.node_id for axis in axes)
         self._originals: dict[int, _Original] = {}
         self._readback: dict[str, object] = {}
+        self._scales: dict[str, ScaleReading] = {}
 
     def __enter__(self) -> Self:
         self.link.open()
@@ -166,6 +167,7 @@ class CanopenNetwork:
         Raises:
             NodeMissing, IdentityMismatch, NmtRefused, MappingRefused, ObjectAccessError, StateRefused, BusError: see
                 drivers/errors.py; what was changed until then is restored on leaving the network.
+            ScaleImplausible: the ampere of a drive cannot be true (drivers/scale.py).
         """
         identities = self.check_identities()
         for axis in self.axes:
@@ -233,20 +235,29 @@ class CanopenNetwork:
 
         Raises:
             ObjectAccessError: a scale object cannot be read.
+            ScaleImplausible: it cannot be true.
         """
-        return tuple(
-            axis.profile.current_scale.factor * math.prod(map(access.read, axis.profile.current_scale.objects))
-            for axis, access in ((axis, self.link.objects(axis.node_id)) for axis in self.axes)
-        )
+        return tuple(reading.ampere_per_unit for reading in self.scales())
+
+    def scales(self) -> tuple[ScaleReading, ...]:
+        """What the drives say of their ampere and their motors, in the order of the axes; read once.
+
+        Raises:
+            ObjectAccessError, ScaleImplausible: as `drivers.scale.read_scale`.
+        """
+        return tuple(self._scale(axis) for axis in self.axes)
+
+    def _scale(self, axis: Axis) -> ScaleReading:
+        if axis.name not in self._scales:
+            self._scales[axis.name] = read_scale(self.link.objects(axis.node_id), axis.profile)
+        return self._scales[axis.name]
 
     def readback(self) -> dict[str, object]:
         """What the drives said about themselves during ``prepare``, by axis name, for the log."""
         return dict(self._readback)
 
     def _describe(self, axis: Axis, identity: Identity, mapped: tuple[PdoRecord, ...]) -> dict[str, object]:
-        access = self.link.objects(axis.node_id)
-        scale = axis.profile.current_scale
-        values = {str(entry): access.read(entry) for entry in scale.objects}
+        scale = self._scale(axis)
         return {
             "node_id": axis.node_id,
             "vendor_id": identity.vendor_id,
@@ -256,8 +267,12 @@ class CanopenNetwork:
             # What the recorded current is: without both a gain of this log cannot be compared with another's.
             "amplitude": axis.profile.amplitude.value,
             "tap": axis.profile.tap.value,
-            "scale_objects": values,
-            "ampere_per_unit": scale.factor * math.prod(values.values()),
+            "signal": axis.profile.signal,
+            "scale_objects": scale.objects,
+            "ampere_per_unit": scale.ampere_per_unit,
+            "rated_current_a": scale.rated_current_a,
+            "rated_torque_nm": scale.rated_torque_nm,
+            "scale_warnings": list(scale.warnings),
             "mode_before": self._originals[axis.node_id].mode,
             "mapping": [str(record) for record in mapped],
             "mapping_before": [str(record) for record in self._originals[axis.node_id].pdos.values()],

@@ -76,11 +76,19 @@ class AcceptedEffect:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One log that the calibration rests on."""
+    """One log that the calibration rests on.
+
+    Attributes:
+        name: of the log.
+        sha256: its digest.
+        role: in the fit.
+        partial: it is what was saved of a recording that was never finished; nothing of it may reach a controller.
+    """
 
     name: str
     sha256: str
     role: str
+    partial: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ class Run:
         move: number of the move that each sample belongs to, shape (k,), or None where no one wrote it down.
         digest: of the log it was read from (sha256, hex).
         valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
+        partial: it is what was saved of a recording that was never finished.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Run:
     move: NDArray[np.int64] | None = None
     digest: str = ""
     valid: NDArray[np.bool_] | None = None
+    partial: bool = False
 
     @property
     def rate_hz(self) -> float:

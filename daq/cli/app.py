@@ -28,6 +28,7 @@ VERBS = (
     Listed("plan", "daq.cli.plan:PLAN", "Choose moves within the limits that excite every parameter."),
     Listed("record", "daq.cli.record:RECORD", "Make a plan's moves and log them; this moves the robot."),
     Listed("info", "daq.cli.info:INFO", "Show what is in a log."),
+    Listed("salvage", "daq.cli.salvage:SALVAGE", "Save what a killed recording left behind."),
     Listed("import", "daq.cli.import_:IMPORT", "Make a log of CSV files of another controller."),
     Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
     Listed("residual", "daq.cli.residual:RESIDUAL", "As fit; then find what the model lacks, and add it."),

@@ -18,6 +18,7 @@ from daq.conversion import scaling
 from daq.errors import LogIncomplete
 from daq.log.metadata import RunStatistics
 from daq.log.reader import LogHead, LogReader
+from daq.report.current_signal import signals
 from drivers.event import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
@@ -49,6 +50,7 @@ def describe_log(path: Path) -> dict[str, Any]:
         "cell": cell.name,
         "cell_sha256": cell.digest,
         "axes": list(cell.axis_names),
+        "current": signals(cell),
         "role": run.role.value,
         "payload": None
         if run.payload is None
@@ -60,6 +62,7 @@ def describe_log(path: Path) -> dict[str, Any]:
         "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
         "lost_cycles": statistics.lost_cycles,
         "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
+        "partial": reader.partial,
         "valid": statistics.valid,
         "reason": statistics.reason,
         "events": [
@@ -70,6 +73,10 @@ def describe_log(path: Path) -> dict[str, Any]:
         "operator": run.operator,
         "software": run.software,
         "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
+        "wall_clock_step_s": None
+        if statistics.wall_minus_monotonic_ns is None
+        else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
         "origin": run.origin,
         "attachments": {name: len(data) for name, data in sorted(head.files.items())},
     }

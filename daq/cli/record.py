@@ -66,10 +66,12 @@ def record_verb(
                 "lockstep` in the cell file; with a real cell look at the load on bus and computer"
             )
         raise
+    for warning in done.warnings:
+        typer.echo(warning, err=True)
     log = done.log
     if json:
         print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
-                    "valid": log.valid, "reason": log.reason})  # fmt: skip
+                    "valid": log.valid, "reason": log.reason, "warnings": done.warnings})  # fmt: skip
     else:
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
@@ -99,7 +101,11 @@ def _free(out: Path) -> Path:
 def _way_on(part: Path) -> str:
     aside = part.with_name(part.name + ".kept")
     one, other = shlex.quote(str(part)), shlex.quote(str(aside))
-    return f"to record under this name, remove it (`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
+    saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
+    return (
+        f"`drivegain salvage {one} --out {saved}` saves what is in it; to record under this name, remove it "
+        f"(`rm {one}`) or keep it (`mv {one} {other}`), or choose another --out"
+    )
 
 
 def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:

@@ -16,6 +16,7 @@ from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address, drive_axes
 from daq.configuration.cell_file import load_cell
+from daq.report.current_signal import actual_current_note, signals
 from drivers.errors import NodeMissing
 from drivers.link import nmt_name
 from drivers.network import CanopenNetwork
@@ -37,7 +38,7 @@ def scan_verb(
         found = network.scan(wait_s=wait)
     rows = scan_rows(declared, found)
     if json:
-        print_json({"bus": str(network.link.address), "nodes": rows})
+        print_json({"bus": str(network.link.address), "nodes": rows, "current": signals(declared)})
     else:
         console = Console(soft_wrap=True)
         console.print(scan_table(rows, console.width))
@@ -45,6 +46,9 @@ def scan_verb(
             if row["enabled"]:
                 name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
                 console.print(Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red"))
+        note = actual_current_note(declared)
+        if note is not None:
+            console.print(Text(note, "yellow"))
     missing = tuple(row["node_id"] for row in rows if row["verdict"] == "missing")
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for node in found), wait)

@@ -27,7 +27,7 @@ from daq.configuration.yaml_file import parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationMissing
 from daq.resources import shipped_configurations
 from drivers.axis import Identity
-from drivers.profile import DriveProfile
+from drivers.profile import DriveProfile, TapPoint
 from ident.conditioning import Conditioning
 from ident.link import LINK_PARAMETERS
 
@@ -109,8 +109,18 @@ def digest(files: Mapping[str, bytes]) -> str:
 def _sources(path: Path) -> dict[str, Path]:
     """Where the members of a cell's bundle are on disk."""
     model = read_model(parse_yaml(read_bytes(path), str(path)), CellModel)
-    drives = {f"{DRIVES}{drive}.yaml": _drive_path(path.parent, drive) for drive in model.drives}
-    return {CELL: path, URDF: path.parent / model.robot.urdf, **drives}
+    sources = {CELL: path, URDF: path.parent / model.robot.urdf}
+    for drive in model.drives:
+        profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
+        sources |= {f"{DRIVES}{drive}.eds": profile.parent / eds for eds in _eds_of(profile)}
+    return sources
+
+
+def _eds_of(profile: Path) -> tuple[str, ...]:
+    """The electronic data sheet that a profile names beside itself, if it does; the schema is checked elsewhere."""
+    tree = parse_yaml(read_bytes(profile), str(profile)).tree
+    named = tree.get("eds") if isinstance(tree, dict) else None
+    return (named,) if isinstance(named, str) and named else ()
 
 
 def _drive_path(folder: Path, drive: str) -> Path:
@@ -145,17 +155,20 @@ def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
     # The schema lets exactly one of the three be given, the checks only those of the joint's kind.
     gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
     per_newton = model.nameplate_gain_n_per_a is not None
+    profile = None if model.drive is None else profiles[model.drive]
+    # A gain by the actual current is another quantity: whoever shows it or its calibration file shows the unit.
+    ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
     return Axis(
         name=model.name,
         node_id=model.node_id,
         drive=model.drive,
-        profile=None if model.drive is None else profiles[model.drive],
+        profile=profile,
         identity=None if model.identity is None else Identity(**model.identity.model_dump()),
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,
         zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),
         nameplate_gain=next(gain for gain in gains if gain is not None),
-        gain_unit=model.gain_unit or ("N/A" if per_newton else "Nm/A"),
+        gain_unit=model.gain_unit or f"{'N' if per_newton else 'Nm'}/{ampere}",
         limits=Limits(
             position=(unit.si * limits.position[0], unit.si * limits.position[1]),
             velocity=unit.si * limits.velocity,

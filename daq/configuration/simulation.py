@@ -13,7 +13,7 @@ from daq.configuration.joint_unit import DEGREE, MILLIMETRE
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.resources import shipped_configurations
-from drivers.simulated.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
+from drivers.simulated.spec import AxisSpec, Body, CellSpec, Dialect, UndeclaredEffect
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -40,6 +40,7 @@ class AxisSpecModel(StrictModel):
     offset_nm: float
     current_noise_a: NotNegative
     noise_correlation_s: NotNegative
+    dialect: Dialect = Dialect.CIA402
 
 
 class BodyModel(StrictModel):

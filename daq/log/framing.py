@@ -8,6 +8,7 @@ records and leave attachments unchecked.)
 from __future__ import annotations
 
 import hashlib
+import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -24,9 +25,13 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Mc
 from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated
 
 MAGIC = b"\x89MCAP0\r\n"
+UNFINISHED = ".part"
+"""Ending of a log that is being written, or whose recorder has died."""
 LARGEST_RECORD = 64 * 2**20
 """Bytes; our chunks hold 200 ms."""
 LARGEST_CHUNK = 64 * 2**20
+LARGEST_RATIO = 200
+"""Of the unpacked bytes to those of the file; our logs have 2 to 20. It bounds what a small file can take in memory."""
 
 Record = TypeVar("Record", bound=McapRecord)
 _PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
@@ -42,6 +47,8 @@ _PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
 class RecordFile:
     """Iterates over the records of the data section; afterwards `sha256` is that of the whole file.
 
+    While `unfinished` iterates, everything before `whole_bytes` has been found whole.
+
     Raises (while iterating):
         LogMissing, LogForeign, LogTruncated, LogCorrupt: with the offset in the file.
     """
@@ -50,12 +57,29 @@ class RecordFile:
         """Store the path."""
         self.path = path
         self.sha256 = ""
+        self.whole_bytes = 0
+        self._allowance = 0
 
     def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
         """Offset and record; those that only index others are passed over."""
+        yield from self._opened(self._records)
+
+    def unfinished(self) -> Iterator[tuple[int, McapRecord]]:
+        """The same of a file whose end is missing or damaged, up to there; the error that it ends with says where.
+
+        What no end vouches for must stand by itself: chunks and attachments have checksums of their own, an unknown
+        kind of record is damage. A whole data section ends the iteration without an error.
+        """
+        yield from self._opened(self._unfinished_records)
+
+    def _opened(
+        self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
+    ) -> Iterator[tuple[int, McapRecord]]:
         try:
             with self.path.open("rb") as stream:
-                yield from self._records(stream, self.path.stat().st_size)
+                size = os.fstat(stream.fileno()).st_size
+                self._allowance = LARGEST_CHUNK + LARGEST_RATIO * size
+                yield from records(stream, size)
         except OSError as error:
             raise LogMissing(
                 str(self.path),
@@ -64,8 +88,34 @@ class RecordFile:
                 remedy="check the name",
             ) from error
 
+    def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
+        self._check_start(stream, size)
+        crc = zlib.crc32(MAGIC)
+        offset = stream.seek(len(MAGIC))
+        while True:
+            self.whole_bytes = offset
+            head = stream.read(9)
+            opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, LARGEST_RECORD)
+            if length > LARGEST_RECORD:
+                raise self.corrupt(offset, f"a record of {length} bytes", f"at most {LARGEST_RECORD}")
+            body = stream.read(length) if len(head) == 9 else b""
+            if len(body) < length:
+                raise self._truncated(offset + len(head) + len(body), offset)
+            if opcode == Opcode.DATA_END:
+                self._check_crc(offset, "data section", _parse(DataEnd.read, body, self, offset).data_section_crc, crc)
+                return
+            crc = zlib.crc32(body, zlib.crc32(head, crc))
+            if opcode == Opcode.MESSAGE_INDEX:
+                if length < 6 or length != 6 + int.from_bytes(body[2:6], "little"):
+                    raise self.corrupt(offset, "a broken index", "one of the chunk before it")
+            elif all(opcode != known for known, _ in _PARSERS):
+                raise self.corrupt(offset, f"a record of kind {opcode:#04x}", "one of a data section")
+            yield from self._record(offset, opcode, body)
+            offset += 9 + length
+
     def _records(self, stream: BinaryIO, size: int) -> Iterator[tuple[int, McapRecord]]:
-        self._check_ends(stream, size)
+        self._check_start(stream, size)
+        self._check_end(stream, size)
         digest = hashlib.sha256(MAGIC)
         crc = zlib.crc32(MAGIC)
         offset = stream.seek(len(MAGIC))
@@ -106,7 +156,7 @@ class RecordFile:
             if opcode == known:
                 yield offset, _parse(read, body, self, offset)
 
-    def _check_ends(self, stream: BinaryIO, size: int) -> None:
+    def _check_start(self, stream: BinaryIO, size: int) -> None:
         start = stream.read(len(MAGIC))
         if start != MAGIC[: len(start)] or (size < len(MAGIC) and size > 0):
             raise LogForeign(
@@ -115,14 +165,19 @@ class RecordFile:
                 expected="an MCAP file",
                 remedy="is this the right file?",
             )
+
+    def _check_end(self, stream: BinaryIO, size: int) -> None:
         stream.seek(max(0, size - len(MAGIC)))
         if size < 2 * len(MAGIC) or stream.read(len(MAGIC)) != MAGIC:
-            raise LogTruncated(
-                str(self.path),
-                found=f"{size} bytes without the closing mark",
-                expected="a finished log",
-                remedy="the recorder was killed or the copy broke off; copy or record it again",
-            )
+            raise self._truncated(size, None)
+
+    def _truncated(self, size: int, good: int | None) -> LogTruncated:
+        return LogTruncated(
+            str(self.path),
+            found=f"{size} bytes without the closing mark" + ("" if good is None else f", whole records up to {good}"),
+            expected="a finished log",
+            remedy="the recorder was killed or the copy broke off: copy it again, or `drivegain salvage` what is there",
+        )
 
     def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
         # 0 means "not computed" in MCAP; our logs always compute, and without it a flipped bit would pass for data.
@@ -157,6 +212,9 @@ class RecordFile:
         size = chunk.uncompressed_size
         if size > LARGEST_CHUNK:
             raise self.corrupt(offset, f"a chunk of {size} bytes", f"at most {LARGEST_CHUNK}")
+        self._allowance -= size
+        if self._allowance < 0:
+            raise self.corrupt(offset, f"chunks that unfold to {LARGEST_RATIO} times the file", "a recording")
         if chunk.compression not in {"zstd", ""}:
             raise LogForeign(
                 str(self.path),

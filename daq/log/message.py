@@ -139,6 +139,8 @@ def event_from_bytes(data: bytes) -> CellEvent:
     end += -end % 4
     (code,) = struct.unpack_from("<I", data, end)
     text, _ = _string_from(data, end + 4)
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise ValueError(f"time {seconds} s, {nanoseconds} ns")
     time_ns = seconds * 1_000_000_000 + nanoseconds
     return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -16,6 +17,8 @@ LARGEST_COUNT = 2**64
 """Of cycles: their numbers are uint64 in the log."""
 VERSION = "1"
 """Of the log's contract; a reader refuses a higher one."""
+SEAL = "crc32"
+"""Entry with the checksum of the others: of what stands outside chunks, a log without its end has no other."""
 
 
 class Role(Enum):
@@ -54,6 +57,11 @@ class RunInfo:
         """Loaded or unloaded."""
         return Role.UNLOADED if self.payload is None else Role.LOADED
 
+    @property
+    def wall_minus_monotonic_ns(self) -> int:
+        """What turns the stamps of the samples into the monotonic clock of the recording computer [ns]."""
+        return self.started_wall_ns - self.started_monotonic_ns
+
 
 @dataclass(frozen=True, slots=True)
 class RunStatistics:
@@ -65,6 +73,9 @@ class RunStatistics:
         missing: samples in which the axis did not answer, one number an axis.
         valid: whether the recorder stands for the run.
         reason: why not.
+        partial: the log holds what could be saved of a recording that was never finished.
+        wall_minus_monotonic_ns: the two clocks at the end [ns]; against the start it shows whether the wall clock was
+            set meanwhile. None where nobody has looked: in salvaged and imported logs.
     """
 
     samples: int
@@ -72,6 +83,8 @@ class RunStatistics:
     missing: tuple[int, ...]
     valid: bool
     reason: str = ""
+    partial: bool = False
+    wall_minus_monotonic_ns: int | None = None
 
 
 def run_record(info: RunInfo) -> dict[str, str]:
@@ -89,6 +102,7 @@ def run_record(info: RunInfo) -> dict[str, str]:
         "software": info.software,
         "started_wall_ns": str(info.started_wall_ns),
         "started_monotonic_ns": str(info.started_monotonic_ns),
+        "wall_minus_monotonic_ns": str(info.wall_minus_monotonic_ns),
         "origin": info.origin,
     }
 
@@ -131,25 +145,31 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
 
 def statistics_record(statistics: RunStatistics) -> dict[str, str]:
     """The metadata `drivegain.statistics`."""
+    offset_ns = statistics.wall_minus_monotonic_ns
     return {
         "samples": str(statistics.samples),
         "lost_cycles": str(statistics.lost_cycles),
         "missing": json.dumps(statistics.missing),
         "valid": json.dumps(statistics.valid),
         "reason": statistics.reason,
+        "partial": json.dumps(statistics.partial),
+        "wall_minus_monotonic_ns": "" if offset_ns is None else str(offset_ns),
     }
 
 
 def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
-    """What `statistics_record` wrote.
+    """What `statistics_record` wrote; logs of earlier versions are never partial.
 
     Raises:
         KeyError: an entry is missing.
         ValueError: an entry is not what it must be.
     """
     missing, valid = json.loads(record["missing"]), json.loads(record["valid"])
-    if not isinstance(valid, bool) or not isinstance(missing, list):
-        raise ValueError(f"missing {record['missing']!r}, valid {record['valid']!r}")  # noqa: TRY004 - a foreign record
+    partial = json.loads(record.get("partial", "false"))
+    if not (isinstance(valid, bool) and isinstance(partial, bool) and isinstance(missing, list)):
+        found = f"missing {record['missing']!r}, valid {record['valid']!r}, partial {partial!r}"
+        raise ValueError(found)  # noqa: TRY004 - a foreign record
+    offset_ns = record.get("wall_minus_monotonic_ns", "")
     samples, lost_cycles = int(record["samples"]), int(record["lost_cycles"])
     for count in (samples, lost_cycles, *missing):
         if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= LARGEST_COUNT:
@@ -162,7 +182,30 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
         missing=tuple(missing),
         valid=valid,
         reason=record["reason"],
+        partial=partial,
+        wall_minus_monotonic_ns=int(offset_ns) if offset_ns else None,
     )
+
+
+def sealed(record: Mapping[str, str]) -> dict[str, str]:
+    """A record with the checksum of its entries."""
+    return {**record, SEAL: _checksum(record)}
+
+
+def unsealed(record: Mapping[str, str]) -> dict[str, str]:
+    """The entries of a sealed record; one of an earlier version has no seal and is taken as it is.
+
+    Raises:
+        ValueError: they are not those that were sealed.
+    """
+    entries = {key: value for key, value in record.items() if key != SEAL}
+    if record.get(SEAL, _checksum(entries)) != _checksum(entries):
+        raise ValueError(f"entries of checksum {_checksum(entries)}, sealed with {record[SEAL]!r:.40}")
+    return entries
+
+
+def _checksum(record: Mapping[str, str]) -> str:
+    return f"{zlib.crc32(json.dumps(sorted(record.items())).encode()):08x}"
 
 
 def _number(value: object) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,8 +12,8 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
-from daq.errors import LogForeign, LogIncomplete
-from daq.log.framing import RecordFile
+from daq.errors import LogForeign, LogIncomplete, LogMissing, LogUnreadable
+from daq.log.framing import UNFINISHED, RecordFile
 from daq.log.message import (
     ENCAPSULATION_WORD,
     EVENTS_SCHEMA,
@@ -24,7 +24,16 @@ from daq.log.message import (
     event_from_bytes,
     sample_dtype,
 )
-from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_from_record, statistics_from_record
+from daq.log.metadata import (
+    RUN,
+    SEAL,
+    STATISTICS,
+    RunInfo,
+    RunStatistics,
+    run_from_record,
+    statistics_from_record,
+    unsealed,
+)
 from daq.log.readback import NAME as READBACK
 from daq.log.readback import Readback, readback_from_bytes
 from drivers.event import CellEvent
@@ -86,6 +95,15 @@ class Log:
     events: tuple[CellEvent, ...]
     statistics: RunStatistics
 
+    @property
+    def partial(self) -> bool:
+        """It is not known how the recording would have ended: salvaged, or never given its final name."""
+        return _partial(self.path, self.statistics)
+
+
+def _partial(path: Path, statistics: RunStatistics) -> bool:
+    return statistics.partial or path.name.endswith(UNFINISHED)
+
 
 class LogReader:
     """One pass over a log in bounded memory: iterate over blocks, then ask for the rest.
@@ -98,6 +116,7 @@ class LogReader:
         """Store the path."""
         self.path = path
         self.events: list[CellEvent] = []
+        self.damage: LogUnreadable | None = None
         self._file = RecordFile(path)
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -106,11 +125,44 @@ class LogReader:
 
     def __iter__(self) -> Iterator[SampleBlock]:
         """Blocks of samples; events are collected on the way."""
-        for offset, record in self._file:
+        yield from self._blocks(self._file)
+
+    def until_damage(self) -> Iterator[SampleBlock]:
+        """The same of a log whose end is missing or damaged, up to there; `damage` then says what ended it.
+
+        Raises:
+            LogMissing: there is no such file.
+        """
+        try:
+            yield from self._blocks(self._checked(self._file.unfinished()))
+        except LogMissing:
+            raise
+        except LogUnreadable as damage:
+            self.damage = damage
+
+    @property
+    def whole_bytes(self) -> int:
+        """Of the file, up to the damage that ended `until_damage`."""
+        return self._file.whole_bytes
+
+    @property
+    def concluded(self) -> bool:
+        """The recorder's own last word has been read."""
+        return STATISTICS in self._metadata
+
+    def _checked(self, records: Iterator[tuple[int, McapRecord]]) -> Iterator[tuple[int, McapRecord]]:
+        """Metadata without a seal would be vouched for by the file's end alone."""
+        for offset, record in records:
+            if isinstance(record, Metadata) and SEAL not in record.metadata:
+                raise self._file.corrupt(offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}")
+            yield offset, record
+
+    def _blocks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[SampleBlock]:
+        for offset, record in records:
             if isinstance(record, Attachment):
                 self._attachments[record.name] = record.data
             elif isinstance(record, Metadata):
-                self._metadata[record.name] = record.metadata
+                self._metadata[record.name] = self._entries(offset, record)
             elif isinstance(record, Header) and record.profile != "ros2":
                 raise self._foreign(f"profile {record.profile!r}", "ros2")
             elif isinstance(record, Chunk):
@@ -148,6 +200,19 @@ class LogReader:
             return statistics_from_record(self._metadata[STATISTICS])
         except (KeyError, ValueError, RecursionError) as error:
             raise self._incomplete(error, f"metadata {STATISTICS!r}") from error
+
+    def _entries(self, offset: int, record: Metadata) -> dict[str, str]:
+        try:
+            return unsealed(record.metadata)
+        except ValueError as error:
+            raise self._file.corrupt(
+                offset, f"metadata {record.name!r} with {error}", "those that were sealed"
+            ) from error
+
+    @property
+    def partial(self) -> bool:
+        """See `Log.partial`; once the iteration has ended."""
+        return _partial(self.path, self.statistics)
 
     def _chunk(self, offset: int, data: bytes) -> Iterator[SampleBlock]:
         """Samples of a chunk: at once when it holds nothing else, else picked one by one."""
@@ -236,6 +301,8 @@ class LogReader:
         counts = [records[name] == axes for name in ("positions", "currents", "statuswords")]
         if not (np.all(counts) and np.all(records["encapsulation"] == ENCAPSULATION_WORD)):
             raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
+        if not (np.all(records["seconds"] >= 0) and np.all(records["nanoseconds"] < 1_000_000_000)):
+            raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")
         return SampleBlock(
             cycle=records["cycle"].astype(np.uint64),
             time_ns=records["seconds"].astype(np.int64) * 1_000_000_000 + records["nanoseconds"],
@@ -284,12 +351,11 @@ def read_log(path: Path) -> Log:
             expected=f"{statistics.samples}, as its recorder counted",
             remedy="another tool may have cut the log; take the original",
         )
-    samples = SampleBlock(
-        cycle=np.concatenate([block.cycle for block in blocks]),
-        time_ns=np.concatenate([block.time_ns for block in blocks]),
-        position_counts=np.concatenate([block.position_counts for block in blocks]),
-        current_raw=np.concatenate([block.current_raw for block in blocks]),
-        statusword=np.concatenate([block.statusword for block in blocks]),
-        missing=np.concatenate([block.missing for block in blocks]),
-    )
-    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics)
+    return Log(path, reader.digest, head, _joined(blocks), tuple(reader.events), statistics)
+
+
+def _joined(blocks: list[SampleBlock]) -> SampleBlock:
+    """All samples; the blocks are used up, so that a long log is not in memory twice."""
+    columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
+    blocks.clear()
+    return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})

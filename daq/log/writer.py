@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
@@ -14,6 +15,7 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from daq.errors import OutputExists, OutputFailed
+from daq.log.framing import UNFINISHED
 from daq.log.message import (
     DEFINITIONS,
     EVENTS_SCHEMA,
@@ -28,17 +30,18 @@ from daq.log.message import (
     sample_bytes,
     sample_struct,
 )
-from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_record, statistics_record
+from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_record, sealed, statistics_record
 from daq.log.readback import NAME as READBACK
 from daq.log.readback import Readback, readback_bytes
 from drivers.event import CellEvent
 from drivers.sample import Sample
 
-FLUSH_NS = 200_000_000
-"""Of recorded or of wall time, whichever comes first."""
+FLUSH_NS = 150_000_000
+"""Of recorded or of wall time, whichever comes first. What a kill may cost is 200 ms: the rest is for the cycle on the
+bus and for the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000
 CHUNK_BYTES = 4 * 2**20
-"""Never reached in 200 ms; a chunk ends with a flush."""
+"""Never reached between two flushes; a chunk ends with one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,16 @@ class LogContent:
     files: Mapping[str, bytes]
     readback: Readback
     joint_names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Verdict:
+    """What the recorder says at the end, see `LogWriter.conclude`."""
+
+    valid: bool = True
+    reason: str = ""
+    partial: bool = False
+    wall_minus_monotonic_ns: int | None = None
 
 
 class LogWriter:
@@ -85,7 +98,7 @@ class LogWriter:
             clock_ns: monotonic clock, for the flush by wall time.
         """
         self.path = path
-        self.part = path.with_name(path.name + ".part")
+        self.part = path.with_name(path.name + UNFINISHED)
         self._content = content
         self._joint_position = joint_position
         self._clock_ns = clock_ns
@@ -99,7 +112,7 @@ class LogWriter:
         self._last_cycle: int | None = None
         self._flushed_recorded_ns = self._flushed_wall_ns = 0
         self._joint_state_due_ns = 0
-        self._verdict = (True, "")
+        self._verdict = _Verdict()
 
     def __enter__(self) -> LogWriter:
         """Open the file and write all that stands before the first sample."""
@@ -121,6 +134,8 @@ class LogWriter:
             ) from error
         except OSError as error:
             raise self._failed(error) from error
+        with suppress(OSError):  # a file system without locks; nothing but `salvage` asks for this one
+            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         try:
             self._open()
         except OSError as error:
@@ -146,7 +161,11 @@ class LogWriter:
         if self._samples == 1:
             self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
             self._joint_state_due_ns = sample.time_ns
-        elif sample.time_ns - self._flushed_recorded_ns >= FLUSH_NS or wall_ns - self._flushed_wall_ns >= FLUSH_NS:
+        elif (
+            self._samples == 2  # the first one by itself: a log that has begun can be salvaged
+            or sample.time_ns - self._flushed_recorded_ns >= FLUSH_NS
+            or wall_ns - self._flushed_wall_ns >= FLUSH_NS
+        ):
             self.flush()
             self._flushed_recorded_ns, self._flushed_wall_ns = sample.time_ns, wall_ns
         try:
@@ -164,14 +183,31 @@ class LogWriter:
         """Append one event."""
         self._held.append((self._events_channel, event.time_ns, event_bytes(event)))
 
-    def conclude(self, valid: bool, reason: str = "") -> None:
-        """Say whether the run may be used; it is valid unless told otherwise."""
-        self._verdict = (valid, reason)
+    def conclude(
+        self, valid: bool, reason: str = "", *, partial: bool = False, wall_minus_monotonic_ns: int | None = None
+    ) -> None:
+        """Say how the run went; it is valid and whole unless told otherwise.
+
+        Args:
+            valid, reason: whether the run may be used, and why not.
+            partial: how it ended is not known.
+            wall_minus_monotonic_ns: the two clocks at the end [ns].
+        """
+        self._verdict = _Verdict(valid, reason, partial, wall_minus_monotonic_ns)
 
     @property
     def statistics(self) -> RunStatistics:
         """So far."""
-        return RunStatistics(self._samples, self._lost, tuple(self._missing), *self._verdict)
+        told = self._verdict
+        return RunStatistics(
+            samples=self._samples,
+            lost_cycles=self._lost,
+            missing=tuple(self._missing),
+            valid=told.valid,
+            reason=told.reason,
+            partial=told.partial,
+            wall_minus_monotonic_ns=told.wall_minus_monotonic_ns,
+        )
 
     def flush(self) -> None:
         """Put everything into the file.
@@ -190,20 +226,23 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Finish and rename after success; keep the `.part` after an error."""
+        """Finish and rename after success; keep the `.part` after an error, which goes on as it is."""
         try:
             with self._stream:
                 self.flush()
                 if error is not None:
                     return
-                self._mcap.add_metadata(STATISTICS, statistics_record(self.statistics))
+                self._mcap.add_metadata(STATISTICS, sealed(statistics_record(self.statistics)))
                 self._mcap.finish()
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
             self.part.rename(self.path)
             _sync_folder(self.path.parent)
-        except OSError as failure:
-            raise self._failed(failure) from (error or failure)
+        except (OSError, OutputFailed) as failure:
+            if error is not None:  # it came first, and what a stop could not confirm is noted on it
+                error.add_note(f"kept: less than could be, {failure}")
+                return
+            raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
 
     def _open(self) -> None:
         # Data CRCs protect attachments and metadata too, which stand outside chunks.
@@ -218,7 +257,7 @@ class LogWriter:
         started_ns = self._content.run.started_wall_ns
         for name, data in {**self._content.files, READBACK: readback_bytes(self._content.readback)}.items():
             self._mcap.add_attachment(started_ns, started_ns, name, "application/octet-stream", data)
-        self._mcap.add_metadata(RUN, run_record(self._content.run))
+        self._mcap.add_metadata(RUN, sealed(run_record(self._content.run)))
         self._samples_channel = self._channel(SAMPLES_TOPIC, SAMPLES_SCHEMA)
         self._events_channel = self._channel(EVENTS_TOPIC, EVENTS_SCHEMA)
         self._joints_channel = self._channel(JOINTS_TOPIC, JOINTS_SCHEMA)
@@ -242,7 +281,8 @@ class LogWriter:
             str(self.part),
             found=(error.strerror or type(error).__name__).lower(),
             expected="a folder that can be written, with room",
-            remedy="what was recorded until then stays in that file, which no fit reads; free space and record again",
+            remedy="what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
+            "it); free space and record again",
         )
 
 

@@ -40,6 +40,7 @@ class Gate(Enum):
     NAMEPLATE = "nameplate"
     UNCERTAINTY = "uncertainty"
     SOURCES = "sources"
+    PARTIAL = "partial"
     HOLDOUT = "hold-out error"
     ERROR = "error"
     CELL = "cell"
@@ -227,7 +228,17 @@ def _source_refusals(calibration: Calibration) -> list[Refusal]:
         return [
             Refusal(Gate.SOURCES, "calibration", "no logs it rests on", "at least one", "fit from logs of this cell")
         ]
-    closed = []
+    closed = [
+        Refusal(
+            Gate.PARTIAL,
+            f"log {source.name}",
+            "what was salvaged of a recording that was never finished",
+            "a recording that its recorder stands for to the end",
+            "record it again and fit",
+        )
+        for source in calibration.sources
+        if source.partial
+    ]
     for source in calibration.sources:
         if source.name.endswith(_UNFINISHED):
             problem = "a recording that was never finished"

@@ -150,6 +150,7 @@ class AmplifierSet:
     Attributes:
         loops: LOOP records, shape (n,).
         reported_a: current reference that 6074h tells, with its noise [A], shape (n,); renewed once a SYNC.
+        actual_a: current of the motor at the same moment [A], shape (n,).
     """
 
     def __init__(self, spec: CellSpec, tuning: LoopTuning, lags: tuple[Lag, ...]) -> None:
@@ -165,6 +166,7 @@ class AmplifierSet:
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
         self.reported_a = np.zeros(n)
+        self.actual_a = np.zeros(n)
         self._counts_per_rad = tuning.counts_per_rad
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
         self._lags = lags
@@ -195,7 +197,8 @@ class AmplifierSet:
                 lag.report(self._lagged_a, self.step_s)
 
     def report(self) -> None:
-        """Renew the reported current reference; once a SYNC."""
+        """Renew the reported currents; once a SYNC."""
+        self.actual_a[:] = self.loops["current_a"]
         if self._used == len(self._block):
             self._block = np.stack([stream.standard_normal(1024) for stream in self._random], axis=1)
             self._used = 0

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from drivers.simulated.amplifier import AmplifierSet
+from drivers.simulated.dialect import current_objects, translated
 from drivers.simulated.drive import Drive, ErrorCode, Settings
 from drivers.simulated.errors import SdoAbort
 from drivers.simulated.object_dictionary import (
@@ -77,7 +78,8 @@ class Node:
         self._loop = amplifiers.loops[index]
         self._readings = readings
         self._send = send
-        self._dictionary = amplifier_dictionary(axis)
+        self._dictionary = translated(amplifier_dictionary(axis), axis)
+        self._told = {told.key: told.source(amplifiers, index) for told in current_objects(axis)}
         self._values: dict[tuple[int, int], Value] = {key: entry.default for key, entry in self._dictionary.items()}
         self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary)
         self._triggers = tuple(TransmitTrigger(pdo, self._source) for pdo in self._transmit)
@@ -256,6 +258,7 @@ class Node:
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
+            0x2240: lambda: readings().position[i],
             0x6041: lambda: drive.statusword(readings()),
             0x6061: lambda: self._number(0x6060),
             0x6062: lambda: readings().demand[i],
@@ -270,7 +273,7 @@ class Node:
         index, subindex = key
         if index == 0x1003:
             return lambda: (self._history[0] if self._history else 0) if subindex else len(self._history[:1])
-        return live.get(index, lambda: self._number(index, subindex))
+        return self._told.get(key) or live.get(index, lambda: self._number(index, subindex))
 
     def _number(self, index: int, subindex: int = 0) -> int:
         value = self._values[index, subindex]
@@ -320,7 +323,9 @@ class Node:
         self._loop["error_time_s"] = self._number(0x6066) * 1e-3
         self._loop["target_window"] = self._number(0x6067)
         self._loop["target_time_s"] = self._number(0x6068) * 1e-3
-        self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
+        # A make without 6073h has the limit that it was built with.
+        if (0x6073, 0) in self._dictionary:
+            self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
 
     def _connection_lost(self) -> None:
         """Abort connection option code 6007h."""

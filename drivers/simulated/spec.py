@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,16 @@ class Body:
     inertia_kg_m2: tuple[float, float, float, float, float, float]
 
 
+class Dialect(Enum):
+    """Whose objects and units an amplifier uses for its current (drivers/simulated/dialect.py)."""
+
+    CIA402 = "cia402"
+    EPOS4 = "epos4"
+    COPLEY = "copley"
+    IPOS = "ipos"
+    AX2000 = "ax2000"
+
+
 @dataclass(frozen=True, slots=True)
 class AxisSpec:
     """One motor, its amplifier, and the joint of the same number.
@@ -44,6 +55,7 @@ class AxisSpec:
         offset_nm: constant torque at the joint.
         current_noise_a: standard deviation of the noise of the current reference [A].
         noise_correlation_s: correlation time of that noise (first-order); 0 is white.
+        dialect: whose objects tell its current.
     """
 
     node_id: int
@@ -63,6 +75,7 @@ class AxisSpec:
     offset_nm: float
     current_noise_a: float
     noise_correlation_s: float
+    dialect: Dialect = Dialect.CIA402
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,7 +114,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(tmp_path: Path, monke
         raise full
 
     class FullStream:
-        write = flush = close = staticmethod(refuse)
+        write = flush = close = fileno = staticmethod(refuse)
 
         def tell(self) -> int:
             return 0

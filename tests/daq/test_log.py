@@ -118,16 +118,16 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     assert list(state.position) == pytest.approx(joints(rows[20].position_counts))
 
 
-def test_samples_are_on_disk_every_200_ms_of_recorded_time(tmp_path: Path) -> None:
+def test_samples_are_on_disk_within_200_ms_of_recorded_time(tmp_path: Path) -> None:
     rows = samples([[k] for k in range(1000)])
     reader = LogReader(tmp_path / "a.mcap")
     blocks = [len(block.cycle) for block in LogReader(write(tmp_path / "a.mcap", content(1), rows))]
-    assert max(blocks) <= 200
+    assert max(blocks) <= 150
     assert sum(blocks) == 1000
     assert reader.digest == ""
 
 
-def test_samples_are_on_disk_every_200_ms_of_wall_time(tmp_path: Path) -> None:
+def test_samples_are_on_disk_within_200_ms_of_wall_time(tmp_path: Path) -> None:
     now_ns = 0
     rows = samples([[k] for k in range(20)])
     with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: now_ns) as log:
@@ -152,7 +152,7 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
     with part.open("rb") as stream, pytest.raises(EndOfFile):
         found.extend(StreamReader(stream).records)
     sequences = [record.sequence for record in found if isinstance(record, Message)]
-    assert sequences == [*range(10, 17), 0]  # seven samples and the first JointState
+    assert sequences == [10, 0, *range(11, 17)]  # seven samples, and after the first of them the first JointState
     with pytest.raises(OutputExists, match="unfinished"):
         write(path, content(1), samples([[0]]))
     assert part.read_bytes() == data
@@ -187,7 +187,7 @@ def test_samples_have_chunks_of_their_own(tmp_path: Path) -> None:
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
     file = RecordFile(write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events))
     sizes = [chunk.uncompressed_size for offset, chunk in file if isinstance(chunk, Chunk)]
-    assert len(sizes) == 10
     blocks = list(LogReader(tmp_path / "a.mcap"))
-    assert len(blocks) == 5
+    assert [len(block.cycle) for block in blocks] == [1, *[150] * 5, 149]
+    assert len(sizes) == 2 * len(blocks)
     np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))

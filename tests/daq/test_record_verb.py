@@ -57,6 +57,7 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
     for told in (first, second):
         assert f"`rm {shlex.quote(str(part))}`" in told
         assert f"`mv {shlex.quote(str(part))} " in told
+        assert f"`drivegain salvage {shlex.quote(str(part))} --out " in told
         assert "choose another --out" in told
 
 

@@ -22,6 +22,7 @@ from drivers.event import EventKind
 from drivers.link import NmtState
 from drivers.network import CanopenNetwork
 from drivers.profile import ObjectEntry
+from drivers.scale import ScaleImplausible
 from drivers.sdo import SdoPolicy
 from drivers.state import State
 from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell
@@ -266,3 +267,12 @@ def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> No
     assert bus.nodes[0].value(0x1400, 2) == 255
     assert bus.nodes[0].value(0x1017, 0) == 0
     assert bus.nodes[1].value(0x1800, 2) == 255
+
+
+def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].store(0x6075, 0, 0)
+    with pytest.raises(ScaleImplausible, match=r"node 2.*6075h:00 = 0"), network:
+        network.prepare()
+    assert not any(node.powered_cycles for node in bus.nodes)
+    assert bus.nodes[0].value(0x6060, 0) == 8  # everything was given back
