@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test check bench ident-study gain-study paper planning-study robot-study wheel lock clean
+.PHONY: help setup demo test check bench ident-study gain-study paper planning-study robot-study crash-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -21,6 +21,7 @@ help:
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/paper.md); minutes"
 	@echo "make planning-study  planned against random moves (docs/planning.md); minutes"
+	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/robots.md); minutes"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
@@ -66,13 +67,16 @@ gain-study: setup
 	$(BIN)/python -m tests.studies.clean_cells
 
 paper: setup
-	$(BIN)/python -m tests.studies.paper_tables
+	$(BIN)/python -m tests.studies.paper_tables --seeds 1 2 3
 
 planning-study: setup
 	$(BIN)/python -m tests.studies.planning
 
 robot-study: setup
 	$(BIN)/python -m tests.studies.any_robot
+
+crash-study: setup
+	$(BIN)/python -m tests.studies.crash_study
 
 wheel: setup
 	$(BIN)/python -m pip wheel -qq --no-deps --no-build-isolation --wheel-dir dist .

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from daq.errors import (
 from daq.log.readback import Readback
 from daq.log.reader import Log, SampleBlock, read_log
 from drivers.event import CellEvent, EventKind
+from ident.payload import Payload
 from ident.run import Run
 
 _LOG = logging.getLogger("drivegain")
@@ -114,7 +115,18 @@ def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
             "%s is PARTIAL: saved from a recording that was never finished; nothing of it is written back", path
         )
     known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
-    return run_from_log(log, known), known
+    run = run_from_log(log, known)
+    if cell is not None and run.payload is not None:
+        run = replace(run, payload=_weighed_again(run.payload, cell))
+    return run, known
+
+
+def _weighed_again(payload: Payload, cell: Cell) -> Payload:
+    """A payload as another description of the cell has it: who names another cell corrects what the log carries."""
+    for weighed in cell.payloads:
+        if (weighed.name, weighed.mounting) == (payload.name, payload.mounting) and "m" in payload.known:
+            return replace(payload, known={**payload.known, "m": weighed.mass_kg})
+    return payload
 
 
 def run_from_log(log: Log, cell: Cell) -> Run:

@@ -29,6 +29,7 @@ DaqError
 │   ├── LogsDiffer              logs of different cells, or of different configurations of one
 │   ├── LogRepeated             one recording twice
 │   ├── RolesExchanged          loaded and unloaded runs are mistaken for each other
+│   ├── ModelContradicted       the declared model explains less of the data than it leaves
 │   └── RunUnfit
 │       ├── RunInvalid          the recorder itself marked it invalid
 │       ├── CyclesLost          SYNC cycles are missing
@@ -191,6 +192,10 @@ class LogRepeated(DataError):
 
 class RolesExchanged(DataError):
     """Loaded and unloaded runs are mistaken for each other."""
+
+
+class ModelContradicted(DataError):
+    """The declared model explains less of the data than it leaves."""
 
 
 class RunUnfit(DataError):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
-from daq.errors import LogRepeated, LogsDiffer, RolesExchanged, UsageError
+from daq.errors import LogRepeated, LogsDiffer, ModelContradicted, RolesExchanged, UsageError
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.comparison import Comparison, compare
@@ -143,6 +143,7 @@ def _fit(
     )
     if not gains_fixed:
         check_signs(result.estimate, nameplate)
+    check_explained(result.training_error, declared.axis_names)
     paper = None if gains_fixed else tls(result.system)
     return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper)
 
@@ -186,6 +187,30 @@ def _culprit(logs: Sequence[Path], cell: Cell | None) -> str:
     return ""
 
 
+LARGEST_TOTAL_PERCENT = 50.0
+LARGEST_AXIS_PERCENT = 100.0
+"""Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
+DOUBTFUL_PERCENT = 25.0
+"""In total; the default gate of `apply` stands here."""
+
+
+def check_explained(error: RelativeError, axes: tuple[str, ...]) -> None:
+    """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
+
+    Raises:
+        ModelContradicted: the relative error is above LARGEST_TOTAL_PERCENT, or LARGEST_AXIS_PERCENT on an axis.
+    """
+    worst = int(np.nanargmax(error.axes))
+    if error.total > LARGEST_TOTAL_PERCENT or error.axes[worst] > LARGEST_AXIS_PERCENT:
+        raise ModelContradicted(
+            "the fit",
+            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}",
+            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis {LARGEST_AXIS_PERCENT:g} %",
+            remedy="look for what contradicts the model: two channels exchanged or one reversed, a wrong drive train, "
+            "gravity or URDF, a payload or drawing (--known cad) that is not the one that was mounted",
+        )
+
+
 def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
     """The payload's weight sets the sign of all gains together: taken from the wrong runs it turns them all."""
     if np.all(np.sign(estimate.gains) == -np.sign(nameplate)):
@@ -193,7 +218,8 @@ def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
             "all drive gains",
             found=", ".join(f"{gain:.3g}" for gain in estimate.gains),
             expected="the signs of the nameplate: " + ", ".join(f"{gain:.3g}" for gain in nameplate),
-            remedy="were the payload's run and the run without load exchanged? look at `drivegain info` of each log",
+            remedy="were the payload's run and the run without load exchanged (look at `drivegain info` of each log), "
+            "or do all currents count the other way?",
         )
 
 

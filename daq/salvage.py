@@ -19,14 +19,16 @@ from daq.log.writer import LogContent, LogWriter
 from drivers.event import CellEvent, EventKind
 from drivers.sample import Sample
 
-_FAULTS = (
-    EventKind.EMCY,
-    EventKind.FOLLOWING_ERROR,
-    EventKind.HEARTBEAT_LOST,
-    EventKind.SAMPLE_LOST,
-    EventKind.STOP_UNCONFIRMED,
+_HARMLESS = (
+    EventKind.EMCY_RESET,
+    EventKind.NMT,
+    EventKind.STATE,
+    EventKind.LIMIT,
+    EventKind.MOVE_START,
+    EventKind.MOVE_END,
+    EventKind.STOP,
 )
-"""Events after which no recorder would have called the run valid."""
+"""Events of sound runs; after any other a recorder might not have called the run valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,7 @@ def _verdict(reader: LogReader, counted: RunStatistics) -> tuple[bool, str]:
         return reader.statistics.valid, reader.statistics.reason
     found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
     found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
-    found += [_told(event) for event in reader.events if event.kind in _FAULTS][:3]
+    found += [_told(event) for event in reader.events if event.kind not in _HARMLESS][:3]
     return not found, ", ".join(found)
 
 

@@ -48,6 +48,7 @@ class Validation:
         digest: of the log (sha256, hex).
         acquaintance: whether the fit has seen it.
         same_configuration: the log carries the cell configuration that the calibration was made with.
+        partial: the log was salvaged from a recording that never finished.
         time_s: of each row, since the start of the run, shape (r,).
         measured_nm: V g with the calibration's gains, shape (n, r).
         predicted_nm: what the calibration says the joints need, shape (n, r).
@@ -59,6 +60,7 @@ class Validation:
     digest: str
     acquaintance: Acquaintance
     same_configuration: bool
+    partial: bool
     time_s: FloatArray
     measured_nm: FloatArray
     predicted_nm: FloatArray
@@ -196,6 +198,7 @@ def predicted(
         digest=run.digest,
         acquaintance=_acquaintance(calibration, run.digest),
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
+        partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
         measured_nm=filter_(measured_torque(calibration, model, data.current_a)),
         predicted_nm=filter_(predict_torque(calibration, model, data)),

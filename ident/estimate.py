@@ -39,7 +39,7 @@ class Estimate:
         covariance: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed.
         axis_noise: standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
         singular_values: of the weighted observation matrix W_r (``tls``: of W_tot).
-        condition: of W_r, rows of a joint divided by its residual's deviation (``ls``: not divided), as in Table 5.
+        condition: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5.
         rows: equations used.
         iterations: of an iterative estimator.
     """

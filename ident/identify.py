@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.conditioning import Conditioning
-from ident.errors import DataUnfit, PayloadUnseen
+from ident.errors import DataUnfit, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
 from ident.estimate import Estimate, Method
 from ident.estimators.least_squares import ls, wls
 from ident.estimators.maximum_likelihood import ml
@@ -87,11 +87,20 @@ def identify(
     system = reduction.system(reduction.base(), reduction.payload_columns())
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
-    if estimate.method is Method.ML and not estimate.gains_fixed:
-        require_seen_payload(estimate, system)
+    if fixed_gains is None:
+        require_seen_payload(estimate if method is Method.ML else _ml_or(estimate, system), system)
     rest = reduce_runs(model, _mounted_among(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)
+
+
+def _ml_or(estimate: Estimate, system: System) -> Estimate:
+    """``ml``'s estimate where it has one: the deviations of the linear ones are those of independent rows (eqs. 10, 23)
+    and do not see that moves contradict each other."""
+    try:
+        return ml(system)
+    except (DataUnfit, NotConverged, RankDeficient, TooFewMoves):
+        return estimate
 
 
 def require_seen_payload(estimate: Estimate, system: System) -> None:

@@ -1,4 +1,4 @@
-"""Error bars that are true although a residual is autocorrelated: leave out one move at a time.
+"""Error bars of an autocorrelated residual: leave out one move at a time (how true they are: docs/estimators.md).
 
 The residual of a geared robot is correlated over a move (lag one about 0.67), so rows are not independent, moves nearly
 are. With G_c = J_cᵀJ_c and s_c = J_cᵀe_c of move c, leaving it out shifts the estimate by −(H − G_c)⁻¹ s_c (MacKinnon &

@@ -49,7 +49,7 @@ class PhysicalParameters:
     @property
     def exact(self) -> bool:
         """Whether the identified base parameters are those of a robot that can exist."""
-        return self.torque_change_percent.total <= 100.0 * EXACT
+        return max(self.torque_change_percent.axes) <= 100.0 * EXACT
 
     @property
     def links(self) -> FloatArray:

@@ -24,6 +24,7 @@ from ident.rows import CHUNK_ROWS, Rows, rows_of
 from ident.run import Run
 from ident.system import System
 from ident.triangles import Triangles, triangle
+from ident.tsqr import qr_update
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -207,19 +208,19 @@ def reduce_runs(
     count, plan = model.robot.joint_count, layout(model)
     width = tuple(len(columns) for columns in plan.joint)
     met = list(payloads)
-    joints = [[np.empty((0, c)) for c in width] for _ in range(len(met) + 1)]
+    joints = [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1)]
     joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     names: list[str] = []
     clusters: list[Cluster] = []
     for run in runs:
         mounting = mounting_of(run, met)
-        joints += [[np.empty((0, c)) for c in width] for _ in range(len(met) + 1 - len(joints))]
+        joints += [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1 - len(joints))]
         data = differentiate(run, model.drive_train, conditioning)
         moves: dict[int, list[list[FloatArray]]] = {}
         for rows in rows_of(model, data, conditioning, chunk_rows):
             for joint, used in enumerate(rows.use):
-                whole = _joint_rows(model, rows, joint, used, plan.joint[joint])
-                joints[mounting + 1][joint] = triangle((joints[mounting + 1][joint], whole), width[joint])
+                columns = _joint_columns(model, rows, joint, used, plan.joint[joint])
+                joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
             joint_rows += rows.use.sum(axis=1)
             motor_rows += rows.motor_use.sum(axis=1)
             for move, parts in _motor_rows(model, rows, plan).items():
@@ -264,12 +265,12 @@ def mounting_of(run: Run, payloads: list[Payload]) -> int:
     return len(payloads) - 1
 
 
-def _joint_rows(model: Model, rows: Rows, joint: int, used: BoolArray, columns: IntArray) -> FloatArray:
+def _joint_columns(model: Model, rows: Rows, joint: int, used: BoolArray, columns: IntArray) -> FloatArray:
     count = len(rows.current)
     own = columns[columns < count]
     current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
     standard = rows.standard[joint][columns[columns >= count] - count][:, used]
-    return np.concatenate((current, standard)).T
+    return np.concatenate((current, standard))
 
 
 def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatArray]]:

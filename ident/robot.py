@@ -13,6 +13,9 @@ from ident.errors import ModelError
 
 FloatArray = NDArray[np.float64]
 
+LARGEST_DISTANCE_M = 50.0
+"""Between joints that follow each other: more than any gantry has."""
+
 
 class JointKind(Enum):
     """One-degree-of-freedom joints."""
@@ -86,6 +89,8 @@ def robot_from_urdf(urdf: str, gravity_m_s2: tuple[float, float, float] = (0.0, 
         joint.calc(motion, pin.neutral(model)[joint.idx_q : joint.idx_q + joint.nq])
         screw = np.asarray(motion.S, dtype=np.float64).reshape(6)
         placement = model.jointPlacements[index]
+        axis = screw[:3] if prismatic else screw[3:]
+        _check_geometry(model.names[index], np.asarray(placement.translation), axis)
         joints.append(
             Joint(
                 name=model.names[index],
@@ -93,7 +98,18 @@ def robot_from_urdf(urdf: str, gravity_m_s2: tuple[float, float, float] = (0.0, 
                 parent=model.parents[index] - 1,
                 rotation=np.array(placement.rotation, dtype=np.float64),
                 translation_m=np.array(placement.translation, dtype=np.float64),
-                axis=screw[:3] if prismatic else screw[3:],
+                axis=axis,
             )
         )
     return Robot(tuple(joints), np.asarray(gravity_m_s2, dtype=np.float64))
+
+
+def _check_geometry(name: str, translation_m: FloatArray, axis: FloatArray) -> None:
+    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
+        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
+    distance = float(np.max(np.abs(translation_m)))
+    if not distance <= LARGEST_DISTANCE_M:
+        raise ModelError(
+            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
+            "is the URDF in mm?"
+        )

@@ -107,6 +107,14 @@ def require_rows(system: System) -> None:
         DataUnfit: for a motor.
     """
     for motor, rows in enumerate(system.motors.rows):
+        if not rows:
+            train = system.drive_train
+            joints = np.flatnonzero((train.direction[motor] != 0) | (train.to_motor[motor] != 0))
+            raise DataUnfit(
+                ", ".join(system.runs),
+                f"joints {' and '.join(str(joint + 1) for joint in joints)}, which motor {motor + 1} is coupled to, "
+                "never move at the same time; let them, or choose another estimator than ml",
+            )
         if rows <= len(system.unknowns):
             raise DataUnfit(
                 ", ".join(system.runs),
@@ -152,7 +160,7 @@ def require_distinct(system: System, *, gains: bool) -> None:
         raise RankDeficient("payload and robot cannot be told apart: record the same robot without load too", lost)
     if gains:
         for motor, factor in enumerate(system.motors.factors):
-            if not np.any(factor[:, 0]):
+            if system.motors.rows[motor] and not np.any(factor[:, 0]):
                 name = f"gain {motor + 1}"
                 raise RankDeficient(
                     f"the current of motor {motor + 1} is zero throughout: is its channel connected?", (name,)

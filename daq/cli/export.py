@@ -14,6 +14,7 @@ from rich.table import Table
 
 from daq.atomic_file import replace_file
 from daq.calibration_file import load
+from daq.cli.export_log import EXPORT_LOG
 from daq.cli.output import check_output, say_written
 from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json, printable
@@ -21,7 +22,8 @@ from daq.cli.verb_group import VerbGroup
 from daq.configuration.cell_file import URDF, bundle, load_cell
 from daq.configuration.cell_model import model_of
 from daq.configuration.yaml_file import read_bytes
-from daq.errors import ConfigurationInconsistent, OutputExists, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputExists, OutputFailed, UsageError
+from daq.fit import DOUBTFUL_PERCENT
 from daq.physical_robot import PhysicalRobot, cell_limits, physical_robot, require_solver
 from daq.urdf_file import FORMAT, JointUpdate, Updated, update_urdf
 from daq.urdf_markup import parse_markup
@@ -40,7 +42,7 @@ _SHOWN_SHIFTS = 5
 
 
 def export_verb() -> None:
-    """Write what a calibration holds into a file of another program."""
+    """Write what a calibration or a log holds into a file of another program."""
 
 
 def export_urdf_verb(
@@ -62,6 +64,7 @@ def export_urdf_verb(
     require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load(calibration)
+    require_good(known, str(calibration))
     content = bundle(given)[URDF] if urdf is None else read_bytes(given)
     if out.exists() and out.read_bytes() == content:
         raise OutputExists(
@@ -80,6 +83,22 @@ def export_urdf_verb(
         print_json(report(known, robot, updates, updated, out, same))
     else:
         show(known, robot, updates, updated, out, same, Console(soft_wrap=True, highlight=False))
+
+
+def require_good(calibration: Calibration, name: str) -> None:
+    """A model that leaves a quarter of the torque says nothing of bodies.
+
+    Raises:
+        ModelContradicted: the calibration's relative error is above DOUBTFUL_PERCENT.
+    """
+    left = calibration.relative_error_percent.total
+    if not left <= DOUBTFUL_PERCENT:
+        raise ModelContradicted(
+            name,
+            found=f"a relative error of {left:.3g} %",
+            expected=f"at most {DOUBTFUL_PERCENT:g} %",
+            remedy="fit again; `drivegain fit` says what to look for",
+        )
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
@@ -267,4 +286,4 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 EXPORT_URDF = Verb(
     "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
 )
-EXPORT = VerbGroup("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF,))
+EXPORT = VerbGroup("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))

@@ -21,13 +21,13 @@ from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed, UsageError
-from daq.fit import Fit, compare_estimators, fit
+from daq.fit import Fit, check_explained, compare_estimators, fit
 from daq.gain_verdicts import needed_verdicts
 from daq.report.comparison import comparison_document, comparison_tables
 from daq.report.current_signal import actual_current_note
 from daq.report.excitation import advice, cannot_tell, verdict_document
 from daq.report.fit import draw
-from daq.report.gain_table import gain_table
+from daq.report.gain_table import gain_table, partial_note
 from ident.calibration import Calibration
 from ident.comparison import Comparison
 from ident.estimate import Method
@@ -106,6 +106,7 @@ def fit_verb(
         else:
             chosen = method or (Method.WLS if fixed else Method.ML)
             found = fit_case(reduce_logs(logs, holdout or (), described), chosen, known, gains_fixed=fixed)
+            check_explained(found.fitted.identification.training_error, found.fitted.cell.axis_names)
         if essential is not None:
             found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
         fitted, calibration = found.fitted, calibration_of_case(found, datetime.now(UTC))
@@ -207,6 +208,8 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
     """Gains, errors and what they rest on, for a person."""
     estimate = fitted.final.estimate
     console.print(gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}"))
+    if (note := partial_note(calibration)) is not None:
+        console.print(note, style="bold", markup=False)
     note = actual_current_note(fitted.cell)
     if note is not None:
         console.print(note)

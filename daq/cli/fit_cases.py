@@ -17,6 +17,7 @@ from daq.cli.progress import status
 from daq.cli.verb import print_json, printable
 from daq.configuration.cell import Cell
 from daq.errors import OutputFailed
+from daq.fit import DOUBTFUL_PERCENT
 from daq.report.paper_tables import PaperTable, gain_table, page, parameter_table
 from ident.calibration import Calibration
 
@@ -73,6 +74,10 @@ def fit_cases(
         print_json({"cases": {case.name: _document(case, fits, calibrations) for case in CASES}})
         return
     console = Console(soft_wrap=True, highlight=False)
+    for name, found in fits.items():
+        left = found.fitted.identification.training_error.total
+        if left > DOUBTFUL_PERCENT:
+            console.print(f"{name} did not succeed: its relative error is {left:.3g} %.", style="bold", markup=False)
     for table in tables:
         console.print(table.on_screen())
         for note in table.notes:

@@ -29,13 +29,14 @@ from daq.cli.progress import status
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
 from daq.fit import Fit, calibration_of, close_loop, fit
-from daq.report.gain_table import gain_table
+from daq.report.gain_table import gain_table, partial_note, with_deviation
 from ident.calibration import Calibration
 from ident.estimate import Method
 from ident.search import Finding
 
 SHOWN = 6
 """Findings listed for each turn; the JSON has them all."""
+SHOWN_RIVALS = 3
 
 
 def residual_verb(
@@ -129,9 +130,17 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
             console.print("No candidate passes every gate: nothing is added.\n")
         else:
             console.print(f"Added: {step.accepted.effect.name} on {fitted.cell.axes[step.accepted.axis].name}.\n")
+    for effect in calibration.effects:
+        sizes = ", ".join(f"{c.name} {with_deviation(c.value, c.std)} {c.unit}" for c in effect.coefficients)
+        more = len(effect.ambiguity) - SHOWN_RIVALS
+        rivals = ", ".join(effect.ambiguity[:SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
+        rivals = f"; not told from {rivals}" if rivals else ""
+        console.print(f"{effect.axis}: {effect.name}: {sizes}{rivals}", markup=False)
     console.print(before_after_table(fitted))
     console.print()
     console.print(gain_table(calibration.gains, title="Drive gains with the effects in the model"))
+    if (note := partial_note(calibration)) is not None:
+        console.print(note, style="bold", markup=False)
 
 
 def ranking_table(fitted: Fit, findings: tuple[Finding, ...], title: str) -> Table:
@@ -156,7 +165,11 @@ def ranking_table(fitted: Fit, findings: tuple[Finding, ...], title: str) -> Tab
 def before_after_table(fitted: Fit) -> Table:
     """Relative error of each axis without and with the effects."""
     table = Table(
-        title="Relative error ‖ρ‖/‖Y‖ [%]", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
+        title="Relative error ‖ρ‖/‖Y‖ by ml [%]",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
     )
     for heading in ("", *(axis.name for axis in fitted.cell.axes), "total"):
         table.add_column(heading, justify="right", no_wrap=True)

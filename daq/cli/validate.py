@@ -153,6 +153,7 @@ def report(calibration: Calibration, validations: tuple[Validation, ...], drawn:
                 "log": str(validation.log),
                 "sha256": validation.digest,
                 "seen_by_fit": validation.acquaintance is Acquaintance.FIT,
+                "partial": validation.partial,
                 "held_out": validation.acquaintance is Acquaintance.HOLDOUT,
                 "same_configuration": validation.same_configuration,
                 "rows": validation.rows,

@@ -59,6 +59,7 @@ class RecordFile:
         self.sha256 = ""
         self.whole_bytes = 0
         self._allowance = 0
+        self._zstd = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
         """Offset and record; those that only index others are passed over."""
@@ -228,7 +229,7 @@ class RecordFile:
                 claimed = zstandard.frame_content_size(data)
                 if claimed > size:
                     raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as it says itself")
-                data = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+                data = self._zstd.decompress(data, max_output_size=size)
             except zstandard.ZstdError as error:
                 raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
         if len(data) != size:

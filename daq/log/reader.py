@@ -39,6 +39,8 @@ from daq.log.readback import Readback, readback_from_bytes
 from drivers.event import CellEvent
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+BLOCK_SAMPLES = 4096
+"""That a block has before it is handed out; so many and one chunk are in memory at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,6 +160,24 @@ class LogReader:
             yield offset, record
 
     def _blocks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[SampleBlock]:
+        """Several chunks make a block: numpy's calls cost more than the 150 samples of one chunk."""
+        waiting: list[NDArray[np.void]] = []
+        start = 0
+        try:
+            for offset, chunk in self._sample_chunks(records):
+                if waiting and (chunk.dtype != waiting[0].dtype or sum(map(len, waiting)) >= BLOCK_SAMPLES):
+                    yield self._block(start, waiting)
+                    waiting = []
+                start = start if waiting else offset
+                waiting.append(chunk)
+        except LogUnreadable:
+            if waiting:  # what was whole before the damage
+                yield self._block(start, waiting)
+            raise
+        if waiting:
+            yield self._block(start, waiting)
+
+    def _sample_chunks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[tuple[int, NDArray[np.void]]]:
         for offset, record in records:
             if isinstance(record, Attachment):
                 self._attachments[record.name] = record.data
@@ -214,7 +234,7 @@ class LogReader:
         """See `Log.partial`; once the iteration has ended."""
         return _partial(self.path, self.statistics)
 
-    def _chunk(self, offset: int, data: bytes) -> Iterator[SampleBlock]:
+    def _chunk(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
         """Samples of a chunk: at once when it holds nothing else, else picked one by one."""
         start = self._definitions(offset, data)
         if start == len(data):
@@ -225,13 +245,13 @@ class LogReader:
             axes = self._axes(offset, head[1])
             if not rest:
                 records = np.frombuffer(data, dtype=sample_dtype(axes), count=count, offset=start)
-                same = (records["opcode"] == Opcode.MESSAGE) & (records["length"] == head[1])
-                if np.all(same & (records["channel"] == head[2])):
-                    yield self._block(offset, records, axes)
+                words = zip((records[name] for name in ("opcode", "length", "channel")), head[:3], strict=True)
+                if all((column == word).all() for column, word in words):
+                    yield offset, records
                     return
         yield from self._mixed(offset, data, start)
 
-    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[SampleBlock]:
+    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[tuple[int, NDArray[np.void]]]:
         """A chunk of events and viewers' topics, or one that another tool has packed anew."""
         samples: list[bytes] = []
         while start < len(data):
@@ -253,7 +273,7 @@ class LogReader:
             dtype = sample_dtype(axes)
             if any(len(sample) != dtype.itemsize for sample in samples):
                 raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
-            yield self._block(offset, np.frombuffer(b"".join(samples), dtype=dtype), axes)
+            yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
     def _definitions(self, offset: int, data: bytes) -> int:
         """Take the schemas and channels at the start of a chunk; position of the first message."""
@@ -297,11 +317,16 @@ class LogReader:
                 return axes
         raise self._file.corrupt(offset, f"a sample of {length} bytes", f"1 to {LARGEST_AXES} axes")
 
-    def _block(self, offset: int, records: NDArray[np.void], axes: int) -> SampleBlock:
-        counts = [records[name] == axes for name in ("positions", "currents", "statuswords")]
-        if not (np.all(counts) and np.all(records["encapsulation"] == ENCAPSULATION_WORD)):
+    def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
+        # As bytes: numpy would promote the fields of one type to those of the same type, chunk by chunk.
+        records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
+        axes = records["position_counts"].shape[1]
+        fixed = [records[name] for name in ("positions", "currents", "statuswords", "encapsulation")]
+        if any(
+            (column != word).any() for column, word in zip(fixed, (axes, axes, axes, ENCAPSULATION_WORD), strict=True)
+        ):
             raise self._file.corrupt(offset, "samples of another layout", f"little-endian CDR of {axes} axes")
-        if not (np.all(records["seconds"] >= 0) and np.all(records["nanoseconds"] < 1_000_000_000)):
+        if (records["seconds"] < 0).any() or (records["nanoseconds"] >= 1_000_000_000).any():
             raise self._file.corrupt(offset, "samples from before 1970 or of a second that is too long", "Unix time")
         return SampleBlock(
             cycle=records["cycle"].astype(np.uint64),

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from rich import box
 from rich.table import Table
 
-from ident.calibration import Gain
+from ident.calibration import Calibration, Gain
 
 
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
@@ -37,6 +37,12 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
             row += [f"{truth[gain.axis]:.4g}", f"{100.0 * (gain.value / truth[gain.axis] - 1.0):+.2f}"]
         table.add_row(*row, gain.unit)
     return table
+
+
+def partial_note(calibration: Calibration) -> str | None:
+    """What to say of a calibration that rests on a log that never finished."""
+    partial = [source.name for source in calibration.sources if source.partial]
+    return f"PARTIAL data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
 
 
 def with_deviation(value: float, std: float) -> str:

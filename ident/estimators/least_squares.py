@@ -50,6 +50,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
     covariance = np.zeros((len(full) - 1, len(full) - 1))
     first = 0 if fixed is None else count
     covariance[first:, first:] = variance * inverse
+    weighted = triangles.weighted_system(full, matrix.shape[1], gains=fixed is None)
     return Estimate(
         method=method,
         gains=full[:count],
@@ -59,6 +60,6 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
         covariance=covariance,
         axis_noise=triangles.residual_std(full, matrix.shape[1]),
         singular_values=singular,
-        condition=float(singular[0] / singular[-1]),
+        condition=float(weighted[0] / weighted[-1]),
         rows=rows,
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ident.estimate import Estimate, Method
 from ident.system import System, require_known_payload
-from ident.triangles import Triangles
+from ident.triangles import Triangles, solve
 
 FloatArray = NDArray[np.float64]
 
@@ -43,8 +43,7 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
         weight = 1.0 / triangles.residual_std(first, len(first) - 1)
     vector, covariance, singular = _smallest(triangles, weight, columns)
     count = system.joint_count
-    regressor = triangles.stacked(weight)[:, :-1]
-    weighted = np.linalg.svd(regressor, compute_uv=False)
+    weighted = triangles.weighted_system(vector, len(vector) - 1, gains=True)
     return Estimate(
         method=Method.TLS,
         gains=vector[:count],
@@ -72,6 +71,6 @@ def _smallest(
     compatible = scaled - s[-1] * np.outer(u[:, -1], vt[-1])  # eq. (20)
     first = compatible[:, :-1]
     size = 1.0 + float(np.sum(vector[:-1] ** 2))
-    scaled_covariance = noise**2 * size * np.linalg.pinv(first.T @ first, rcond=1e-15)  # eq. (23)
+    scaled_covariance = noise**2 * size * solve(first, scaled[:, -1])[1]  # eq. (23)
     back = norms[-1] / norms[:-1]
     return vector * norms[-1] / norms, scaled_covariance * np.outer(back, back), s

@@ -64,6 +64,24 @@ def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
         drive_axes(cell)
 
 
+def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
+    cells, drives = tmp_path / "cells", tmp_path / "drives"
+    cells.mkdir()
+    drives.mkdir()
+    configs = checkout / "configs"
+    text = (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+    (cells / "cell.yaml").write_text(text)
+    profile = (configs / "drives/generic-cia402.yaml").read_text()
+    (drives / "generic-cia402.yaml").write_text(profile)
+    assert not [name for name in bundle(cells / "cell.yaml") if name.endswith(".eds")]
+    (drives / "generic-cia402.yaml").write_text(profile + "eds: maker.eds\n")
+    (drives / "maker.eds").write_bytes(b"[FileInfo]\n")
+    assert bundle(cells / "cell.yaml")["drives/generic-cia402.eds"] == b"[FileInfo]\n"
+    (drives / "maker.eds").unlink()
+    with pytest.raises(ConfigurationMissing, match=r"maker\.eds"):
+        bundle(cells / "cell.yaml")
+
+
 def test_a_bundle_is_the_same_cell_without_its_files(checkout: Path) -> None:
     path = checkout / "configs/cells/demo.yaml"
     files = bundle(path)

@@ -75,6 +75,17 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
     assert len(run.digest) == 64
 
 
+def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:
+    """And what is printed of the payload is what was used."""
+    log = record(samples([[1000 * k] * 6 for k in range(100)]), loaded=True)
+    heavier = replace(CELL, payloads=tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads))
+    run, _ = load_run(log, heavier)
+    assert run.payload is not None
+    assert run.payload.known == {"m": 5.049}
+    other = replace(CELL, payloads=tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads))
+    assert load_run(log, other)[0].payload == DISC
+
+
 def test_no_moves_written_down_is_none(record: Recorder) -> None:
     assert load_run(record(samples([[0] * 6] * 3)))[0].move is None
 

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from daq import fit as fit_module
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
-from daq.errors import LogRepeated, LogsDiffer
-from daq.fit import fit
+from daq.errors import LogRepeated, LogsDiffer, ModelContradicted
+from daq.fit import check_explained, fit
 from daq.resources import shipped_configurations
 from ident.errors import PayloadUnseen
+from ident.estimate import Method
+from ident.relative_error import RelativeError
 from ident.run import Run
 from tests.ident.recordings import MOUNTED, record, tx40_truth
 
@@ -78,3 +82,32 @@ def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytes
     monkeypatch.setattr(fit_module, "load_run", load)
     with pytest.raises(LogsDiffer, match="as in the first log"):
         fit(_paths("run0", "run1"))
+
+
+def test_a_model_that_contradicts_its_data_is_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two current channels exchanged: small deviations, and nothing is right."""
+    order = [0, 1, 2, 4, 3, 5]
+    crossed = {name: replace(run, current_a=run.current_a[:, order]) for name, run in shelf.runs.items()}
+    monkeypatch.setattr(fit_module, "load_run", Shelf(shelf.cell, crossed).load)
+    for method in (Method.WLS, Method.TLS):
+        with pytest.raises((ModelContradicted, PayloadUnseen)):
+            fit(_paths("run0", "run1", "run2", "run3"), method=method)
+
+
+@pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS])
+def test_every_method_hears_of_a_payload_that_was_not_there(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch, method: Method
+) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(PayloadUnseen):
+        fit(_paths("undeclared", "run1", "run2", "run3"), method=method)
+
+
+@given(total=st.floats(0.0, 200.0), axis=st.floats(0.0, 1000.0))
+def test_what_is_refused_is_what_the_limits_say(total: float, axis: float) -> None:
+    error = RelativeError((axis, 1.0), total)
+    if total > 50.0 or axis > 100.0:
+        with pytest.raises(ModelContradicted, match="J1" if axis > 1.0 else "total"):
+            check_explained(error, ("J1", "J2"))
+    else:
+        check_explained(error, ("J1", "J2"))

@@ -118,7 +118,8 @@ def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
     assert list(state.position) == pytest.approx(joints(rows[20].position_counts))
 
 
-def test_samples_are_on_disk_within_200_ms_of_recorded_time(tmp_path: Path) -> None:
+def test_samples_are_on_disk_within_200_ms_of_recorded_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     rows = samples([[k] for k in range(1000)])
     reader = LogReader(tmp_path / "a.mcap")
     blocks = [len(block.cycle) for block in LogReader(write(tmp_path / "a.mcap", content(1), rows))]
@@ -182,8 +183,9 @@ def test_a_log_without_samples_is_incomplete(tmp_path: Path) -> None:
         read_log(write(tmp_path / "a.mcap", content(1), []))
 
 
-def test_samples_have_chunks_of_their_own(tmp_path: Path) -> None:
+def test_samples_have_chunks_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What makes a chunk one `frombuffer`."""
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
     file = RecordFile(write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events))
     sizes = [chunk.uncompressed_size for offset, chunk in file if isinstance(chunk, Chunk)]
@@ -191,3 +193,21 @@ def test_samples_have_chunks_of_their_own(tmp_path: Path) -> None:
     assert [len(block.cycle) for block in blocks] == [1, *[150] * 5, 149]
     assert len(sizes) == 2 * len(blocks)
     np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+
+
+@pytest.mark.parametrize("size", [1, 7, 149, 151, 10_000])
+def test_the_size_of_a_block_changes_nothing_but_the_blocks(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", size)
+    path = write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]))
+    blocks = list(LogReader(path))
+    assert max(len(block.cycle) for block in blocks) <= size + 149
+    np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+    whole = LogReader(path)
+    assert (len(list(whole.until_damage())), whole.damage) == (len(blocks), None)
+    path.write_bytes(path.read_bytes()[: whole.whole_bytes - 5])
+    cut = LogReader(path)
+    saved = np.concatenate([b.position_counts for b in cut.until_damage()])[:, 1]
+    assert cut.damage is not None
+    np.testing.assert_array_equal(saved, np.arange(900))

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from math import radians
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
+from daq.cli.app import main
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.conversion import load_run
-from daq.errors import RunInvalid
+from daq.errors import ExitCode, RunInvalid
 from daq.log.reader import read_log
 from daq.plan_file import load_plan
 from daq.record import Clocks, Recorded, record
@@ -51,10 +54,10 @@ class Rig:
 
         patch.setattr("daq.record.network_of", network_of)
 
-    def run(self) -> Recorded:
+    def run(self, clocks: Clocks | None = None) -> Recorded:
         """Record the plan."""
         declared = load_cell(self.cell_file)
-        clocks = Clocks(lambda: WALL_NS, self.bus.clock)
+        clocks = clocks or Clocks(lambda: WALL_NS, self.bus.clock)
         moves = load_plan(self.plan, declared)
         return record(
             self.cell_file,
@@ -171,3 +174,24 @@ def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
     done = lockstep.run()
     assert done.stream.foreign > 100
     assert (done.log.valid, done.log.reason) == (True, "")
+
+
+@pytest.mark.parametrize("step_ns", [0, 3_000_000_000])
+def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
+    lockstep: Rig, step_ns: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wall = {"ns": WALL_NS}
+
+    def set_clock(cycle: int) -> None:
+        if cycle == 150:
+            wall["ns"] += step_ns
+
+    lockstep.bus.on_cycle = set_clock
+    clocks = Clocks(lambda: wall["ns"] + lockstep.bus.clock(), lockstep.bus.clock)
+    lockstep.run(clocks)
+    log = read_log(lockstep.out)
+    assert log.statistics.wall_minus_monotonic_ns == WALL_NS + step_ns
+    assert log.head.run.wall_minus_monotonic_ns == WALL_NS
+    assert set(np.diff(log.samples.time_ns)) == {PERIOD_NS}
+    assert main(["info", str(lockstep.out), "--json"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
