@@ -37,8 +37,10 @@ from ident.payload import Payload
 
 FloatArray = NDArray[np.float64]
 
-LOCKSTEP_TIMEOUT_S = 5.0
-"""A simulated cell on a busy machine may be that late, and nothing real waits meanwhile."""
+LOCKSTEP_TIMEOUT_S = 3.0
+"""A simulated cell on a busy machine may be that late; one that ended is told of in two seconds."""
+GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
+"""Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
 ALLOWANCE_S = 10.0
 """Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
 SPACE_CHECK_S = 0.1
@@ -76,7 +78,9 @@ def network_of(cell: Cell) -> CanopenNetwork:
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
-    return CanopenNetwork(bus_address(cell), drive_axes(cell))
+    pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
+    # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
+    return CanopenNetwork(bus_address(cell), drive_axes(cell), guard_ms=max(GUARD_MS[pacing], 3 * period_us // 1000))
 
 
 def record(
@@ -121,7 +125,7 @@ def record(
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
     with network_of(cell) as network:
         network.prepare()
-        warnings = check_currents(cell, network.scales())
+        warnings = (*check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
         started_ns = clocks.monotonic_ns()
@@ -143,6 +147,7 @@ def record(
         stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
         # The first samples tell where the axes stand: what is refused there is refused before a file exists.
         first = until_complete(stream)
+        network.check_feedback(first[-1])
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         start_counts = first[-1].position_counts
         moves = motor_moves(cell, plan, scale, start_counts)

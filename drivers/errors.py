@@ -2,6 +2,7 @@
 
 DriverError
 ├── BusError                  the bus cannot be opened, or has gone
+├── BusBusy                   another master commands this bus
 ├── NodeMissing               a configured node does not answer
 ├── IdentityMismatch          1018h is not what the cell configuration expects
 ├── NmtRefused                a node did not confirm an NMT state by heartbeat
@@ -9,7 +10,12 @@ DriverError
 ├── ScaleImplausible          a drive's ampere value cannot be true (drivers/scale.py)
 ├── MappingRefused            a PDO mapping could not be written, or reads back differently
 ├── StateRefused              a CiA 402 transition did not happen in its bound
+├── FeedbackDiffers           a PDO carries another value than the object that it maps
 ├── SampleLost                a SYNC cycle had no complete answer
+├── CellSilent                no axis answers any more
+├── PdoLengthWrong            an answer is not as long as the mapping says, twice
+├── DataFrozen                position and current do not change while the axis is told to move
+├── LimitActive               a limit acts for too long
 ├── DriveFault                EMCY, fault bit or following error while running
 ├── HeartbeatLost             a node fell silent
 ├── MotionRefused             motion was asked for without permission, or outside the limits
@@ -30,6 +36,18 @@ class BusError(DriverError):
         super().__init__(f"bus {address}: {reason}")
         self.address = address
         self.reason = reason
+
+
+class BusBusy(DriverError):
+    """Another master commands this bus: two of them would move one robot."""
+
+    def __init__(self, address: str, seen: str) -> None:
+        super().__init__(
+            f"bus {address}: {seen} that we did not send: another master, recorder or SYNC producer uses this bus; "
+            "end it first"
+        )
+        self.address = address
+        self.seen = seen
 
 
 class NodeMissing(DriverError):
@@ -104,6 +122,72 @@ class StateRefused(DriverError):
         self.node_id = node_id
         self.asked = asked
         self.found = found
+        self.statusword = statusword
+
+
+class FeedbackDiffers(DriverError):
+    """A PDO carries another value than the object that it maps, at standstill."""
+
+    def __init__(self, node_id: int, entry: str, by_sdo: int, by_pdo: int, allowed: int) -> None:
+        super().__init__(
+            f"node {node_id}: object {entry} is {by_sdo} by SDO and {by_pdo} in its PDO at standstill, expected at "
+            f"most {allowed} apart; another device sends with this COB-ID, or the mapping is not what it reads back as"
+        )
+        self.node_id = node_id
+        self.entry = entry
+        self.by_sdo = by_sdo
+        self.by_pdo = by_pdo
+
+
+class CellSilent(DriverError):
+    """No axis answers any more; a stop that could not be confirmed is noted on the error."""
+
+    def __init__(self, cycle: int, waited_s: float) -> None:
+        super().__init__(
+            f"cycle {cycle}: no axis answered within {waited_s:.3g} s; check the power of the cell and the bus"
+        )
+        self.cycle = cycle
+        self.waited_s = waited_s
+
+
+class PdoLengthWrong(DriverError):
+    """An answer is not as long as the mapping says, twice; a stop that could not be confirmed is noted on the error."""
+
+    def __init__(self, node_id: int, cob_id: int, expected: int, found: int) -> None:
+        super().__init__(
+            f"node {node_id}: PDO {cob_id:03X}h has {found} bytes, its mapping says {expected}; stopping all axes; "
+            "did somebody change the mapping, or does another device use this COB-ID?"
+        )
+        self.node_id = node_id
+        self.cob_id = cob_id
+        self.expected = expected
+        self.found = found
+
+
+class DataFrozen(DriverError):
+    """Position and current do not change while the axis is told to move."""
+
+    def __init__(self, move: int, node_id: int, position_counts: int, current_raw: int) -> None:
+        super().__init__(
+            f"node {node_id}: move {move}: position {position_counts} and current {current_raw} do not change while "
+            "the axis is told to move; stopping all axes; is its data frozen, its encoder or its motor cable off?"
+        )
+        self.move = move
+        self.node_id = node_id
+        self.position_counts = position_counts
+        self.current_raw = current_raw
+
+
+class LimitActive(DriverError):
+    """A limit of the drive acts for too long; a stop that could not be confirmed is noted on the error."""
+
+    def __init__(self, node_id: int, acted_s: float, statusword: int) -> None:
+        super().__init__(
+            f"node {node_id}: a limit acts for {acted_s:g} s, statusword {statusword:#06x}; stopping all axes; "
+            "check limit switches, position, speed and current limits, or use slower moves"
+        )
+        self.node_id = node_id
+        self.acted_s = acted_s
         self.statusword = statusword
 
 

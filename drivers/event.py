@@ -18,6 +18,10 @@ class EventKind(Enum):
     LIMIT = "limit"
     HEARTBEAT_LOST = "heartbeat lost"
     SAMPLE_LOST = "sample lost"
+    BUS_BUSY = "bus busy"
+    BUS_LOST = "bus lost"
+    PDO_LENGTH = "pdo length"
+    FROZEN = "frozen data"
     MOVE_START = "move start"
     MOVE_END = "move end"
     STOP = "stop"
@@ -32,7 +36,8 @@ class CellEvent:
         time_ns: in the time of the samples [ns since 1970]: that of the SYNC it came after.
         axis: index of the axis from 0, or None when it concerns the whole cell.
         kind: what happened.
-        code: EMCY error code, NMT state, statusword, number of the move or of the cycle, by kind.
+        code: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, by
+            kind.
         text: for a person.
     """
 

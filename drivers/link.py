@@ -11,14 +11,16 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import can
-from canopen.emcy import EmcyError
 
 from drivers.bus import BusAddress, bus_errors, open_bus, send_burst
+from drivers.emcy import describe
 from drivers.errors import BusError, NmtRefused
 from drivers.event import CellEvent, EventKind
 from drivers.sdo import Clock, ObjectAccess, PumpedSdoClient, SdoPolicy
 
 SYNC_COB_ID = 0x080
+_NMT_COB_ID = 0x000
+SDO_REQUEST = 0x600
 _EMCY, _SDO_ANSWER, _HEARTBEAT = 0x080, 0x580, 0x700
 _BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 
@@ -50,6 +52,15 @@ def nmt_name(state: int | None) -> str:
     return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
 
 
+def command_name(identifier: int) -> str:
+    """Name of a master's command for a person."""
+    if identifier == SYNC_COB_ID:
+        return "a SYNC (080h)"
+    if identifier == _NMT_COB_ID:
+        return "an NMT command (000h)"
+    return f"an SDO request to node {identifier - SDO_REQUEST} ({identifier:03X}h)"
+
+
 class Link:
     """An open bus and what its nodes last said about themselves.
 
@@ -57,6 +68,8 @@ class Link:
         nmt: last NMT state of each node that sent a heartbeat.
         heard_ns: when it did, by the clock.
         answered: nodes that sent any SDO answer.
+        silent: nodes that did not answer when they were last asked, and were not heard since.
+        foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request) came that we did not send.
     """
 
     def __init__(
@@ -72,6 +85,11 @@ class Link:
         self.nmt: dict[int, int] = {}
         self.heard_ns: dict[int, int] = {}
         self.answered: set[int] = set()
+        self.foreign: dict[int, int] = {}
+        self.silent: set[int] = set()
+        self._beat: can.Message | None = None
+        self._beat_period_ns = 0
+        self._next_beat_ns = 0
         self._opener = opener
         self._bus: can.BusABC | None = None
         self._clients: dict[int, list[PumpedSdoClient]] = {}
@@ -118,6 +136,7 @@ class Link:
         Raises:
             BusError: the bus has gone, or is off.
         """
+        self.beat()
         with bus_errors(self.address):
             message = self.bus.recv(timeout_s)
             while message is not None:
@@ -134,8 +153,29 @@ class Link:
         while (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
 
+    def start_heartbeat(self, node_id: int, period_ms: int) -> None:
+        """Let the nodes hear us from now on, as a node of this id, whenever somebody reads the bus."""
+        self._beat = can.Message(
+            arbitration_id=_HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
+        )
+        self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
+
+    def stop_heartbeat(self) -> None:
+        """Fall silent again."""
+        self._beat = None
+
+    def beat(self) -> None:
+        """Send our heartbeat if one is due.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        if self._beat is not None and (now := self.clock()) >= self._next_beat_ns:
+            self._next_beat_ns = now + self._beat_period_ns
+            self.send((self._beat,))
+
     def dispatch(self, message: can.Message) -> bool:
-        """Take note of a frame; tells whether it was a heartbeat, EMCY or SDO answer.
+        """Take note of a frame; tells whether it was a heartbeat, EMCY, SDO answer or the command of another master.
 
         Raises:
             BusError: an error frame says that the controller went off the bus.
@@ -145,8 +185,14 @@ class Link:
                 raise BusError(str(self.address), "bus-off: the CAN controller disconnected itself; check the wiring")
             return True
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
-        if message.is_extended_id or message.is_remote_frame or node_id == 0:
+        if message.is_extended_id or message.is_remote_frame:
             return False
+        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id):
+            self._note_foreign(message.arbitration_id)  # no end of a bus receives what it sent itself
+            return True
+        if node_id == 0:
+            return False
+        self.silent.discard(node_id)
         if service == _HEARTBEAT and message.data:
             self._note_heartbeat(node_id, message.data[0] & 0x7F)
         elif service == _EMCY and len(message.data) == 8:
@@ -167,12 +213,16 @@ class Link:
             text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
             self._events.append((node_id, EventKind.NMT, state, text))
 
+    def _note_foreign(self, identifier: int) -> None:
+        self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
+        if self.foreign[identifier] == 1:  # told once: a master would fill the log
+            self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
+
     def _note_emcy(self, node_id: int, data: bytearray) -> None:
         code, register = int.from_bytes(data[:2], "little"), data[2]
         # CiA 301: codes 00xxh say that an error has gone.
         kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-        description = EmcyError(code, register, bytes(data[3:]), 0.0).get_desc() or "unnamed"
-        text = f"EMCY {code:04X}h {description}, error register {register:02X}h, data {data[3:].hex()}"
+        text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data[3:].hex()}"
         self._events.append((node_id, kind, code, text))
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
@@ -181,7 +231,13 @@ class Link:
             return ()
         taken, self._events = self._events, deque()
         return tuple(
-            CellEvent(time_ns, node_ids.index(node) if node in node_ids else None, kind, code, f"node {node}: {text}")
+            CellEvent(
+                time_ns,
+                node_ids.index(node) if node in node_ids else None,
+                kind,
+                code,
+                f"node {node}: {text}" if node else text,
+            )
             for node, kind, code, text in taken
         )
 

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import can
 
-from drivers.errors import DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
+from drivers.errors import DataFrozen, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
 from drivers.event import CellEvent, EventKind
+from drivers.frozen import FrozenData
 from drivers.mapping import SETPOINT_PDOS, Direction, layout
 from drivers.move import MotionPermission, Move, check_moves
 from drivers.network import CanopenNetwork
+from drivers.pacing import LockstepSync
 from drivers.sample import Sample
 from drivers.state import (
     CONTROL_CHANGE_IMMEDIATELY,
@@ -81,6 +83,7 @@ def execute(
         MotionRefused: no permission, or a move outside of it; nothing has moved.
         StateRefused: an axis did not become OPERATION ENABLED, or could not be stopped.
         MotionTimeout: a move did not end in its bound.
+        DataFrozen: an axis is told to move, and its position and current stay what they are.
         DriveFault, HeartbeatLost, SampleLost, BusError: see the stream.
     """
     if permission is None:
@@ -94,16 +97,17 @@ def execute(
     if not moves:
         return
     walk = _Walk(network, stream, bounds, first)
-    try:
-        yield from walk.enable(permission.granted_by)
-        for number, move in enumerate(moves):
-            yield from walk.move(number, move)
-        problems = yield from walk.stop()
-    except BaseException as error:
-        # Also a closed generator and an interrupt, during the stop above as well: the stop then runs without yielding.
-        for problem in _drain(walk.stop()):
-            error.add_note(f"while stopping: {problem}")
-        raise
+    with network.guarded():
+        try:
+            yield from walk.enable(permission.granted_by)
+            for number, move in enumerate(moves):
+                yield from walk.move(number, move)
+            problems = yield from walk.stop()
+        except BaseException as error:
+            # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
+            for problem in _drain(walk.stop()):
+                error.add_note(f"while stopping: {problem}")
+            raise
     if problems:
         for problem in problems[1:]:
             problems[0].add_note(f"while stopping: {problem}")
@@ -194,7 +198,11 @@ class _Walk:
         yield from self._handshake(number, moving)
         durations = move.duration_s(start)
         allowed = 2 * max(durations) + self._bounds.settle_s
+        data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed)):
+            for axis in data.frozen(self._sample):
+                if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
+                    self._freeze(number, axis)
             if all(self._arrived(axis, start[axis]) for axis in moving):
                 break
             yield self._checked()
@@ -205,6 +213,12 @@ class _Walk:
         self._emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
+
+    def _freeze(self, number: int, axis: int) -> None:
+        position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
+        error = DataFrozen(number, self._nodes[axis], position, current)
+        self._emit(axis, EventKind.FROZEN, number, str(error))
+        raise error
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
         """New set-point on all axes with the same SYNC, acknowledged, and taken back."""
@@ -236,6 +250,7 @@ class _Walk:
         for axis in self._axes:
             if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
                 word = sample.statusword[axis]
+                self._stream.check()  # what the drive itself says of it
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
@@ -249,7 +264,18 @@ class _Walk:
             self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
             return [error]
         problems: list[DriverError] = []
+        try:
+            silent = self._network.find_silent([self._network.axes[axis] for axis in unconfirmed])
+        except DriverError as error:
+            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            return [error]
+        if silent is not None:
+            problems.append(silent)
         for axis in unconfirmed:
+            if silent is not None and self._nodes[axis] in silent.node_ids:
+                text = f"node {self._nodes[axis]} does not answer: it is not known to stand"
+                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+                continue
             try:
                 self._network.disable(self._network.axes[axis])
             except DriverError as error:
@@ -280,7 +306,12 @@ class _Walk:
             powered = [
                 axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
             ]
-            if not powered or silent > self._stream.max_missing_cycles:
+            patience = (
+                0
+                if self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
+                else (self._stream.max_missing_cycles)
+            )
+            if not powered or silent > patience:
                 break
         return tuple(powered)
 

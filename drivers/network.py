@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from types import TracebackType
@@ -13,8 +14,17 @@ import can
 
 from drivers.axis import Axis, Identity
 from drivers.bus import BusAddress, open_bus
-from drivers.errors import DriverError, IdentityMismatch, MappingRefused, StateRefused
-from drivers.link import SYNC_COB_ID, Link, NmtCommand, NmtState
+from drivers.errors import (
+    BusBusy,
+    DriverError,
+    FeedbackDiffers,
+    IdentityMismatch,
+    MappingRefused,
+    NodeMissing,
+    StateRefused,
+)
+from drivers.guard import Guard, arm, disarm, find_guard
+from drivers.link import SYNC_COB_ID, Link, NmtCommand, NmtState, command_name
 from drivers.mapping import (
     CONTROLWORD,
     NOT_VALID,
@@ -32,8 +42,9 @@ from drivers.mapping import (
     write_record,
 )
 from drivers.profile import ObjectEntry
+from drivers.sample import Sample
 from drivers.scale import ScaleReading, read_scale
-from drivers.scan import FoundNode, read_identity, require, scan
+from drivers.scan import FoundNode, answering, read_identity, require, scan
 from drivers.sdo import Clock, SdoPolicy
 from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 
@@ -41,6 +52,8 @@ HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
+STANDSTILL_COUNTS = 1024
+"""An encoder at rest flickers, and an axis may sink onto its brake between two readings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +61,17 @@ class Bounds:
     """How long the cell may take [s].
 
     Attributes:
+        listen_s: to other masters before the first frame is sent; each SYNC period of theirs must fit.
         answer_s: until every node answered the search.
+        silence_s: until nodes that do not answer while the network closes are given up, all of them together.
         nmt_s: until a heartbeat confirms an NMT state.
         mode_s: until 6061h shows the mode asked for.
         disable_s: until an axis is without power when the network closes.
     """
 
     answer_s: float = 1.0
+    silence_s: float = 0.5
+    listen_s: float = 0.2
     nmt_s: float = 2.0
     mode_s: float = 1.0
     disable_s: float = 2.0
@@ -69,6 +86,7 @@ class _Original:
     """What a drive had before we came; filled step by step, so that a half-done set-up can be undone."""
 
     heartbeat_ms: int | None = None
+    guard: Guard | None = None
     mode: int | None = None
     pdos: dict[str, PdoRecord] = field(default_factory=dict)
 
@@ -79,7 +97,8 @@ class CanopenNetwork:
     Args:
         address: of the bus.
         axes: the amplifiers, in the order of the samples' columns.
-        heartbeat_ms: what every node is told to send.
+        heartbeat_ms: what every node is told to send, and we send while axes have power.
+        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/guard.py).
         bounds, policy: how long to wait.
         clock: monotonic time [ns].
         opener: makes the bus of an address.
@@ -91,6 +110,7 @@ class CanopenNetwork:
         axes: tuple[Axis, ...],
         *,
         heartbeat_ms: int = 100,
+        guard_ms: int = 500,
         bounds: Bounds = DEFAULT_BOUNDS,
         policy: SdoPolicy = DEFAULT_POLICY,
         clock: Clock = time.monotonic_ns,
@@ -98,9 +118,12 @@ class CanopenNetwork:
     ) -> None:
         self.axes = axes
         self.heartbeat_ms = heartbeat_ms
+        self.guard_ms = guard_ms
         self.bounds = bounds
         self.link = Link(address, policy, clock, opener)
         self.node_ids = tuple(axis.node_id for axis in axes)
+        # The highest id is the last that anybody gives to a drive.
+        self.recorder_id = next(n for n in range(127, 0, -1) if n not in self.node_ids)
         self._originals: dict[int, _Original] = {}
         self._readback: dict[str, object] = {}
         self._scales: dict[str, ScaleReading] = {}
@@ -160,15 +183,17 @@ class CanopenNetwork:
         return found
 
     def prepare(self) -> None:
-        """Set every node up: identity, heartbeat, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
+        """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
 
         No axis gets power. The objects' values from before are written back when the network is left.
 
         Raises:
+            BusBusy: another master commands this bus; nothing was sent.
             NodeMissing, IdentityMismatch, NmtRefused, MappingRefused, ObjectAccessError, StateRefused, BusError: see
                 drivers/errors.py; what was changed until then is restored on leaving the network.
             ScaleImplausible: the ampere of a drive cannot be true (drivers/scale.py).
         """
+        self._require_quiet()
         identities = self.check_identities()
         for axis in self.axes:
             original = self._originals.setdefault(axis.node_id, _Original())
@@ -176,6 +201,9 @@ class CanopenNetwork:
             if original.heartbeat_ms is None:
                 original.heartbeat_ms = access.read(HEARTBEAT_TIME)
             access.write(HEARTBEAT_TIME, self.heartbeat_ms)
+            if original.guard is None:
+                original.guard = find_guard(access, self.recorder_id)
+            original.guard = arm(access, original.guard, self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
         for axis, identity in zip(self.axes, identities, strict=True):
             self.disable(axis)
@@ -183,6 +211,60 @@ class CanopenNetwork:
             self._set_mode(axis)
             self._readback[axis.name] = self._describe(axis, identity, mapped)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+
+    def _require_quiet(self) -> None:
+        self.link.foreign.clear()
+        self.link.wait(self.bounds.listen_s)
+        if self.link.foreign:
+            seen = ", ".join(command_name(identifier) for identifier in sorted(self.link.foreign))
+            raise BusBusy(str(self.link.address), seen)
+
+    @contextmanager
+    def guarded(self) -> Iterator[None]:
+        """Let the amplifiers watch us: within it they quick stop by themselves when we fall silent.
+
+        It ends before the network closes, so that what is slow after a run is not taken for the recorder's end.
+        """
+        self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
+        try:
+            yield
+        finally:
+            for node_id, original in self._originals.items():
+                if original.guard is not None and node_id not in self.link.silent:
+                    # What fails here is tried again, and told, when the network closes.
+                    with suppress(DriverError):
+                        disarm(self.link.objects(node_id), original.guard)
+            self.link.stop_heartbeat()
+
+    def unguarded(self) -> tuple[str, ...]:
+        """What the amplifiers of the prepared network lack to stop by themselves when the recorder is killed."""
+        guards = [(axis, original.guard) for axis in self.axes if (original := self._originals.get(axis.node_id))]
+        return tuple(f"{axis.name}: {guard.lack}" for axis, guard in guards if guard is not None and guard.lack)
+
+    def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
+        """Ask all these axes at once who still answers; those that do not are passed over from then on.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        asked = tuple(axis.node_id for axis in axes)
+        answered = answering(self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s)
+        missing = tuple(node_id for node_id in asked if node_id not in answered)
+        self.link.silent.update(missing)
+        return NodeMissing(missing, answered, self.bounds.silence_s) if missing else None
+
+    def check_feedback(self, sample: Sample) -> None:
+        """Compare the positions in a sample of axes at standstill with what they say by SDO.
+
+        Raises:
+            FeedbackDiffers: a PDO carries something else.
+            ObjectAccessError: an axis does not answer.
+        """
+        for axis, by_pdo in zip(self.axes, sample.position_counts, strict=True):
+            entry = axis.profile.position
+            by_sdo = self.link.objects(axis.node_id).read(entry)
+            if abs(by_sdo - by_pdo) > STANDSTILL_COUNTS:
+                raise FeedbackDiffers(axis.node_id, str(entry), by_sdo, by_pdo, STANDSTILL_COUNTS)
 
     def _command_all(self, command: NmtCommand, state: NmtState) -> None:
         """To each node of ours, not to all of the bus: there may be others on it."""
@@ -273,6 +355,7 @@ class CanopenNetwork:
             "rated_current_a": scale.rated_current_a,
             "rated_torque_nm": scale.rated_torque_nm,
             "scale_warnings": list(scale.warnings),
+            "guard": _guard_text(self._originals[axis.node_id].guard, self.guard_ms),
             "mode_before": self._originals[axis.node_id].mode,
             "mapping": [str(record) for record in mapped],
             "mapping_before": [str(record) for record in self._originals[axis.node_id].pdos.values()],
@@ -332,21 +415,33 @@ class CanopenNetwork:
         """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever the one before did."""
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._originals]
+        try:
+            # One bound for all: asked in turn, six dead nodes would keep a person waiting for a minute and more.
+            silent = self.find_silent(axes)
+        except DriverError as problem:
+            self._originals.clear()
+            return [problem]
+        if silent is not None:
+            silent.add_note("it is not known to stand, and its settings were not restored")
+            problems.append(silent)
+            axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
+        self._try(problems, [partial(self.disable, axis) for axis in axes])
         since_ns = self.link.clock()
-        steps: list[Callable[[], object]] = [partial(self.disable, axis) for axis in axes]
-        steps += [partial(self.link.command_nmt, axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL) for axis in axes]
+        pre_operational = NmtCommand.ENTER_PRE_OPERATIONAL
+        self._try(problems, [partial(self.link.command_nmt, axis.node_id, pre_operational) for axis in axes])
         for axis in axes:
-            confirm = partial(
-                self.link.confirm_nmt, axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, self.bounds.nmt_s
-            )
-            steps += [confirm, *self._restoring(axis)]
+            left_s = self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9
+            confirm = partial(self.link.confirm_nmt, axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, max(left_s, 0.0))
+            self._try(problems, [confirm, *self._restoring(axis)])
+        self._originals.clear()
+        return problems
+
+    def _try(self, problems: list[DriverError], steps: Sequence[Callable[[], object]]) -> None:
         for step in steps:
             try:
                 step()
             except DriverError as problem:
                 problems.append(problem)
-        self._originals.clear()
-        return problems
 
     def _restoring(self, axis: Axis) -> Iterator[Callable[[], object]]:
         access = self.link.objects(axis.node_id)
@@ -355,5 +450,13 @@ class CanopenNetwork:
             yield partial(restore, access, record)
         if original.mode is not None:
             yield partial(access.write, MODE_OF_OPERATION, original.mode)
+        if original.guard is not None:
+            yield partial(disarm, access, original.guard)
         if original.heartbeat_ms is not None:
             yield partial(access.write, HEARTBEAT_TIME, original.heartbeat_ms)
+
+
+def _guard_text(guard: Guard | None, silence_ms: int) -> str:
+    if guard is None or guard.consumer is None:
+        return guard.lack if guard is not None else "none"
+    return f"watches the recorder by {guard.consumer}, {silence_ms} ms" + (f"; {guard.lack}" if guard.lack else "")

@@ -54,7 +54,7 @@ def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode,
     Raises:
         BusError: the bus has gone.
     """
-    answered = _search(link, node_ids, wait_s)
+    answered = answering(link, node_ids, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     return tuple(_describe(link, node_id, node_id in answered) for node_id in alive)
 
@@ -65,7 +65,7 @@ def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
     Raises:
         NodeMissing: some do not.
     """
-    answered = _search(link, node_ids, wait_s)
+    answered = answering(link, node_ids, wait_s)
     missing = tuple(node_id for node_id in node_ids if node_id not in answered)
     if missing:
         raise NodeMissing(missing, answered, wait_s)
@@ -80,7 +80,12 @@ def read_identity(access: ObjectAccess) -> Identity:
     return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
 
 
-def _search(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Nodes that answer an SDO request; all are asked at once, and the bound is for all together.
+
+    Raises:
+        BusError: the bus has gone.
+    """
     asked = set(node_ids)
     link.answered.clear()
     link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])

@@ -14,7 +14,7 @@ from struct import Struct
 import can
 
 from drivers.bus import bus_errors
-from drivers.errors import SampleLost
+from drivers.errors import BusError, CellSilent, PdoLengthWrong, SampleLost
 from drivers.event import CellEvent, EventKind, EventSink, discard
 from drivers.link import SYNC_COB_ID
 from drivers.mapping import Direction, feedback_entries, layout, pack, records
@@ -22,6 +22,9 @@ from drivers.network import CanopenNetwork
 from drivers.pacing import LockstepSync, Pacing
 from drivers.sample import Sample
 from drivers.watch import Watch
+
+SHORTENED, STRAGGLING = 16, 4
+"""Parts of a lockstep cycle's bound: for a cell that was silent before, and for axes when others have answered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +91,10 @@ class SyncStream:
     Raises (by ``next``):
         SampleLost: more incomplete cycles in a row than tolerated.
         DriveFault: an EMCY, a new fault or following error, or a node that left OPERATIONAL.
+        CellSilent: the same, and no axis answered.
+        PdoLengthWrong: an axis answers twice in a row with a PDO that is not as long as its mapping.
+        LimitActive: a limit of a drive acts for too long.
+        BusBusy: another master sends SYNC or NMT commands.
         HeartbeatLost: a node is silent for more than two of its periods.
         BusError: the bus has gone.
     """
@@ -115,6 +122,9 @@ class SyncStream:
         self._debt = 0
         self._last_data: dict[int, bytearray] = {}
         self._incomplete_cycles = 0
+        self._short: dict[int, int] = {}
+        self._silent = False
+        self._answered_ns = 0
         self._next_sync_ns = 0
         self._first_sync_ns = 0
         self._time_ns = pacing.start_ns
@@ -136,6 +146,11 @@ class SyncStream:
             self._skipped,
             self._foreign,
         )
+
+    @property
+    def silent(self) -> bool:
+        """Whether no axis answered the last SYNC."""
+        return self._silent
 
     @property
     def time_ns(self) -> int:
@@ -172,22 +187,29 @@ class SyncStream:
         Raises:
             BusError: the bus has gone.
         """
-        with bus_errors(self._link.address):
-            deadline_ns = self._send_sync()
-            self._collect(deadline_ns)
+        try:
+            with bus_errors(self._link.address):
+                deadline_ns = self._send_sync()
+                self._collect(deadline_ns)
+        except BusError as error:
+            self._on_event(CellEvent(self._time_ns, None, EventKind.BUS_LOST, 0, str(error)))
+            raise
         return self._finish_cycle()
 
     def _send_sync(self) -> int:
         """Send what waits and the SYNC; returns until when its answers may come, by the clock."""
         pacing, bus = self.pacing, self._link.bus
+        self._link.beat()
         while (message := bus.recv(0.0)) is not None:
             self._between_cycles(message)
         now = pacing.clock()
         if self._cycles == 0:
-            self._first_sync_ns = self._next_sync_ns = now
+            self._first_sync_ns = self._next_sync_ns = self._answered_ns = now
         if isinstance(pacing, LockstepSync):
             self._time_ns = pacing.start_ns + self._cycles * pacing.period_ns
-            deadline_ns = now + round(pacing.timeout_s * 1e9)
+            # A cell that was silent for the whole bound gets no second one: the stop must not take minutes.
+            bound_s = pacing.timeout_s / SHORTENED if self._silent else pacing.timeout_s
+            deadline_ns = now + round(bound_s * 1e9)
         else:
             while (left_ns := self._next_sync_ns - now) > 0:
                 message = bus.recv(left_ns * 1e-9)
@@ -222,8 +244,9 @@ class SyncStream:
                 continue
             data = message.data
             if len(data) != slot.length:
-                self._wrong_length += 1
+                self._note_length(slot, identifier, len(data))
                 continue
+            deadline_ns = deadline_ns if seen else self._stragglers_until(deadline_ns)
             if seen & slot.bit:
                 if debt & slot.bit:
                     # The first one was the late answer to an earlier SYNC, this one is ours.
@@ -239,8 +262,28 @@ class SyncStream:
             for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
                 values[column] = value
         self._seen = seen
+        self._silent = not seen
+        if seen:
+            self._answered_ns = clock()
         # One answer and a debt at the end: the owed frame was lost for good, and the answer is this cycle's.
         self._debt = everything & ~seen
+
+    def _stragglers_until(self, deadline_ns: int) -> int:
+        """Cells in lockstep answer in one go: where one axis has answered, the others get less patience."""
+        if not isinstance(self.pacing, LockstepSync):
+            return deadline_ns
+        return min(deadline_ns, self.pacing.clock() + round(self.pacing.timeout_s * 1e9) // STRAGGLING)
+
+    def _note_length(self, slot: _Slot, identifier: int, found: int) -> None:
+        """One frame may have been cut by another's; a second one with the next SYNC is a wrong mapping."""
+        self._wrong_length += 1
+        node_id = self.network.node_ids[slot.axis]
+        if identifier not in self._short or self._short[identifier] < self._cycles - 1:
+            text = f"node {node_id}: PDO {identifier:03X}h has {found} bytes, its mapping says {slot.length}"
+            self._on_event(CellEvent(self._time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
+        elif self._short[identifier] == self._cycles - 1:
+            self._watch.faults.append(PdoLengthWrong(node_id, identifier, slot.length, found))
+        self._short[identifier] = self._cycles
 
     def _between_cycles(self, message: can.Message) -> None:
         """A frame that is read before the next SYNC, and so answers none that is still open."""
@@ -288,5 +331,10 @@ class SyncStream:
         for axis in silent:
             text = f"no complete answer of {self.network.axes[axis].name} to cycle {cycle}"
             self._on_event(CellEvent(self._time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
-        if self._incomplete_cycles > self.max_missing_cycles:
+        if self._incomplete_cycles <= self.max_missing_cycles:
+            return
+        if len(silent) == self._axes:
+            waited_s = (self.pacing.clock() - self._answered_ns) * 1e-9
+            self._watch.faults.append(CellSilent(cycle, waited_s))
+        else:
             self._watch.faults.append(SampleLost(cycle, silent))

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections import deque
 
-from drivers.errors import DriveFault, DriverError, HeartbeatLost
+from drivers.errors import BusBusy, DriveFault, DriverError, HeartbeatLost, LimitActive
 from drivers.event import CellEvent, EventKind, EventSink
-from drivers.link import NmtState, nmt_name
+from drivers.link import SDO_REQUEST, NmtState, command_name, nmt_name
 from drivers.network import CanopenNetwork
 from drivers.state import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
 
 HEARTBEAT_PERIODS = 2.0
 """Silence after which a node is lost."""
+LIMIT_S = 0.5
+"""A current that saturates in a ramp is masked by the fit; a limit that acts longer is no ramp any more."""
 _WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
 
 
@@ -36,6 +38,7 @@ class Watch:
         self._allowed_silence_ns = round(network.heartbeat_ms * 1e6 * HEARTBEAT_PERIODS)
         self._next_heartbeat_check_ns = 0
         self._heard_at: dict[int, tuple[int, int, int]] = {}
+        self._limited_since_ns: dict[int, int] = {}
 
     def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
         """See to everything after one cycle.
@@ -46,10 +49,12 @@ class Watch:
             statuswords: of all axes.
             missing: bit i is set when axis i did not answer this cycle.
         """
+        if self._link.has_events:
+            self._note_events(time_ns)  # first: an EMCY says why, the statusword only that
         if self._unheard or statuswords != self._statuswords:
             self._note_statuswords(time_ns, statuswords, missing)
-        if self._link.has_events:
-            self._note_events(time_ns)
+        if self._limited_since_ns:
+            self._check_limits(time_ns)
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
             self._check_heartbeats(time_ns, clock_ns)
@@ -78,15 +83,34 @@ class Watch:
                 acts = "a limit acts" if word >> saturation & 1 else "the limit acts no more"
                 text = f"{self._network.axes[axis].name}: {acts}"
                 self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                if word >> saturation & 1:
+                    self._limited_since_ns[axis] = time_ns
+                else:
+                    self._limited_since_ns.pop(axis, None)
+
+    def _check_limits(self, time_ns: int) -> None:
+        for axis, since_ns in tuple(self._limited_since_ns.items()):
+            word = self._statuswords[axis]
+            if decode(word) is not State.OPERATION_ENABLED:
+                self._limited_since_ns[axis] = time_ns  # what limits nothing is no reason to stop
+            elif (acted_ns := time_ns - since_ns) > LIMIT_S * 1e9:
+                del self._limited_since_ns[axis]
+                text = f"{self._network.axes[axis].name}: a limit acts for {acted_ns * 1e-9:.3f} s"
+                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                self.faults.append(LimitActive(self._network.node_ids[axis], LIMIT_S, word))
 
     def _note_events(self, time_ns: int) -> None:
         for event in self._link.take_events(time_ns, self._network.node_ids):
             self._on_event(event)
+            if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
+                # Whoever only asks a drive something disturbs, and is told; one who commands would move the robot.
+                self.faults.append(BusBusy(str(self._link.address), command_name(event.code)))
             if event.axis is None:
                 continue
             node_id = self._network.node_ids[event.axis]
             if event.kind is EventKind.EMCY and self._begun:
-                self.faults.append(DriveFault(node_id, event.text, emcy_code=event.code))
+                reason = event.text.removeprefix(f"node {node_id}: ")
+                self.faults.append(DriveFault(node_id, reason, emcy_code=event.code))
             elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
                 self.faults.append(DriveFault(node_id, f"left OPERATIONAL, is {nmt_name(event.code)}"))
 

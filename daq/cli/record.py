@@ -13,13 +13,13 @@ import typer
 from daq.cli.interrupt import interruptible
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell import Cell, Pacing
+from daq.configuration.cell import Cell, MotionPolicy, Pacing
 from daq.configuration.cell_file import load_cell
 from daq.errors import ExitCode, OutputExists, UsageError
 from daq.plan import slowed
 from daq.plan_file import load_plan
 from daq.record import record
-from drivers.errors import DriverError, SampleLost
+from drivers.errors import CellSilent, DriverError, SampleLost
 from ident.payload import Payload
 
 
@@ -28,7 +28,11 @@ def record_verb(
     plan: Annotated[Path, typer.Argument(help="Plan of `drivegain plan`.")],
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
     enable_motion: Annotated[
-        bool, typer.Option("--enable-motion", help="Allow the axes to move; nothing moves without it.")
+        bool,
+        typer.Option(
+            "--enable-motion",
+            help="Allow the axes to move; nothing moves without it, or the cell's `policy: {motion: allowed}`.",
+        ),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     operator: Annotated[str | None, typer.Option(help="Who stands for this recording; you, by default.")] = None,
@@ -49,7 +53,7 @@ def record_verb(
                 out,
                 payload=mounted(declared, payload),
                 operator=who,
-                granted_by=who if enable_motion else None,
+                granted_by=granted(declared, who, enable_motion),
                 run_id=str(uuid.uuid4()),
                 progress=lambda count, total: told(count, total, "moves"),
             )
@@ -60,7 +64,8 @@ def record_verb(
     except DriverError as error:
         if part.exists():
             error.add_note(f"kept: what was recorded until then is in {part}, which no fit reads; {_way_on(part)}")
-        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
+        lost = isinstance(error, SampleLost | CellSilent)
+        if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
                 "lockstep` in the cell file; with a real cell look at the load on bus and computer"
@@ -118,6 +123,13 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
     if made == out:
         return f"interrupted: {axes}; all moves had been made, and {out} is complete"
     return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit; {_way_on(made)}"
+
+
+def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
+    """Who allows the motion: the person who asks for it, the cell's policy, or nobody."""
+    if enable_motion:
+        return who
+    return f"the policy of cell {cell.name}, for {who}" if cell.motion is MotionPolicy.ALLOWED else None
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:

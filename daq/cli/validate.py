@@ -22,6 +22,7 @@ from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell_file import load_cell
 from daq.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun, cross_validate
 from daq.errors import CalibrationMissing, OutputFailed
+from daq.fit import DOUBTFUL_PERCENT
 from daq.report.paper_tables import PaperTable, condition_table, mass_tables, page
 from daq.report.paper_tables import error_table as paper_error_table
 from daq.report.torque import plot_torques
@@ -226,6 +227,16 @@ def show(
             console.print(
                 f"{printable(str(validation.log))} carries another cell configuration than the logs of the fit: "
                 "look at what has changed.",
+                style="bold",
+                markup=False,
+            )
+    for validation in validations:
+        if validation.error.total > DOUBTFUL_PERCENT:
+            console.print(
+                printable(
+                    f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the "
+                )
+                + "torque. Was the payload mounted as the log says, and is it the same robot?",
                 style="bold",
                 markup=False,
             )

@@ -123,6 +123,15 @@ class Controller:
     gains: tuple[str, ...]
 
 
+class MotionPolicy(Enum):
+    """Whose leave a recording needs to move the axes."""
+
+    ASK = "ask"
+    """Somebody's, every time: --enable-motion."""
+    ALLOWED = "allowed"
+    """The cell's own: a fenced cell whose safety chain does not depend on this program, for scheduled recordings."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
     """Everything that is declared of a cell, in SI units.
@@ -138,6 +147,7 @@ class Cell:
         conditioning: the filters.
         controller: None where nothing is written back.
         clearance: the room around the arm, None where nothing is said of it.
+        motion: whose leave a recording needs.
         folder: of the cell file; None for a cell that was read from a log.
         digest: sha256 of the cell file and all files it refers to, hex.
     """
@@ -155,6 +165,7 @@ class Cell:
     clearance: Clearance | None
     folder: Path | None
     digest: str
+    motion: MotionPolicy = MotionPolicy.ASK
 
     @property
     def controller_path(self) -> Path | None:

@@ -25,6 +25,9 @@ SIMULATED_INTERFACES = ("virtual", "socketcand")
 LARGEST_CONDITION = 1e8
 """Of R; above it, joint positions cannot be told from motor positions."""
 
+LARGEST_TOLERANCE = 0.1
+"""Of a payload's mass: a wrong weight scales all gains alike."""
+
 
 def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile]) -> None:
     """Refuse a cell that contradicts itself.
@@ -144,6 +147,11 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
     for index, payload in enumerate(model.payloads):
         if payload.mass_kg <= 0:
             yield Fault(("payloads", index, "mass_kg"), f"{payload.mass_kg:g}", "a positive mass [kg]")
+        elif payload.mass_tolerance_kg > LARGEST_TOLERANCE * payload.mass_kg:
+            found = f"{payload.mass_tolerance_kg:g} kg for {payload.mass_kg:g} kg"
+            yield Fault(
+                ("payloads", index, "mass_tolerance_kg"), found, "at most a tenth of the mass: it is in every gain"
+            )
         if mountings[payload.mounting] > 1:
             yield Fault(
                 ("payloads", index, "mounting"),

@@ -94,6 +94,7 @@ def cell_from_bundle(
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=folder,
         digest=digest({name: files[name] for name in used}),
+        motion=model.policy.motion,
     )
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.configuration.cell import Pacing
+from daq.configuration.cell import MotionPolicy, Pacing
 from daq.configuration.clearance import ClearanceModel, WorkspaceModel
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE, JointUnit
 from daq.configuration.yaml_file import StrictModel
@@ -187,6 +187,12 @@ class ControllerModel(StrictModel):
     gains: tuple[FileName, ...]
 
 
+class PolicyModel(StrictModel):
+    """What may be done in this cell without asking."""
+
+    motion: MotionPolicy = MotionPolicy.ASK
+
+
 class CellModel(StrictModel):
     """A whole cell file."""
 
@@ -201,6 +207,7 @@ class CellModel(StrictModel):
     controller: ControllerModel | None = None
     workspace: WorkspaceModel | None = None
     clearance: ClearanceModel | None = None
+    policy: PolicyModel = PolicyModel()
 
     @property
     def drives(self) -> tuple[str, ...]:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 
 import can
 import numpy as np
 
 from drivers.simulated.amplifier import AmplifierSet
+from drivers.simulated.disturbance import FOREIGN_SDO, Disturbance
+from drivers.simulated.drive import ErrorCode
 from drivers.simulated.effects import build_effect
 from drivers.simulated.effects.lag import Lag
 from drivers.simulated.errors import SpecInvalid
-from drivers.simulated.node import Node
+from drivers.simulated.fault import FaultKind, FaultSpec
+from drivers.simulated.node import NmtCommand, Node
 from drivers.simulated.plant import Plant
 from drivers.simulated.readings import Readings, take
 from drivers.simulated.spec import CellSpec
@@ -22,6 +26,9 @@ from drivers.simulated.tuning import tuned
 
 SYNC_ID = 0x080
 NMT_ID = 0x000
+
+BUS_OFF_CLASS = 0x40
+"""Class of an error frame (linux/can/error.h)."""
 
 IDLE_S = 0.02
 """Longest sleep while no frame comes; heartbeats by wall time are as punctual as this."""
@@ -72,9 +79,16 @@ class SimulatedCell:
         self._substeps, self._period_us = spec.substeps, spec.sync_period_us
         self._bus, self._clock = bus, clock
         self.nodes = tuple(
-            Node(index, axis, self._amplifiers, self._current_readings, self._send)
+            Node(index, axis, self._amplifiers, self._current_readings, partial(self._send_of, index))
             for index, axis in enumerate(spec.axes)
         )
+        self._disturbance = Disturbance(spec.faults)
+        for index, node in enumerate(self.nodes):
+            node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
+            if self._disturbance.active(FaultKind.OTHER_SERIAL, index):
+                node.change_serial()
+            if self._disturbance.active(FaultKind.NO_GUARD, index):
+                node.lose_guard()
         self._by_id = {node.node_id: node for node in self.nodes}
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -123,7 +137,10 @@ class SimulatedCell:
                 self._receive(message.arbitration_id, bytes(message.data))
             wall_s, now_us = self._clock(), self.time_us
             for node in self.nodes:
+                node.watch(wall_s)
                 node.beat(now_us, wall_s)
+            if message is None and self._disturbance:
+                self._interfere()  # other masters do not wait for our SYNC
 
     @property
     def time_us(self) -> int:
@@ -137,25 +154,71 @@ class SimulatedCell:
             self._failure = error
 
     def _receive(self, can_id: int, data: bytes) -> None:
+        hearing = self._hearing()
         if can_id == SYNC_ID:
             self._advance()
         elif can_id == NMT_ID:
             if len(data) >= 2:
-                for node in self.nodes:
+                for node in hearing:
                     if data[1] in (0, node.node_id):
                         node.command_nmt(data[0], self._clock())
         elif 0x600 < can_id < 0x680:
             node_asked = self._by_id.get(can_id - 0x600)
-            if node_asked is not None:
+            if node_asked in hearing:
                 node_asked.request(data)
+        elif 0x700 < can_id < 0x780:
+            for node in hearing:
+                node.hear_heartbeat(can_id - 0x700, self._clock())
         else:
-            for node in self.nodes:
+            for node in hearing:
                 node.receive_pdo(can_id, data)
+
+    def _hearing(self) -> tuple[Node, ...]:
+        if not self._disturbance:
+            return self.nodes
+        return tuple(node for index, node in enumerate(self.nodes) if not self._disturbance.cut_off(index))
+
+    def _interfere(self) -> None:
+        """Frames of other masters on this bus."""
+        for index, node in enumerate(self.nodes):
+            if self._disturbance.active(FaultKind.SDO_MASTER, index):
+                self._send(0x600 + node.node_id, FOREIGN_SDO)
+        if any(self._disturbance.active(FaultKind.SECOND_MASTER, index) for index in range(len(self.nodes))):
+            self._send(SYNC_ID, b"")
+
+    def _begin_faults(self) -> None:
+        """What begins with this cycle, before the plant moves."""
+        for index, node in enumerate(self.nodes):
+            node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
+        for fault in self._disturbance.beginning():
+            for index, node in enumerate(self.nodes):
+                if fault.concerns(index):
+                    self._strike(fault, node)
+            if fault.kind is FaultKind.BUS_OFF:
+                self._bus.send(can.Message(is_error_frame=True, arbitration_id=BUS_OFF_CLASS, data=bytes(8)))
+
+    def _strike(self, fault: FaultSpec, node: Node) -> None:
+        if fault.kind is FaultKind.EMERGENCY:
+            node.fail(fault.value)
+        elif fault.kind is FaultKind.FOLLOWING_ERROR:
+            node.fail(ErrorCode.FOLLOWING_ERROR)
+        elif fault.kind is FaultKind.FALLS_BACK:
+            node.fall_back()
+        elif fault.kind is FaultKind.REBOOTS:
+            node.command_nmt(NmtCommand.RESET_NODE, self._clock())
+        elif fault.kind is FaultKind.LOSES_POWER:
+            node.drive.reset()
 
     def _advance(self) -> None:
         plant, amplifiers = self.plant, self._amplifiers
         for node in self.nodes:
             node.begin_cycle()
+        if self._disturbance:
+            self._disturbance.cycle = self.cycles
+            for frame in self._disturbance.release():
+                self._send(*frame)
+            self._begin_faults()
+            self._interfere()
         loops = amplifiers.loops
         loops["limited"] = 0
         if not np.array_equal(loops["enabled"], self._enabled):
@@ -177,6 +240,13 @@ class SimulatedCell:
 
     def _current_readings(self) -> Readings:
         return self._readings
+
+    def _send_of(self, index: int, can_id: int, data: bytes) -> None:
+        if not self._disturbance:
+            self._send(can_id, data)
+            return
+        for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):
+            self._send(*frame)
 
     def _send(self, can_id: int, data: bytes) -> None:
         self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))

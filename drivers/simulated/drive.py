@@ -17,6 +17,7 @@ class ErrorCode(IntEnum):
     NONE = 0x0000
     COMMUNICATION_LOST = 0x8100
     PDO_TOO_SHORT = 0x8210
+    HEARTBEAT_LOST = 0x8130
     FOLLOWING_ERROR = 0x8611
 
 
@@ -50,6 +51,7 @@ class Drive:
         state: of CiA 402.
         controlword: as written last.
         error: code of the active fault.
+        limited: a limit acts that the loops know nothing of.
     """
 
     def __init__(self, index: int, amplifiers: AmplifierSet) -> None:
@@ -57,7 +59,8 @@ class Drive:
         self._amplifiers = amplifiers
         self.state = PowerState.SWITCH_ON_DISABLED
         self.controlword = 0
-        self.error = ErrorCode.NONE
+        self.error: int = ErrorCode.NONE
+        self.limited = False
         self._acknowledged = False
         self._waiting: tuple[int, Settings] | None = None
 
@@ -105,7 +108,7 @@ class Drive:
             return ErrorCode.FOLLOWING_ERROR
         return ErrorCode.NONE
 
-    def fail(self, code: ErrorCode) -> None:
+    def fail(self, code: int) -> None:
         """Fault reaction: the power stage goes off and the brake closes at once."""
         self._enter(PowerState.FAULT)
         self.error = code
@@ -124,7 +127,7 @@ class Drive:
         """Object 6041h."""
         word = self.state.value | 0x0210  # voltage present, remote
         if self.powered:
-            word |= readings.reached[self._index] << 10 | readings.limited[self._index] << 11
+            word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
         if self._acknowledged:
             word |= 0x1000
         if self.error is ErrorCode.FOLLOWING_ERROR:

@@ -65,6 +65,7 @@ class Node:
         node_id: on the bus.
         nmt: its state.
         drive: its CiA 402 part.
+        obeys_nmt: whether it goes to OPERATIONAL when it is told to.
     """
 
     def __init__(
@@ -91,6 +92,8 @@ class Node:
         self._sdo = SdoServer(self.read, self.write)
         self._now_us = 0
         self._beat_us, self._beat_wall_s = 0, 0.0
+        self._heard_wall_s: float | None = None
+        self.obeys_nmt = True
 
     # -- NMT and error control -------------------------------------------------------------------------------------
 
@@ -103,6 +106,8 @@ class Node:
 
     def command_nmt(self, command: int, wall_s: float) -> None:
         """Obey an NMT command; unknown ones are ignored, as the standard wants."""
+        if command == NmtCommand.START and not self.obeys_nmt:
+            return
         if command == NmtCommand.START and self.nmt is not NmtState.OPERATIONAL:
             self.nmt = NmtState.OPERATIONAL
             self._pending.clear()
@@ -123,6 +128,40 @@ class Node:
             self._connection_lost()
             self._restore(self._saved, first=0x1000, last=0x1FFF)
             self.boot(wall_s)
+
+    def hear_heartbeat(self, producer: int, wall_s: float) -> None:
+        """Somebody's heartbeat; that of the node in 1016h is watched from its first one on."""
+        if self._number(0x1016, 1) >> 16 & 0x7F == producer:
+            self._heard_wall_s = wall_s
+
+    def watch(self, wall_s: float) -> None:
+        """Stop by 6007h when the watched node is silent; the time of the plant stands still without its SYNC."""
+        allowed_ms = self._number(0x1016, 1) & 0xFFFF
+        if not allowed_ms:
+            self._heard_wall_s = None
+        elif self._heard_wall_s is not None and (wall_s - self._heard_wall_s) * 1e3 >= allowed_ms:
+            self._heard_wall_s = None
+            self.fall_back()
+
+    def fall_back(self) -> None:
+        """A heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
+        self._emergency(ErrorCode.HEARTBEAT_LOST)
+        self._connection_lost()
+        self.nmt = NmtState.PRE_OPERATIONAL
+
+    def fail(self, code: int) -> None:
+        """A fault of the amplifier, told by EMCY."""
+        self.drive.fail(code)
+        self._emergency(code)
+
+    def change_serial(self) -> None:
+        """Become another amplifier of the same kind."""
+        self._values[0x1018, 4] = self._number(0x1018, 4) + 1
+
+    def lose_guard(self) -> None:
+        """Become an amplifier without consumer heartbeat."""
+        for key in ((0x1016, 0), (0x1016, 1)):
+            del self._dictionary[key]  # its value stays zero: it watches nobody
 
     def beat(self, now_us: int, wall_s: float) -> None:
         """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
@@ -340,7 +379,7 @@ class Node:
         else:
             self.drive.quick_stop(self._settings())
 
-    def _emergency(self, code: ErrorCode) -> None:
+    def _emergency(self, code: int) -> None:
         self._history.insert(0, int(code))
         if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
             register = int(self.drive.error is not ErrorCode.NONE)

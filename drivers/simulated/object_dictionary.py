@@ -113,6 +113,8 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x1011, 0): Entry(Kind.U8, 1),
         (0x1011, 1): Entry(Kind.U32, 1, writable=True),
         (0x1014, 0): Entry(Kind.U32, 0x80 + axis.node_id),
+        (0x1016, 0): Entry(Kind.U8, 1),
+        (0x1016, 1): Entry(Kind.U32, writable=True),  # whom to watch: node id << 16 | ms
         (0x1017, 0): Entry(Kind.U16, 100, writable=True),
         (0x1018, 0): Entry(Kind.U8, 4),
         (0x1018, 1): Entry(Kind.U32, axis.vendor_id),

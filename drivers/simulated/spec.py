@@ -8,6 +8,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.simulated.fault import FaultSpec
+
 FloatArray = NDArray[np.float64]
 
 
@@ -108,6 +110,7 @@ class CellSpec:
         sync_period_us: one SYNC advances the plant by this much.
         substeps: control and integration steps in one SYNC period.
         seed: of every random number of the cell.
+        faults: what goes wrong, and when.
     """
 
     urdf: str
@@ -120,3 +123,4 @@ class CellSpec:
     sync_period_us: int
     substeps: int
     seed: int
+    faults: tuple[FaultSpec, ...] = ()

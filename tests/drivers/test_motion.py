@@ -224,6 +224,7 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
     def stuck(cycle: int) -> None:
         bus.nodes[1].moving = False
         bus.nodes[1].statusword |= 0x0400
+        bus.nodes[1].store(0x6074, 0, cycle & 1)  # a live current: what stands still is the axis, not its data
 
     bus.on_cycle = stuck
     with pytest.raises(MotionTimeout, match="axis 2"):

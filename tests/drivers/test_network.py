@@ -241,7 +241,7 @@ def test_emcy_and_its_end_are_told_in_words() -> None:
         network.link.pump(0.0)
         first, second = network.link.take_events(5, (1,))
     assert (first.kind, first.code, first.axis, first.time_ns) == (EventKind.EMCY, 0x2310, 0, 5)
-    assert "EMCY 2310h Current" in first.text
+    assert "EMCY 2310h continuous over-current" in first.text
     assert second.kind is EventKind.EMCY_RESET
 
 

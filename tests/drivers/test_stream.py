@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import can
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import BusError, DriveFault, HeartbeatLost, SampleLost
@@ -289,6 +289,7 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
     assert [sample.time_ns - samples[0].time_ns for sample in samples] == [PERIOD_NS * k for k in range(5)]
 
 
+@settings(deadline=None)
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
 def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
     for stream, bus, _ in prepared():

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from enum import Enum
 from pathlib import Path
 
 from daq.atomic_file import replace_file
@@ -144,13 +145,20 @@ def record_study(
             truth = truth_of(study_cell(seed, FLOORS[floor]))
             path = _folder(out, floor, seed) / "truth.json"
             path.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(path, (json.dumps(asdict(truth), indent=1) + "\n").encode())
+            replace_file(path, (json.dumps(asdict(truth), indent=1, default=_plain) + "\n").encode())
     (out / "plans").mkdir(parents=True, exist_ok=True)
     for line in side_by_side(_plan, plans, processes):
         told(line)
     for line in side_by_side(_record, runs, processes):
         told(line)
     return study_logs(seeds, floors, out=out)
+
+
+def _plain(value: object) -> object:
+    """An enum of the simulator's as JSON has it."""
+    if isinstance(value, Enum):
+        return value.value
+    raise TypeError(f"{value!r} is nothing that JSON can say")
 
 
 def study_logs(seeds: Sequence[int], floors: Sequence[str], *, out: Path = OUT) -> tuple[StudyLogs, ...]:

@@ -1,0 +1,163 @@
+"""The demo cell with one fault in it, driven over a virtual bus in lockstep: what was told, when, and how it ended."""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import can
+
+from daq.configuration.cell_bus import drive_axes
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation
+from drivers.bus import BusAddress, open_bus
+from drivers.errors import DriverError
+from drivers.event import CellEvent, EventKind
+from drivers.motion import execute
+from drivers.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.network import Bounds, CanopenNetwork
+from drivers.pacing import LockstepSync
+from drivers.sdo import SdoPolicy
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.fault import FaultSpec
+from drivers.simulated.node import Node
+from drivers.simulated.power_state import PowerState
+from drivers.stream import StreamStatistics, SyncStream
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+PERIOD_NS = 1_000_000
+ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
+WAY_COUNTS = 150_000
+STRIKE = 120
+"""SYNCs since power-on: in the middle of the move, which begins at about 25 and takes more than 300."""
+
+
+@dataclass
+class Outcome:
+    """What became of a run.
+
+    Attributes:
+        error: that it raised, None when it ended well.
+        events: in their order.
+        statistics: of the stream; None when it never began.
+        states: CiA 402 state of each axis at the end, read in the simulator.
+        settings: values of all nodes' 1017h, 6007h, 6060h and the parameters of their PDOs, before and after.
+        ended_cycle: SYNCs since power-on at the end.
+        unguarded: what the network says of amplifiers that cannot watch it.
+    """
+
+    error: DriverError | None = None
+    events: list[CellEvent] = field(default_factory=list)
+    statistics: StreamStatistics | None = None
+    states: tuple[PowerState, ...] = ()
+    settings: tuple[object, object] = (None, None)
+    ended_cycle: int = 0
+    unguarded: tuple[str, ...] = ()
+
+    @property
+    def powerless(self) -> bool:
+        """Whether no axis has power."""
+        return not any(
+            state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.SWITCHED_ON)
+            for state in self.states
+        )
+
+    @property
+    def restored(self) -> bool:
+        """Whether all nodes have the settings from before."""
+        return self.settings[0] == self.settings[1]
+
+    def told(self, kind: EventKind, axis: int | None = None) -> list[int]:
+        """Cycles, counted as `FaultSpec.at_cycle` is, of the events of a kind."""
+        return [
+            event.time_ns // PERIOD_NS
+            for event in self.events
+            if event.kind is kind and (axis is None or event.axis == axis)
+        ]
+
+
+def settings_of(cell: SimulatedCell) -> object:
+    """What a recording changes and must give back."""
+    return [
+        [_settings(node, base, number) for base in (0x1400, 0x1800) for number in range(4)]
+        + [node.read(*key) for key in ((0x1017, 0), (0x6007, 0), (0x6060, 0))]
+        for node in cell.nodes
+    ]
+
+
+def _settings(node: Node, base: int, number: int) -> list[bytes]:
+    mapped = node.read(base + 0x200 + number, 0)[0]
+    used = [node.read(base + 0x200 + number, sub) for sub in range(mapped + 1)]
+    return [node.read(base + number, 1), node.read(base + number, 2), *used]
+
+
+def run(name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int = 0) -> Outcome:
+    """One move of all axes there and back in a cell with these faults.
+
+    The driver's clock runs with the plant's time beside the wall's: a silence lasts as long in samples on a fast
+    machine as on a slow one; and so does the amplifiers'.
+
+    Args:
+        name: of the virtual bus.
+        faults: of the cell.
+        guard_ms: silence of the recorder that the amplifiers bear.
+        afterwards: SYNCs of somebody else when the recorder has gone, to let the plant's time pass.
+    """
+    address, outcome = BusAddress("virtual", f"faults {name}"), Outcome()
+    spec = replace(load_simulation(CONFIGS / "simulation" / "clean.yaml"), faults=faults)
+    axes = drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+    bus: can.BusABC = open_bus(address)
+    try:
+        cell = SimulatedCell(spec, bus, lambda: time.monotonic() + cell.cycles * PERIOD_NS * 1e-9)
+        outcome_before = settings_of(cell)
+        with cell:
+            network = CanopenNetwork(
+                address,
+                axes,
+                guard_ms=guard_ms,
+                bounds=Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05, nmt_s=1.0, mode_s=1.0, disable_s=1.0),
+                policy=SdoPolicy(0.3, 3),
+                clock=lambda: time.monotonic_ns() + cell.cycles * PERIOD_NS,
+            )
+            try:
+                _drive(network, outcome)
+            except DriverError as error:
+                outcome.error = error
+            let_pass(cell, address, afterwards)
+        outcome.states = tuple(node.drive.state for node in cell.nodes)
+        outcome.settings = (outcome_before, settings_of(cell))
+        outcome.ended_cycle = cell.cycles
+    finally:
+        bus.shutdown()
+    return outcome
+
+
+def let_pass(cell: SimulatedCell, address: BusAddress, cycles: int) -> None:
+    """Let a cell live on for so many SYNCs."""
+    wanted = cell.cycles + cycles
+    with open_bus(address) as bus:
+        for _ in range(cycles):
+            bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        while cell.cycles < wanted:
+            cell.check()
+            bus.recv(0.01)
+
+
+def _drive(network: CanopenNetwork, outcome: Outcome) -> None:
+    with network:
+        network.prepare()
+        outcome.unguarded = network.unguarded()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 1.0, clock=network.link.clock), outcome.events.append)
+        try:
+            first = next(stream)
+            network.check_feedback(first)
+            start = first.position_counts
+            there = synchronised_move(start, tuple(count + WAY_COUNTS for count in start), ROOM, dwell_cycles=10)
+            back = synchronised_move(there.target_counts, start, ROOM, dwell_cycles=10)
+            with closing(execute(network, stream, (there, back), MotionPermission("the test", ROOM))) as samples:
+                for _ in samples:
+                    pass
+        finally:
+            outcome.statistics = stream.statistics

@@ -1,0 +1,38 @@
+"""Every fault that is there before a recording: it is refused by name, and no axis ever has power."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import BusBusy, DriverError, FeedbackDiffers, IdentityMismatch, NmtRefused, NodeMissing
+from drivers.event import EventKind
+from drivers.simulated.fault import FaultKind, FaultSpec
+from drivers.simulated.power_state import PowerState
+from tests.faults.cells import run
+
+REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
+    FaultKind.SILENT: (NodeMissing, r"node 2 did not answer within 1 s \(answered: 1, 3, 4, 5, 6\)"),
+    FaultKind.OTHER_SERIAL: (IdentityMismatch, "node 2: serial number 1018h:04 is 0x3eb, .* expects 0x3ea"),
+    FaultKind.REFUSES_NMT: (NmtRefused, "node 2: asked for NMT OPERATIONAL, its heartbeat still says PRE-OPERATIONAL"),
+    FaultKind.SHIFTED: (FeedbackDiffers, r"node 2: object 6064h(:00)? is -?\d+ by SDO and -?\d+ in its PDO"),
+    FaultKind.SECOND_MASTER: (BusBusy, r"a SYNC \(080h\) that we did not send"),
+    FaultKind.SDO_MASTER: (BusBusy, r"an SDO request to node 2 \(602h\) that we did not send"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSALS, ids=lambda kind: kind.value)
+def test_a_fault_from_the_start_is_refused_by_name_before_anything_moves(kind: FaultKind) -> None:
+    error, text = REFUSALS[kind]
+    outcome = run(f"start {kind.value}", FaultSpec(kind, 1))
+    assert isinstance(outcome.error, error), outcome.error
+    with pytest.raises(error, match=text):
+        raise outcome.error
+    assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
+    assert not outcome.told(EventKind.MOVE_START)
+    assert outcome.restored
+
+
+def test_an_amplifier_without_consumer_heartbeat_is_recorded_and_said_so() -> None:
+    outcome = run("no guard", FaultSpec(FaultKind.NO_GUARD, 1))
+    assert outcome.error is None
+    assert outcome.unguarded == ("J2: no 1016h: it does NOT stop by itself when the recorder is killed",)

@@ -1,0 +1,59 @@
+"""A recorder that ends without a word, as kill -9 ends it: the amplifiers stop by themselves."""
+
+from __future__ import annotations
+
+import time
+from itertools import islice
+
+import pytest
+
+from daq.configuration.cell_bus import drive_axes
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation
+from drivers.bus import BusAddress, open_bus
+from drivers.motion import execute
+from drivers.move import MotionPermission, synchronised_move
+from drivers.network import CanopenNetwork
+from drivers.pacing import LockstepSync
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.power_state import PowerState
+from drivers.stream import SyncStream
+from tests.faults.cells import CONFIGS, PERIOD_NS, ROOM, let_pass
+
+GUARD_MS = 2000
+WAY_COUNTS = 2_000_000
+"""Longer than the amplifiers wait, shorter than the test looks on."""
+
+
+@pytest.mark.parametrize("guarded", [True, False], ids=["1016h", "without"])
+def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool) -> None:
+    """Without 1016h the same axes go on to their target and keep their power: the guard is what stops them."""
+    address = BusAddress("virtual", f"killed {guarded}")
+    bus = open_bus(address)
+    cell = SimulatedCell(
+        load_simulation(CONFIGS / "simulation" / "clean.yaml"),
+        bus,
+        lambda: time.monotonic() + cell.cycles * PERIOD_NS * 1e-9,
+    )
+    if not guarded:
+        for node in cell.nodes:
+            node.lose_guard()
+    axes = drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+    with cell:
+        network = CanopenNetwork(address, axes, guard_ms=GUARD_MS)
+        network.link.open()
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 5.0))
+        start, start_rad = next(stream).position_counts, cell.plant.motor_rad.copy()
+        far = synchronised_move(start, tuple(count + WAY_COUNTS for count in start), ROOM)
+        samples = execute(network, stream, (far,), MotionPermission("the test", ROOM))
+        moving = list(islice(samples, 300))[-1]
+        assert all(word & 0x6F == 0x27 for word in moving.statusword)
+        network.link.close()  # the process has gone: nobody says another word
+        let_pass(cell, address, GUARD_MS + 500)
+        states = {node.drive.state for node in cell.nodes}
+        turned = abs(cell.plant.motor_rad - start_rad) * 65536 / (2 * 3.141592653589793)
+        assert states == {PowerState.SWITCH_ON_DISABLED if guarded else PowerState.OPERATION_ENABLED}
+        assert bool((turned > 0.99 * WAY_COUNTS).all()) != guarded
+        samples.close()
+    bus.shutdown()

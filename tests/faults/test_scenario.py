@@ -1,0 +1,108 @@
+"""A scenario in the simulation file, through the command line: exit code, log, and what is left on the axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.cli.record import granted
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation
+from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
+from daq.log.reader import read_log
+from drivers.bus import open_bus
+from drivers.event import EventKind
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.fault import FaultKind, FaultSpec
+from drivers.simulated.power_state import PowerState
+from tests.faults.cells import CONFIGS
+
+PLAN = """format: drivegain-plan
+cell: demo
+seed: 1
+condition: 100.0
+moves:
+  - {target_deg: [20, -20, 70, 20, -20, 20], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+  - {target_deg: [0, 0, 90, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+"""
+
+
+def scenario(folder: Path, faults: str) -> Path:
+    """A simulation file of the demo cell with these faults."""
+    text = (CONFIGS / "simulation" / "clean.yaml").read_text(encoding="utf-8")
+    path = folder / "scenario.yaml"
+    path.write_text(text.replace("urdf: ", f"urdf: {CONFIGS}/simulation/") + f"faults:\n{faults}", encoding="utf-8")
+    return path
+
+
+def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_log(tmp_path: Path) -> None:
+    spec = load_simulation(scenario(tmp_path, "  - {fault: emergency, axis: J3, at_s: 0.2, emcy_code: 0x2310}\n"))
+    cell_file, plan, out = CONFIGS / "cells" / "demo.yaml", tmp_path / "plan.yaml", tmp_path / "a.mcap"
+    plan.write_text(PLAN, encoding="utf-8")
+    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
+        code = main(["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--operator", "test"])
+        assert code == ExitCode.DEVICE_FAULT
+        assert [node.drive.state for node in cell.nodes].count(PowerState.FAULT) <= 1
+        assert not any(node.drive.powered for node in cell.nodes)
+    assert not out.exists()
+    saved = tmp_path / "saved.mcap"
+    assert main(["salvage", str(tmp_path / "a.mcap.part"), "--out", str(saved)]) == ExitCode.OK
+    told = [event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)]
+    assert [(event.kind, event.axis, event.code) for event in told[:1]] == [(EventKind.EMCY, 2, 0x2310)]
+    assert EventKind.STOP in {event.kind for event in told}
+
+
+def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+    arguments = ["record", str(CONFIGS / "cells" / "demo.yaml"), str(plan), "--out", str(tmp_path / "a.mcap")]
+    assert main(arguments) == ExitCode.USAGE
+
+
+def test_the_policy_of_a_cell_may_allow_motion_and_is_named(tmp_path: Path) -> None:
+    text = (CONFIGS / "cells" / "demo.yaml").read_text(encoding="utf-8")
+    path = tmp_path / "cell.yaml"
+    for policy, expected in (
+        ("", None),
+        ("policy: {motion: ask}\n", None),
+        ("policy: {motion: allowed}\n", "the policy of cell demo, for Ada"),
+    ):
+        path.write_text(text.replace("../robots", str(CONFIGS / "robots")) + policy, encoding="utf-8")
+        assert granted(load_cell(path), "Ada", enable_motion=False) == expected
+        assert granted(load_cell(path), "Ada", enable_motion=True) == "Ada"
+
+
+def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:
+    faults = (
+        "  - {fault: silent}\n"
+        "  - {fault: lost, axis: 2, at_s: 1.5, for_s: 0.002}\n"
+        "  - {fault: emergency, axis: J3, at_cycle: 7, emcy_code: 0x2310}\n"
+    )
+    assert load_simulation(scenario(tmp_path, faults)).faults == (
+        FaultSpec(FaultKind.SILENT),
+        FaultSpec(FaultKind.LOST, 1, 1500, 2),
+        FaultSpec(FaultKind.EMERGENCY, 2, 7, None, 0x2310),
+    )
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "{fault: explodes}",
+        "{fault: lost, at_s: 1, at_cycle: 1}",
+        "{fault: lost, for_s: 1, cycles: 1}",
+        "{fault: emergency, axis: J3}",
+        "{fault: lost, emcy_code: 0x2310}",
+    ],
+)
+def test_a_scenario_that_means_nothing_is_refused(tmp_path: Path, fault: str) -> None:
+    with pytest.raises(SchemaMismatch):
+        load_simulation(scenario(tmp_path, f"  - {fault}\n"))
+
+
+def test_a_scenario_for_an_axis_that_the_cell_lacks_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationInconsistent, match="J7"):
+        load_simulation(scenario(tmp_path, "  - {fault: lost, axis: J7}\n"))
