@@ -9,11 +9,12 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test check bench ident-study gain-study paper planning-study robot-study crash-study wheel lock clean
+.PHONY: help setup demo test test-vcan check bench ident-study gain-study paper planning-study robot-study crash-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
+	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
 	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
@@ -50,6 +51,15 @@ demo: setup
 
 test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+test-vcan: setup
+	@[ -e /sys/class/net/vcan0 ] || { command -v linux.uml && command -v ip; } >/dev/null || { \
+		[ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
+		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2; } || { \
+		echo "test-vcan needs vcan0, or as root: apt-get install user-mode-linux iproute2" >&2; exit 1; }
+	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \
+		else echo "no npm: the foreign stack's tests are skipped"; fi
+	$(BIN)/python -m tests.vcan.run $(BIN)/python -m pytest -q -m vcan tests/vcan
 
 check: setup
 	$(BIN)/ruff check .

@@ -26,7 +26,7 @@ from daq.plan import Plan
 from daq.planned_move import path_of
 from daq.version import software
 from drivers.errors import MotionRefused
-from drivers.event import CellEvent, EventKind, EventSink
+from drivers.event import CellEvent, EventKind
 from drivers.motion import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.network import CanopenNetwork
@@ -38,7 +38,7 @@ from ident.payload import Payload
 FloatArray = NDArray[np.float64]
 
 LOCKSTEP_TIMEOUT_S = 3.0
-"""A simulated cell on a busy machine may be that late; one that ended is told of in two seconds."""
+"""A simulated cell on a busy machine may be that late; one that ended is told of in four seconds."""
 GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
 ALLOWANCE_S = 10.0
@@ -138,18 +138,14 @@ def record(
             started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
             started_monotonic_ns=started_ns,
         )
-        early: list[CellEvent] = []
-        sinks: list[EventSink] = [early.append]
-
-        def on_event(event: CellEvent) -> None:
-            sinks[-1](event)
-
-        stream = SyncStream(network, _pacing(cell, run, clocks), on_event)
-        # The first samples tell where the axes stand: what is refused there is refused before a file exists.
-        first = until_complete(stream)
-        network.check_feedback(first[-1])
+        # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
+        # the schedule of the recording's waits for nobody, and what follows here takes many periods.
+        asking = SyncStream(network, _pacing(cell, run, clocks))
+        start = until_complete(asking)[-1]
+        asking.check()
+        network.check_feedback(start)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        start_counts = first[-1].position_counts
+        start_counts = start.position_counts
         moves = motor_moves(cell, plan, scale, start_counts)
         check_moves(start_counts, moves, permission, cell.axis_names)
         content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
@@ -167,10 +163,8 @@ def record(
                     done += 1
                     progress(done, len(moves))
 
-            for event in early:
-                keep(event)
-            sinks.append(keep)
-            for sample in first:
+            stream = SyncStream(network, _pacing(cell, run, clocks), keep)
+            for sample in until_complete(stream):
                 log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
                 try:

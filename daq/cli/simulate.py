@@ -52,11 +52,12 @@ def simulate(
 def how_to_reach(address: BusAddress, period_us: int) -> str:
     """What the cell file of the other verbs must say, ready to paste, and a first command."""
     hub = f"  host: {address.host}\n  port: {address.port}\n" if address.interface == "socketcand" else ""
+    # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
+    pacing = "timed" if address.interface == "socketcan" else "lockstep"
     return (
-        "To reach it, let the cell file say this instead of its own `bus` and `sync` "
-        "(`pacing: timed` is for real cells):\n\n"
+        "To reach it, let the cell file say this instead of its own `bus` and `sync`:\n\n"
         f"bus:\n  interface: {address.interface}\n  channel: {address.channel}\n{hub}"
-        f"  bitrate_bit_s: {address.bitrate_bit_s}\nsync:\n  period_us: {period_us}\n  pacing: lockstep\n\n"
+        f"  bitrate_bit_s: {address.bitrate_bit_s}\nsync:\n  period_us: {period_us}\n  pacing: {pacing}\n\n"
         "and try it in a second terminal: drivegain scan CELL"
     )
 

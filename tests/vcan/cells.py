@@ -1,0 +1,63 @@
+"""The demo cell on vcan0, with its amplifiers in a process of their own."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.vcan.run import INTERFACE
+
+CONFIGURATIONS = Path(__file__).parents[2] / "configs"
+SIMULATION = "clean"
+
+
+def write_cell(folder: Path, period_us: int, pacing: str) -> Path:
+    """A folder with the demo cell's file, its bus vcan0, and a copy of its controller's file."""
+    shutil.copy(CONFIGURATIONS / "controllers" / "demo.yaml", folder / "controller.yaml")
+    text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
+    text = text.replace("../robots", str(CONFIGURATIONS / "robots"))
+    text = text.replace("../controllers/demo.yaml", "controller.yaml")
+    bus = (
+        f"bus:\n  interface: socketcan\n  channel: {INTERFACE}\n  bitrate_bit_s: 1000000\n"
+        f"sync:\n  period_us: {period_us}\n  pacing: {pacing}\n"
+    )
+    # At 100 Hz there is nothing above 50 Hz, and the filters need room below that.
+    text = text.replace("position_cutoff_hz: 40.0", "position_cutoff_hz: 20.0")
+    text = text.replace("decimation_cutoff_hz: 20.0", "decimation_cutoff_hz: 10.0")
+    path = folder / "cell.yaml"
+    path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL), encoding="utf-8")
+    return path
+
+
+def write_simulation(folder: Path, period_us: int) -> Path:
+    """The clean cell's truth at another sync period; the mechanics are computed as finely as before."""
+    text = (CONFIGURATIONS / "simulation" / f"{SIMULATION}.yaml").read_text(encoding="utf-8")
+    text = text.replace("tx40-plant.urdf", str(CONFIGURATIONS / "simulation" / "tx40-plant.urdf"))
+    text = re.sub(r"sync_period_us: \d+", f"sync_period_us: {period_us}", text)
+    text = re.sub(r"substeps: \d+", f"substeps: {4 * period_us // 1000}", text)
+    path = folder / "simulation.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@contextmanager
+def simulated(simulation: Path, payload: str | None = None) -> Iterator[None]:
+    """`drivegain simulate` on vcan0 until the block ends."""
+    command = [sys.executable, "-m", "daq", "simulate", str(simulation), "--interface", "socketcan"]
+    command += ["--channel", INTERFACE, *(() if payload is None else ("--payload", payload))]
+    folder = CONFIGURATIONS.parent
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as process:
+        try:
+            if process.stdout is None or "amplifiers" not in process.stdout.readline():
+                raise RuntimeError(f"no simulated cell: {process.communicate()[1]}")
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            if process.wait(timeout=60) != 0:
+                raise RuntimeError(f"the simulated cell ended with {process.returncode}")
