@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import cast
@@ -138,7 +138,7 @@ class DirectStream:
     Attributes:
         network: what the walk asks of a network: its nodes and the names of its axes.
         pacing: of the samples' time.
-        max_missing_cycles: none is ever missing.
+        max_missing_cycles, silent: none is ever missing, and somebody always answers.
         events: in their order.
         time_ns: of the last sample.
         ampere_per_unit: of the raw current, from the drives' own scale objects.
@@ -150,6 +150,7 @@ class DirectStream:
         n = len(spec.axes)
         self.pacing = LockstepSync(spec.sync_period_us * 1000)
         self.max_missing_cycles = 0
+        self.silent = False
         self.events: list[CellEvent] = []
         self.time_ns = 0
         self._cycle = 0
@@ -166,7 +167,11 @@ class DirectStream:
             for index, axis in enumerate(spec.axes)
         )
         axes = drive_axes(cell)
-        self.network = cast(CanopenNetwork, SimpleNamespace(axes=axes, node_ids=tuple(axis.node_id for axis in axes)))
+        # Nobody can die between this recorder and its amplifiers: they need not be guarded.
+        self.network = cast(
+            CanopenNetwork,
+            SimpleNamespace(axes=axes, node_ids=tuple(axis.node_id for axis in axes), guarded=nullcontext),
+        )
         accesses = [_DirectAccess(node) for node in self._nodes]
         for access in accesses:
             access.prepare()
