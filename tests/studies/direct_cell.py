@@ -170,7 +170,12 @@ class DirectStream:
         # Nobody can die between this recorder and its amplifiers: they need not be guarded.
         self.network = cast(
             CanopenNetwork,
-            SimpleNamespace(axes=axes, node_ids=tuple(axis.node_id for axis in axes), guarded=nullcontext),
+            SimpleNamespace(
+                axes=axes,
+                node_ids=tuple(axis.node_id for axis in axes),
+                guarded=nullcontext,
+                find_silent=lambda _axes: None,
+            ),
         )
         accesses = [_DirectAccess(node) for node in self._nodes]
         for access in accesses:
