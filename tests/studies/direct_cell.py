@@ -84,10 +84,10 @@ def simulate_run(cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Pay
     """
     stream = DirectStream(cell, spec)
     scale = _scaling(cell, stream.ampere_per_unit)
-    first = next(stream)
+    first = next(stream)  # as a recording does: it asks where the axes stand before its log begins
     permission = MotionPermission("a simulated cell", motor_limits(cell, scale))
     planned = motor_moves(cell, plan, scale, first.position_counts)
-    samples = [first]
+    samples = [next(stream)]
     # The walk asks of network and stream what DirectStream has, and no more.
     with closing(execute(stream.network, cast(SyncStream, stream), planned, permission)) as walk:
         samples += walk
