@@ -70,13 +70,17 @@ class Tap:
         self._bus.send(message, timeout)
 
 
+ASKED = 1
+"""SYNCs before the log begins: a recorder first asks where the axes stand (daq/record.py)."""
+
+
 @dataclass(frozen=True)
 class Kill:
     """One killed recording.
 
     Attributes:
         target: SYNCs after which it was killed.
-        sent: SYNCs that reached the cell.
+        sent: SYNCs of the recording that reached the cell.
         recovered, lost: samples in the salvaged log, and not in it.
         lost_ms: recorded time that is gone [ms].
         same: what was recovered is what the cell had sent, cycle by cycle.
@@ -157,8 +161,8 @@ def kill_once(cell_file: Path, plan: Path, folder: Path, target: int) -> Kill:
         recovered, same, partial = len(found.samples.cycle), _as_sent(found.samples, tap.answers), found.partial
     part.unlink(missing_ok=True)
     saved.unlink(missing_ok=True)
-    lost = tap.syncs - recovered
-    return Kill(target, tap.syncs, recovered, lost, lost * CYCLE_MS, same, code, partial, refused)
+    lost = tap.syncs - ASKED - recovered
+    return Kill(target, tap.syncs - ASKED, recovered, lost, lost * CYCLE_MS, same, code, partial, refused)
 
 
 def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
@@ -172,7 +176,7 @@ def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
     return bool(
         np.array_equal(samples.cycle, np.arange(length, dtype=np.uint64))
         and not samples.missing.any()
-        and all(np.array_equal(column, sent[:, :length, field].T) for field, column in enumerate(logged))
+        and all(np.array_equal(column, sent[:, ASKED : ASKED + length, field].T) for field, column in enumerate(logged))
     )
 
 
@@ -300,12 +304,12 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
             )
         data = log.read_bytes()
         flips, cuts = damage(log, flipped(data, chance), damages), damage(log, cut(data, chance), damages)
-    kept = all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == length
+    kept = all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == ASKED + length
     return {
         "kept": kept,
         "promised_ms": PROMISED_MS,
         "seed": seed,
-        "whole": {"sent": tap.syncs, "logged": length, "as_sent": _as_sent(whole.samples, tap.answers)},
+        "whole": {"sent": tap.syncs - ASKED, "logged": length, "as_sent": _as_sent(whole.samples, tap.answers)},
         "kills": [asdict(one) for one in done],
         "largest_loss_ms": max((one.lost_ms for one in done), default=None),
         "bit_flips": asdict(flips),
