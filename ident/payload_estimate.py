@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from ident.base_parameters import BaseParameters
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimators.least_squares import ls, wls
+from ident.estimators.maximum_likelihood import noise_of
 from ident.jackknife import jackknife_covariance
 from ident.link import LINK_PARAMETERS
 from ident.payload import Payload
-from ident.reduction import Cluster, Reduction
+from ident.reduction import Cluster, Reduction, place_of
 from ident.system import System, require_distinct
-from ident.triangles import Triangles, solve, triangle
+from ident.triangles import solve, triangle
 
 FloatArray = NDArray[np.float64]
 
@@ -117,7 +118,7 @@ def joined(parts: Sequence[Reduction]) -> Reduction:
     joints = [list(parts[0].joints[0])]
     clusters: list[Cluster] = []
     for number, part in enumerate(parts):
-        places = [0, *(1 + _place(payload, payloads, part) for payload in part.payloads)]
+        places = [0, *(1 + place_of(payload, payloads, ", ".join(part.runs)) for payload in part.payloads)]
         joints += [
             [np.empty((0, factor.shape[1])) for factor in joints[0]] for _ in range(1 + len(payloads) - len(joints))
         ]
@@ -136,17 +137,6 @@ def joined(parts: Sequence[Reduction]) -> Reduction:
     )
 
 
-def _place(payload: Payload, payloads: list[Payload], part: Reduction) -> int:
-    for index, known in enumerate(payloads):
-        if known.mounting == payload.mounting:
-            if known != payload:
-                found = f"mounting {payload.mounting!r} carries {payload} here and {known} in another run"
-                raise DataUnfit(", ".join(part.runs), found)
-            return index
-    payloads.append(payload)
-    return len(payloads) - 1
-
-
 def _unknown(reduction: Reduction) -> Reduction:
     if len(reduction.payloads) != 1:
         mountings = ", ".join(payload.mounting for payload in reduction.payloads) or "none"
@@ -161,7 +151,7 @@ def _weighed(system: System, gains: FloatArray) -> PayloadEstimate:
     if "m" not in names:
         raise RankDeficient("these moves do not tell the payload's mass from its other parameters", ("m",))
     estimate = wls(system, gains)
-    noise = _motor_noise(system.motors, gains, estimate.parameters)
+    noise = noise_of(system.motors, 1.0 / gains, estimate.parameters, len(estimate.parameters))
     covariance = jackknife_covariance(system, gains, estimate.parameters, noise, gains_fixed=True)
     # With its weights held, WLS is linear in the gains.
     stacked = system.joints.stacked(1.0 / ls(system, gains).axis_noise)
@@ -170,13 +160,3 @@ def _weighed(system: System, gains: FloatArray) -> PayloadEstimate:
     own = slice(len(estimate.parameters) - len(names), None)
     std = np.sqrt(np.diag(covariance)[count:])
     return PayloadEstimate(names, estimate.parameters[own], std[own], per_gain[own])
-
-
-def _motor_noise(motors: Triangles, gains: FloatArray, parameters: FloatArray) -> FloatArray:
-    """σ of each motor's current [A] around an estimate, shape (n,)."""
-    size = [
-        float(np.linalg.norm(factor @ np.concatenate(([1.0], -parameters / gain, [-1.0 / gain]))))
-        for factor, gain in zip(motors.factors, gains, strict=True)
-    ]
-    free = len(parameters) / len(gains)
-    return np.asarray(np.array(size) / np.sqrt(np.maximum(motors.rows - free, 1.0)))

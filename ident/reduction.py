@@ -213,7 +213,7 @@ def reduce_runs(
     names: list[str] = []
     clusters: list[Cluster] = []
     for run in runs:
-        mounting = mounting_of(run, met)
+        mounting = place_of(run.payload, met, run.name)
         joints += [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1 - len(joints))]
         data = differentiate(run, model.drive_train, conditioning)
         moves: dict[int, list[list[FloatArray]]] = {}
@@ -244,24 +244,24 @@ def reduce_runs(
     )
 
 
-def mounting_of(run: Run, payloads: list[Payload]) -> int:
-    """Index of a run's payload among those met so far, to which a new one is added; −1 without load.
+def place_of(payload: Payload | None, payloads: list[Payload], run: str) -> int:
+    """Index of a payload among those met so far, to which a new one is added; −1 without load.
 
     Raises:
-        DataUnfit: the mounting carries something else here than in another run.
+        DataUnfit: its mounting carries something else here than in another run.
     """
-    if run.payload is None:
+    if payload is None:
         return -1
-    for index, payload in enumerate(payloads):
-        if payload.mounting == run.payload.mounting:
-            if payload != run.payload:
+    for index, known in enumerate(payloads):
+        if known.mounting == payload.mounting:
+            if known != payload:
                 raise DataUnfit(
-                    run.name,
-                    f"mounting {payload.mounting!r} carries {run.payload} here and {payload} in another run; "
+                    run,
+                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another run; "
                     "give each way of mounting a name of its own",
                 )
             return index
-    payloads.append(run.payload)
+    payloads.append(payload)
     return len(payloads) - 1
 
 

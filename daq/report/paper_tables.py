@@ -65,7 +65,8 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
     for name in names:
         one, other = values[0].get(name), values[1].get(name)
         difference = _difference_percent(one, other)
-        if difference is not None and (one or other).std > 0.0:  # type: ignore[union-attr]
+        # The mean is over what both have identified: a parameter that the drawing gave is no comparison.
+        if difference is not None and one is not None and one.std > 0.0:
             differences.append(difference)
         rows.append((_short(name), *_parameter(one), *_parameter(other), percent(difference)))
     errors = "‖ρ‖/‖Y‖", *(cell for c in (first, second) for cell in (f"{c.relative_error_percent.total:.2f} %", "")), ""

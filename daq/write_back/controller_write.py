@@ -190,7 +190,7 @@ def _restore(target: Path, before: bytes | None, after: bytes, source: Backup, n
         return Restored(target, source.path, written.backup, before, after)
     try:
         replace_file(target, after, check=check, like=source.path)
-    except BaseException:
+    except BaseException:  # an interrupt too: what is restored is there whole, or not at all
         target.unlink(missing_ok=True)
         raise
     return Restored(target, source.path, None, b"", after)

@@ -52,10 +52,10 @@ def ml(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
     else:
         gamma, iterations = 1.0 / fixed_gains, 0
     free = len(system.unknowns) + (0 if fixed_gains is not None else system.joint_count)
-    noise = _noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
+    noise = noise_of(triangles, gamma, _parameters(triangles, gamma, np.ones(len(gamma))), free)
     for _ in range(30):  # σ and χ for these γ: a fixed point of a few rounds
         parameters = _parameters(triangles, gamma, noise)
-        updated = _noise_of(triangles, gamma, parameters, free)
+        updated = noise_of(triangles, gamma, parameters, free)
         if np.allclose(updated, noise, rtol=1e-10):
             break
         noise = updated
@@ -94,7 +94,8 @@ def _residuals(triangles: Triangles, gamma: FloatArray, parameters: FloatArray) 
     return [factor @ vector for factor, vector in zip(triangles.factors, vectors, strict=True)]
 
 
-def _noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, free: int) -> FloatArray:
+def noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, free: int) -> FloatArray:
+    """σ of each motor's current [A] around an estimate, shape (n,); ``free`` parameters are shared among the motors."""
     size = np.array([float(e @ e) for e in _residuals(triangles, gamma, parameters)])
     return np.asarray(np.sqrt(size / np.maximum(triangles.rows - free / len(gamma), 1.0)))
 
@@ -117,7 +118,7 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
     noise = np.ones(count)
     for _ in range(3):
         parameters = _parameters(triangles, gamma, noise)
-        noise = _noise_of(triangles, gamma, parameters, 0)
+        noise = noise_of(triangles, gamma, parameters, 0)
     cost = [_log_likelihood_cost(triangles, gamma, parameters)]
     damping = 1e-3
     for iteration in range(1, MAX_ITERATIONS + 1):
@@ -151,7 +152,7 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
             if damping > LARGEST_DAMPING:
                 raise NotConverged("ml", iteration, tuple(cost), step)
         gamma, damping = trial, max(damping * 0.1, 1e-12)
-        noise = _noise_of(triangles, gamma, candidate, 0)
+        noise = noise_of(triangles, gamma, candidate, 0)
         cost.append(trial_cost)
     raise NotConverged("ml", MAX_ITERATIONS, tuple(cost), step)
 
