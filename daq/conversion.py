@@ -103,7 +103,9 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
 
 
 def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
-    """Read a log as a run, with the cell that it carries, or with another description of it; warns of a partial one.
+    """Read a log as a run, with the cell that it carries, or with another description of it.
+
+    Warns of what was saved of an unfinished recording, and of a first run at less than the plan's speed.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.
@@ -113,6 +115,12 @@ def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
     if log.partial:
         _LOG.warning(
             "%s is PARTIAL: saved from a recording that was never finished; nothing of it is written back", path
+        )
+    if (speed := log.head.run.speed) < 1.0:
+        _LOG.warning(
+            "%s was recorded at %g %% of the plan's speed: a first run tells less of gains and inertias than planned",
+            path,
+            100.0 * speed,
         )
     known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
     run = run_from_log(log, known)
@@ -163,6 +171,7 @@ def run_from_log(log: Log, cell: Cell) -> Run:
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
         valid=valid,
+        started_s=float(samples.time_ns[0]) * 1e-9,
         partial=log.partial,
     )
 

@@ -37,6 +37,7 @@ class Dataset:
         valid: sample may be used.
         move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
         payload: what was mounted, None without load.
+        started_s: when the run began, on a clock that the runs of one session share; None where no one knows.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Dataset:
     valid: BoolArray
     move: NDArray[np.int64]
     payload: Payload | None
+    started_s: float | None = None
 
     def motion(self, part: slice = slice(None)) -> Motion:
         """Of some of the samples."""
@@ -96,6 +98,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         valid=valid,
         move=move,
         payload=run.payload,
+        started_s=run.started_s,
     )
 
 

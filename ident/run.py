@@ -26,6 +26,7 @@ class Run:
         move: number of the move that each sample belongs to, shape (k,), or None where no one wrote it down.
         digest: of the log it was read from (sha256, hex).
         valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
+        started_s: when the run began, on a clock that the runs of one session share [s]; None where no one knows.
         partial: it is what was saved of a recording that was never finished.
     """
 
@@ -37,6 +38,7 @@ class Run:
     move: NDArray[np.int64] | None = None
     digest: str = ""
     valid: NDArray[np.bool_] | None = None
+    started_s: float | None = None
     partial: bool = False
 
     @property

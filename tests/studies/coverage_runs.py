@@ -11,17 +11,14 @@ the amplifiers tell them. `load_coverage` gives them back as runs with their tru
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address
@@ -35,6 +32,7 @@ from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.spec import CellSpec
 from ident.run import Run
 from tests.studies.direct_cell import RawRun, run_of, simulate_run
+from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.side_by_side import side_by_side
 from tests.studies.study_cells import Truth, declared_payload, spec_of, study_cell, truth_of
 
@@ -105,7 +103,7 @@ def load_coverage(out: Path = OUT) -> Iterator[CoverageCell]:
         raise FileNotFoundError(f"found no cell in {out}; run `python -m tests.studies.coverage_runs` first")
     for path in paths:
         seed = int(path.stem)
-        runs = tuple(run_of(raw, cell) for raw in _read(path))
+        runs = tuple(run_of(raw, cell) for raw in read_runs(path))
         yield CoverageCell(seed, truth_of(study_cell(seed)), runs)
 
 
@@ -185,45 +183,12 @@ def _simulate(task: _Task) -> str:
     begun_s = time.process_time()
     raw = simulate_runs(load_cell(CELL), task.seed, task.plans)
     path = task.out / f"{task.seed}.npz"
-    _write(path, raw)
+    write_runs(path, raw)
     samples = sum(len(run.move) for run in raw)
     spent_s = time.process_time() - begun_s
     limited = max(float(run.limited.mean(axis=0).max()) for run in raw)
     size_mb = path.stat().st_size / 1e6
     return f"cell {task.seed}: {samples} samples, at a limit {limited:.1%}, {spent_s:.1f} s, {size_mb:.2f} MB"
-
-
-def _write(path: Path, raw: Sequence[RawRun]) -> None:
-    arrays: dict[str, NDArray[Any]] = {}
-    for run in raw:
-        # Steps of positions are small numbers, which pack better than positions; the first one is a step from zero.
-        arrays[f"{run.name}.position_steps"] = np.diff(run.position_counts, axis=0, prepend=np.int32(0)).T
-        arrays[f"{run.name}.current_raw"] = run.current_raw.T
-        arrays[f"{run.name}.limited"] = run.limited.T
-        arrays[f"{run.name}.move"] = run.move.astype(np.int32)
-        arrays[f"{run.name}.ampere_per_unit"] = run.ampere_per_unit
-    payloads = {name: payload for name, payload, _ in RUNS}
-    with path.open("wb") as file:
-        # The stubs take every keyword for `allow_pickle`.
-        np.savez_compressed(file, runs=np.array(json.dumps(payloads)), **arrays)  # type: ignore[arg-type]
-
-
-def _read(path: Path) -> tuple[RawRun, ...]:
-    raw = []
-    with np.load(path) as arrays:
-        for name, payload in json.loads(str(arrays["runs"])).items():
-            raw.append(
-                RawRun(
-                    name=name,
-                    payload=None if payload is None else declared_payload(payload),
-                    position_counts=np.cumsum(arrays[f"{name}.position_steps"].T, axis=0, dtype=np.int32),
-                    current_raw=np.ascontiguousarray(arrays[f"{name}.current_raw"].T),
-                    limited=np.ascontiguousarray(arrays[f"{name}.limited"].T),
-                    move=arrays[f"{name}.move"].astype(np.int64),
-                    ampere_per_unit=arrays[f"{name}.ampere_per_unit"],
-                )
-            )
-    return tuple(raw)
 
 
 def _tell(line: str) -> None:

@@ -57,6 +57,7 @@ class RawRun:
         limited: whether a limit acted (6041h, bit of the drive profile), shape (k, n).
         move: number of the move, shape (k,).
         ampere_per_unit: of the raw current, as the drives' own objects say, shape (n,).
+        began_s: how long the cell had been on when the run began.
     """
 
     name: str
@@ -66,10 +67,13 @@ class RawRun:
     limited: NDArray[np.bool_]
     move: NDArray[np.int64]
     ampere_per_unit: NDArray[np.float64]
+    began_s: float = 0.0
 
 
-def simulate_run(cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Payload | None) -> RawRun:
-    """Power a simulated cell on, make a plan's moves, power it off.
+def simulate_run(
+    cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Payload | None, began_s: float = 0.0
+) -> RawRun:
+    """Make a plan's moves on a simulated cell.
 
     Args:
         cell: as declared: limits and drive train of the moves.
@@ -77,12 +81,13 @@ def simulate_run(cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Pay
         plan: the moves.
         name: of the run.
         payload: what is mounted, as declared; None without load.
+        began_s: how long the cell has been on, which is when what depends on time began.
 
     Raises:
         DriverError: the moves leave the limits, or an axis did not follow.
         FrictionUnsolved, SpecInvalid, EffectUnknown: from the simulated cell.
     """
-    stream = DirectStream(cell, spec)
+    stream = DirectStream(cell, spec, began_s)
     scale = _scaling(cell, stream.ampere_per_unit)
     first = next(stream)  # as a recording does: it asks where the axes stand before its log begins
     permission = MotionPermission("a simulated cell", motor_limits(cell, scale))
@@ -106,6 +111,7 @@ def simulate_run(cell: Cell, spec: CellSpec, plan: Plan, name: str, payload: Pay
         limited=(status & masks) != 0,
         move=move,
         ampere_per_unit=np.array(stream.ampere_per_unit),
+        began_s=began_s,
     )
 
 
@@ -122,6 +128,7 @@ def run_of(raw: RawRun, cell: Cell) -> Run:
         payload=raw.payload,
         move=raw.move,
         valid=~raw.limited,
+        started_s=raw.began_s,
     )
 
 
@@ -144,7 +151,7 @@ class DirectStream:
         ampere_per_unit: of the raw current, from the drives' own scale objects.
     """
 
-    def __init__(self, cell: Cell, spec: CellSpec) -> None:
+    def __init__(self, cell: Cell, spec: CellSpec, began_s: float = 0.0) -> None:
         if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
             raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
         n = len(spec.axes)
@@ -155,6 +162,7 @@ class DirectStream:
         self.time_ns = 0
         self._cycle = 0
         self._plant = Plant(spec)
+        self._plant.time_s = began_s
         self._amplifiers = AmplifierSet(spec, tuned(spec, self._plant), ())
         self._amplifiers.prime(self._plant.motor_rad)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])

@@ -1,0 +1,50 @@
+"""Raw runs of a study in one compressed file, counts as the amplifiers tell them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.studies.direct_cell import RawRun
+from tests.studies.study_cells import declared_payload
+
+
+def write_runs(path: Path, raw: Sequence[RawRun]) -> None:
+    """Save runs; their payloads are those that `declared_payload` knows by name."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for run in raw:
+        # Steps of positions are small numbers, which pack better than positions; the first one is a step from zero.
+        arrays[f"{run.name}.position_steps"] = np.diff(run.position_counts, axis=0, prepend=np.int32(0)).T
+        arrays[f"{run.name}.current_raw"] = run.current_raw.T
+        arrays[f"{run.name}.limited"] = run.limited.T
+        arrays[f"{run.name}.move"] = run.move.astype(np.int32)
+        arrays[f"{run.name}.ampere_per_unit"] = run.ampere_per_unit
+    payloads = {run.name: (None if run.payload is None else run.payload.name, run.began_s) for run in raw}
+    with path.open("wb") as file:
+        # The stubs take every keyword for `allow_pickle`.
+        np.savez_compressed(file, runs=np.array(json.dumps(payloads)), **arrays)  # type: ignore[arg-type]
+
+
+def read_runs(path: Path) -> tuple[RawRun, ...]:
+    """The runs of a file that `write_runs` made."""
+    raw = []
+    with np.load(path) as arrays:
+        for name, (payload, began_s) in json.loads(str(arrays["runs"])).items():
+            raw.append(
+                RawRun(
+                    name=name,
+                    payload=None if payload is None else declared_payload(payload),
+                    began_s=began_s,
+                    position_counts=np.cumsum(arrays[f"{name}.position_steps"].T, axis=0, dtype=np.int32),
+                    current_raw=np.ascontiguousarray(arrays[f"{name}.current_raw"].T),
+                    limited=np.ascontiguousarray(arrays[f"{name}.limited"].T),
+                    move=arrays[f"{name}.move"].astype(np.int64),
+                    ampere_per_unit=arrays[f"{name}.ampere_per_unit"],
+                )
+            )
+    return tuple(raw)
