@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-vcan check bench ident-study gain-study paper planning-study robot-study crash-study wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools check bench bench-stream ident-study gain-study paper planning-study robot-study crash-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -18,6 +18,7 @@ help:
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
 	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
+	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/stream.md); minutes"
 	@echo "make ident-study  errors by estimator and noise floor, and whether error bars are true (docs/estimators.md); 40 min"
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
 	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/paper.md); minutes"
@@ -52,14 +53,17 @@ demo: setup
 test: check
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
-test-vcan: setup
-	@[ -e /sys/class/net/vcan0 ] || { command -v linux.uml && command -v ip; } >/dev/null || { \
-		[ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
-		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2; } || { \
-		echo "test-vcan needs vcan0, or as root: apt-get install user-mode-linux iproute2" >&2; exit 1; }
+test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \
 		else echo "no npm: the foreign stack's tests are skipped"; fi
 	$(BIN)/python -m tests.vcan.run $(BIN)/python -m pytest -q -m vcan tests/vcan
+
+# What brings a kernel with vcan where this one has none.
+vcan-tools:
+	@[ -e /sys/class/net/vcan0 ] || { command -v linux.uml && command -v ip; } >/dev/null || { \
+		[ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null && apt-get update -qq && \
+		apt-get install -y -qq --no-install-recommends user-mode-linux iproute2; } || { \
+		echo "this needs vcan0, or as root: apt-get install user-mode-linux iproute2" >&2; exit 1; }
 
 check: setup
 	$(BIN)/ruff check .
@@ -69,6 +73,10 @@ check: setup
 
 bench: setup
 	$(BIN)/python -m tests.bench
+
+bench-stream: setup vcan-tools
+	@mkdir -p out
+	DRIVEGAIN_VCAN_OUT=$(CURDIR)/out $(BIN)/python -m tests.vcan.run $(BIN)/python -m tests.bench.stream
 
 ident-study: setup
 	$(BIN)/python -m tests.studies.ident_study

@@ -81,6 +81,11 @@ class DaqError(Exception):
         self.expected = expected
         self.remedy = remedy
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
+        # these to another.
+        return type(self).__new__, (type(self), *self.args), self.__dict__
+
 
 class UsageError(DaqError):
     """The command asks for what cannot be done."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from daq.configuration import cell as declared
 from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_bus import cell_address, drive_axes, load_warnings
 from daq.configuration.cell_file import bundle
 from daq.conversion import Scaling, scaling
 from daq.current_check import check_currents
@@ -30,7 +30,8 @@ from drivers.event import CellEvent, EventKind
 from drivers.motion import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
 from drivers.network import CanopenNetwork
-from drivers.pacing import LockstepSync, Pacing, TimedSync
+from drivers.pacing import FollowedSync, LockstepSync, Pacing, TimedSync
+from drivers.producer import DriveProducer, KernelProducer, SyncProducer
 from drivers.sample import Sample
 from drivers.stream import StreamStatistics, SyncStream
 from ident.payload import Payload
@@ -41,6 +42,8 @@ LOCKSTEP_TIMEOUT_S = 3.0
 """A simulated cell on a busy machine may be that late; one that ended is told of in four seconds."""
 GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
+SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
+"""Without a SYNC of its producer's, whichever is longer, after which this program sends it, to stop the axes."""
 ALLOWANCE_S = 10.0
 """Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
 SPACE_CHECK_S = 0.1
@@ -80,7 +83,7 @@ def network_of(cell: Cell) -> CanopenNetwork:
     """
     pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
     # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
-    return CanopenNetwork(bus_address(cell), drive_axes(cell), guard_ms=max(GUARD_MS[pacing], 3 * period_us // 1000))
+    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=max(GUARD_MS[pacing], 3 * period_us // 1000))
 
 
 def record(
@@ -93,6 +96,7 @@ def record(
     operator: str,
     granted_by: str | None,
     run_id: str,
+    speed: float = 1.0,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
@@ -108,6 +112,7 @@ def record(
         operator: who stands for the recording.
         granted_by: who allows the motion; None refuses it.
         run_id: unique.
+        speed: share of its planned speed that the plan's moves have been given (`daq.plan.slowed`), for the log.
         clocks: wall and monotonic time.
         free: room on the disk of a folder.
         progress: told the moves done and their number.
@@ -123,9 +128,9 @@ def record(
     clocks = clocks or Clocks()
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
-    with network_of(cell) as network:
+    with network_of(cell) as network, _sync_producer(cell, network) as producer:
         network.prepare()
-        warnings = (*check_currents(cell, network.scales()), *network.unguarded())
+        warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
         started_ns = clocks.monotonic_ns()
@@ -137,10 +142,14 @@ def record(
             software=software(),
             started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
             started_monotonic_ns=started_ns,
+            speed=speed,
         )
         # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
         # the schedule of the recording's waits for nobody, and what follows here takes many periods.
-        asking = SyncStream(network, _pacing(cell, run, clocks))
+        if producer is not None:
+            producer.start()
+        pacing = _pacing(cell, run, clocks, producer)
+        asking = SyncStream(network, pacing)
         start = until_complete(asking)[-1]
         asking.check()
         network.check_feedback(start)
@@ -163,7 +172,7 @@ def record(
                     done += 1
                     progress(done, len(moves))
 
-            stream = SyncStream(network, _pacing(cell, run, clocks), keep)
+            stream = SyncStream(network, pacing, keep)
             for sample in until_complete(stream):
                 log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
@@ -275,6 +284,9 @@ def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
         "answers twice": statistics.duplicate,
         "PDOs that no axis was told to send": statistics.surplus,
         "periods without SYNC": statistics.skipped_periods,
+        "frames dropped by the kernel": statistics.kernel_dropped,
+        "frames dropped by the interface": statistics.interface_dropped,
+        "frames dropped by the capture process": statistics.backlog_dropped,
     }
     found = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
     return not found, found
@@ -288,10 +300,23 @@ def _sync(cell: Cell) -> declared.Sync:
     return cell.sync
 
 
-def _pacing(cell: Cell, run: RunInfo, clocks: Clocks) -> Pacing:
+def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManager[SyncProducer | None]:
+    """Who sends SYNC in place of this program; None where this program does."""
+    sync = cell.sync
+    if sync is None or sync.producer == declared.RECORDER:
+        return nullcontext()
+    if sync.producer == declared.KERNEL:
+        return KernelProducer(network, sync.period_us)
+    return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
+
+
+def _pacing(cell: Cell, run: RunInfo, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
     sync = _sync(cell)
+    period_ns, start_ns, clock = sync.period_us * 1000, run.started_wall_ns, clocks.monotonic_ns
+    if producer is not None:
+        in_kernel = isinstance(producer, KernelProducer)
+        silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
+        return FollowedSync(period_ns, producer.name, in_kernel, silence_s, producer.seen, start_ns, clock)
     if sync.pacing is declared.Pacing.LOCKSTEP:
-        return LockstepSync(
-            sync.period_us * 1000, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns
-        )
-    return TimedSync(sync.period_us * 1000, start_ns=run.started_wall_ns, clock=clocks.monotonic_ns)
+        return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
+    return TimedSync(period_ns, start_ns=start_ns, clock=clock)

@@ -26,6 +26,7 @@ _HARMLESS = (
     EventKind.LIMIT,
     EventKind.MOVE_START,
     EventKind.MOVE_END,
+    EventKind.CAPTURE,
     EventKind.STOP,
 )
 """Events of sound runs; after any other a recorder might not have called the run valid."""

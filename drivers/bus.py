@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import can
 
 from drivers.errors import BusError
+from drivers.socketcan import open_socketcan
 from drivers.socketcand import SocketcandBus
-
-RECEIVE_BUFFER_BYTES = 4 << 20
-"""A kernel buffer of 208 KiB holds 43 ms of a full bus; a busy interpreter needs more."""
-SO_RCVBUFFORCE = 33  # linux/socket.h; allowed to CAP_NET_ADMIN
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +37,8 @@ class BusAddress:
 
 
 @contextmanager
-def bus_errors(address: BusAddress) -> Iterator[None]:
-    """Turn what python-can and the operating system raise into BusError."""
+def bus_errors(address: object) -> Iterator[None]:
+    """Turn what python-can and the operating system raise into BusError; the address says of which bus, or buses."""
     try:
         yield
     except (can.CanError, OSError) as error:
@@ -53,7 +49,8 @@ def open_bus(address: BusAddress) -> can.BusABC:
     """Open one end of a bus.
 
     A ``virtual`` bus keeps every frame that is not read, without bound (a bounded one would block the *sender* for
-    ever): close the ends that nobody reads. No end receives what it sent itself.
+    ever): close the ends that nobody reads. No end receives what it sent itself, but for the SYNCs on ``socketcan``,
+    which come back with their time and ``is_rx`` False (drivers/socketcan.py).
 
     Raises:
         BusError: the interface is unknown, the device is absent, or the hub does not answer.
@@ -62,9 +59,24 @@ def open_bus(address: BusAddress) -> can.BusABC:
         if address.interface == "socketcand":
             # Not python-can's client: to that one a closed hub looks like silence.
             return SocketcandBus(address.channel, address.host, address.port)
+        if address.interface == "socketcan":
+            # Not python-can's: that one loses frames while this interpreter is busy, and cannot say how many.
+            return open_socketcan(address.channel)
+    return open_answering_bus(address)
+
+
+def open_answering_bus(address: BusAddress) -> can.BusABC:
+    """As `open_bus`, for whoever answers each frame and keeps none: on ``socketcan`` without a process in between.
+
+    Raises:
+        BusError: as `open_bus`.
+    """
+    if address.interface == "socketcand":
+        return open_bus(address)
+    with bus_errors(address):
         try:
             # Users' python-can configuration files must not turn the cell's configuration into another one.
-            bus = can.Bus(
+            return can.Bus(
                 interface=address.interface,
                 channel=address.channel,
                 bitrate=address.bitrate_bit_s,
@@ -73,25 +85,13 @@ def open_bus(address: BusAddress) -> can.BusABC:
             )
         except (ValueError, TypeError, ImportError, NotImplementedError) as error:
             raise BusError(str(address), str(error)) from error
-    if address.interface == "socketcan":
-        _enlarge_receive_buffer(bus)
-    return bus
-
-
-def _enlarge_receive_buffer(bus: can.BusABC) -> None:
-    handle = getattr(bus, "socket", None)
-    if not isinstance(handle, socket.socket):
-        return
-    try:
-        handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER_BYTES)
-    except PermissionError:
-        handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
 
 
 def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
-    """Send several frames; in one system call where the bus can."""
-    if isinstance(bus, SocketcandBus):
-        bus.send_burst(messages)
+    """Send several frames; in one go where the bus has a ``send_burst`` of its own."""
+    burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
+    if burst is not None:
+        burst(messages)
         return
     for message in messages:
         bus.send(message)

@@ -4,6 +4,7 @@ DriverError
 ├── BusError                  the bus cannot be opened, or has gone
 ├── BusBusy                   another master commands this bus
 ├── NodeMissing               a configured node does not answer
+├── NodeMisplaced             a node is heard on another bus than its own
 ├── IdentityMismatch          1018h is not what the cell configuration expects
 ├── NmtRefused                a node did not confirm an NMT state by heartbeat
 ├── ObjectAccessError         an SDO transfer was aborted or timed out
@@ -15,6 +16,7 @@ DriverError
 ├── CellSilent                no axis answers any more
 ├── PdoLengthWrong            an answer is not as long as the mapping says, twice
 ├── DataFrozen                position and current do not change while the axis is told to move
+├── DataStale                 an amplifier's toggle bit says that it sends old values
 ├── LimitActive               a limit acts for too long
 ├── DriveFault                EMCY, fault bit or following error while running
 ├── HeartbeatLost             a node fell silent
@@ -27,6 +29,11 @@ from __future__ import annotations
 
 class DriverError(Exception):
     """Root of the tree; carries the evidence as attributes and says it in its message."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
+        # these to another.
+        return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class BusError(DriverError):
@@ -61,6 +68,20 @@ class NodeMissing(DriverError):
         self.node_ids = node_ids
         self.found = found
         self.waited_s = waited_s
+
+
+class NodeMisplaced(DriverError):
+    """A node is heard on another bus than its own."""
+
+    def __init__(self, node_id: int, expected: str, found: str) -> None:
+        super().__init__(
+            f"node {node_id} is heard on bus {found}, the cell configuration has it on bus {expected}: it is wired to "
+            "the other bus, two amplifiers have that node id, or both CAN interfaces are on one wire; "
+            "`drivegain scan` shows the nodes of each bus"
+        )
+        self.node_id = node_id
+        self.expected = expected
+        self.found = found
 
 
 class IdentityMismatch(DriverError):
@@ -176,6 +197,20 @@ class DataFrozen(DriverError):
         self.node_id = node_id
         self.position_counts = position_counts
         self.current_raw = current_raw
+
+
+class DataStale(DriverError):
+    """An amplifier's toggle bit stands; a stop that could not be confirmed is noted on the error."""
+
+    def __init__(self, node_id: int, bit: int, stood_s: float, cycles: int) -> None:
+        super().__init__(
+            f"node {node_id}: statusword bit {bit} has not toggled for {cycles} cycles, {1e3 * stood_s:g} ms: it sends "
+            "old values; stopping all axes; restart the drive, and check toggle_bit and update_period_us of its profile"
+        )
+        self.node_id = node_id
+        self.bit = bit
+        self.stood_s = stood_s
+        self.cycles = cycles
 
 
 class LimitActive(DriverError):

@@ -20,6 +20,11 @@ class EventKind(Enum):
     SAMPLE_LOST = "sample lost"
     BUS_BUSY = "bus busy"
     BUS_LOST = "bus lost"
+    BUS_PASSIVE = "error passive"
+    CONTROLLER = "controller"
+    FRAMES_DROPPED = "frames dropped"
+    SYNC_LOST = "sync lost"
+    CAPTURE = "capture"
     PDO_LENGTH = "pdo length"
     FROZEN = "frozen data"
     MOVE_START = "move start"
@@ -36,8 +41,8 @@ class CellEvent:
         time_ns: in the time of the samples [ns since 1970]: that of the SYNC it came after.
         axis: index of the axis from 0, or None when it concerns the whole cell.
         kind: what happened.
-        code: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, by
-            kind.
+        code: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, bits of
+            the controller's state, number of frames, by kind.
         text: for a person.
     """
 

@@ -1,10 +1,14 @@
-"""An axis that is told to move while neither its position nor its current changes by one count: its data are frozen."""
+"""Frozen data: an axis that is told to move while neither its position nor its current changes by one count, and, where
+an amplifier has a toggle bit, an amplifier that sends its last values again.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
+from drivers.axis import Axis
+from drivers.errors import DataStale
 from drivers.move import Move
 from drivers.sample import Sample
 
@@ -69,3 +73,49 @@ class FrozenData:
             ):
                 found.append(axis)
         return tuple(found)
+
+
+STALE_PERIODS = 2
+"""Of the amplifier's own, and SYNCs, in which its toggle bit stands: less may be its timer against ours."""
+
+
+class ToggleBits:
+    """Looks at the toggle bits of all axes that have one, in every cycle.
+
+    Args:
+        axes: of the cell.
+    """
+
+    def __init__(self, axes: Sequence[Axis]) -> None:
+        self._bits = tuple(
+            (number, axis.node_id, axis.profile.toggle_bit, STALE_PERIODS * 1000 * axis.profile.update_period_us)
+            for number, axis in enumerate(axes)
+            if axis.profile.toggle_bit is not None
+        )
+        # Of each axis: the bit, when it was first seen so, cycles since, whether that was told.
+        self._last: dict[int, tuple[int, int, int, bool]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._bits)
+
+    def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, DataStale]]:
+        """Axes whose bit has stood for too long, each once until it changes again; to be asked in every cycle.
+
+        Args:
+            time_ns: of the samples.
+            statuswords: of all axes.
+            missing: bit i is set when axis i did not answer; what it sent meanwhile is not known, so it begins anew.
+        """
+        for axis, node_id, bit, allowed_ns in self._bits:
+            if missing >> axis & 1:
+                self._last.pop(axis, None)
+                continue
+            value = statuswords[axis] >> bit & 1
+            before, since_ns, cycles, told = self._last.get(axis, (-1, 0, 0, False))
+            if value != before:
+                self._last[axis] = (value, time_ns, 0, False)
+                continue
+            stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
+            self._last[axis] = (value, since_ns, cycles + 1, told or stale)
+            if stale and not told:
+                yield axis, DataStale(node_id, bit, (time_ns - since_ns) * 1e-9, cycles + 1)

@@ -7,6 +7,7 @@ says that the connection was closed.
 
 from __future__ import annotations
 
+import errno
 import re
 import selectors
 import socket
@@ -73,7 +74,7 @@ class Hub:
             listener.setblocking(False)
         except OSError as error:
             listener.close()
-            raise BusError(f"hub {HOST}:{self._port}", str(error)) from error
+            raise BusError(f"hub {HOST}:{self._port}", _hint(error)) from error
         self._listener = listener
         self._waker, wake = socket.socketpair()
         self._thread = threading.Thread(target=self._serve, args=(listener, wake), name="socketcand hub", daemon=True)
@@ -189,6 +190,16 @@ class Hub:
         waiting = selectors.EVENT_WRITE if client.outgoing else 0
         if selector.get_key(client.handle).events != selectors.EVENT_READ | waiting:
             selector.modify(client.handle, selectors.EVENT_READ | waiting)
+
+
+def _hint(error: OSError) -> str:
+    """Why it cannot listen, and what to do."""
+    reason = error.strerror or str(error)
+    if error.errno == errno.EADDRINUSE:
+        return f"{reason}: another hub runs on this port; use that one, end it, or choose another port (0: a free one)"
+    if error.errno == errno.EACCES:
+        return f"{reason}: ports below 1024 are the system's; choose another port (0: a free one)"
+    return reason
 
 
 def _payload(data: bytes, length: int) -> bytes | None:

@@ -12,17 +12,20 @@ from enum import IntEnum
 
 import can
 
-from drivers.bus import BusAddress, bus_errors, open_bus, send_burst
+from drivers.bus import bus_errors, send_burst
 from drivers.emcy import describe
 from drivers.errors import BusError, NmtRefused
 from drivers.event import CellEvent, EventKind
 from drivers.sdo import Clock, ObjectAccess, PumpedSdoClient, SdoPolicy
+from drivers.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 
 SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 SDO_REQUEST = 0x600
 _EMCY, _SDO_ANSWER, _HEARTBEAT = 0x080, 0x580, 0x700
-_BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
+# linux/can/error.h: classes of an error frame, and what its second byte says of the controller.
+_CONTROLLER, _RESTARTED = 0x004, 0x100
+_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
 
 
 class NmtState(IntEnum):
@@ -70,14 +73,15 @@ class Link:
         answered: nodes that sent any SDO answer.
         silent: nodes that did not answer when they were last asked, and were not heard since.
         foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request) came that we did not send.
+        sync_producer: who sends SYNC because we told it to (drivers/producer.py); None while only we do.
     """
 
     def __init__(
         self,
-        address: BusAddress,
+        address: CellAddress,
         policy: SdoPolicy,
         clock: Clock,
-        opener: Callable[[BusAddress], can.BusABC] = open_bus,
+        opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
     ) -> None:
         self.address = address
         self.clock = clock
@@ -87,6 +91,7 @@ class Link:
         self.answered: set[int] = set()
         self.foreign: dict[int, int] = {}
         self.silent: set[int] = set()
+        self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0
         self._next_beat_ns = 0
@@ -181,14 +186,15 @@ class Link:
             BusError: an error frame says that the controller went off the bus.
         """
         if message.is_error_frame:
-            if message.arbitration_id & _BUS_OFF:
-                raise BusError(str(self.address), "bus-off: the CAN controller disconnected itself; check the wiring")
-            return True
+            self._note_error_frame(message)
+        if message.is_error_frame or not message.is_rx:
+            return True  # or a SYNC of ours, which comes back for the sake of its time
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
         if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id):
-            self._note_foreign(message.arbitration_id)  # no end of a bus receives what it sent itself
+            if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
+                self.note_foreign(message.arbitration_id)
             return True
         if node_id == 0:
             return False
@@ -213,7 +219,23 @@ class Link:
             text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
             self._events.append((node_id, EventKind.NMT, state, text))
 
-    def _note_foreign(self, identifier: int) -> None:
+    def _note_error_frame(self, message: can.Message) -> None:
+        """What the CAN controller says of itself; the kernel tells each change once."""
+        if message.arbitration_id & BUS_OFF:
+            raise BusError(str(self.address), BUS_OFF_REASON)
+        if message.arbitration_id & _RESTARTED:
+            self._events.append((0, EventKind.CONTROLLER, _RESTARTED, "the CAN controller was restarted"))
+        bits = message.data[1] if message.arbitration_id & _CONTROLLER and len(message.data) > 1 else 0
+        if bits & _PASSIVE:
+            text = "the CAN controller is error passive: check termination, wiring and bit rate"
+            self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
+        elif bits:
+            says = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
+            told = ", ".join(text for mask, text in says if bits & mask) or f"says {bits:02X}h"
+            self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {told}"))
+
+    def note_foreign(self, identifier: int) -> None:
+        """Take note of a master's command that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
         if self.foreign[identifier] == 1:  # told once: a master would fill the log
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))

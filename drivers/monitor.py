@@ -19,6 +19,7 @@ from drivers.event import CellEvent
 from drivers.link import SYNC_COB_ID, Link
 from drivers.mapping import Direction, feedback_entries, layout, pack, records
 from drivers.profile import ObjectEntry
+from drivers.split_bus import SplitAddress
 
 QUIET_S = 2.0
 """Silence of other masters after which the axes are asked."""
@@ -66,7 +67,7 @@ class CellReading:
         seconds: since the reading before.
         axes: in their order.
         sync_hz: SYNCs a second.
-        frames: number of frames in that time by their length, ours among them, shape (9,).
+        frames: on each bus, number of frames in that time by their length, ours among them, shape (buses, 9).
         events: EMCY and changes of NMT states in that time.
     """
 
@@ -74,7 +75,7 @@ class CellReading:
     seconds: float
     axes: tuple[AxisReading, ...]
     sync_hz: float
-    frames: tuple[int, ...]
+    frames: tuple[tuple[int, ...], ...]
     events: tuple[CellEvent, ...]
 
 
@@ -151,7 +152,9 @@ class CellMonitor:
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
         self._by_node = {axis.node_id: axis for axis in self._axes}
-        self._frames: Counter[int] = Counter()
+        self._split = link.address if isinstance(link.address, SplitAddress) else None
+        self._buses = ("",) if self._split is None else tuple(map(str, self._split.parts))
+        self._frames: Counter[tuple[int, int]] = Counter()
         self._syncs = 0
         self._master_ns: int | None = None
         self._began_ns = self._since_ns = link.clock()
@@ -191,11 +194,14 @@ class CellMonitor:
             if entry is None:
                 continue
             data = struct.pack("<BHB4x", _UPLOAD, entry.index, entry.subindex)
-            self._link.send((can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data),))
-            self._frames[len(data)] += 1
+            request = can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data)
+            self._link.send((request,))
+            for bus in (0,) if self._split is None else self._split.route(request):
+                self._frames[bus, len(data)] += 1
 
     def _hear(self, message: can.Message) -> None:
-        self._frames[len(message.data)] += 1
+        bus = 0 if self._split is None else self._buses.index(str(message.channel))
+        self._frames[bus, len(message.data)] += 1
         if message.is_error_frame or message.is_extended_id or message.is_remote_frame:
             self._link.dispatch(message)
             return
@@ -233,7 +239,7 @@ class CellMonitor:
             nmt = self._link.nmt.get(axis.node_id)
             axes.append(AxisReading(position, current, statusword, nmt, axis.readings / seconds, axis.lost))
             axis.readings = 0
-        frames = tuple(self._frames[length] for length in range(9))
+        frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
         sync_hz = self._syncs / seconds
         self._frames.clear()
         self._syncs = 0

@@ -1,4 +1,4 @@
-"""The amplifiers of one cell on one bus: found, checked, set up for recording and moving, given back as they were."""
+"""The amplifiers of one cell: found, checked, set up for recording and moving, given back as they were."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Self
 import can
 
 from drivers.axis import Axis, Identity
-from drivers.bus import BusAddress, open_bus
 from drivers.errors import (
     BusBusy,
     DriverError,
@@ -46,12 +45,15 @@ from drivers.sample import Sample
 from drivers.scale import ScaleReading, read_scale
 from drivers.scan import FoundNode, answering, read_identity, require, scan
 from drivers.sdo import Clock, SdoPolicy
+from drivers.split_bus import CellAddress, open_cell_bus
 from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 
 HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
+HEARTBEAT_MS = 100
+"""Of every node, and of the recorder."""
 STANDSTILL_COUNTS = 1024
 """An encoder at rest flickers, and an axis may sink onto its brake between two readings."""
 
@@ -95,26 +97,26 @@ class CanopenNetwork:
     """The axes of a cell. Use as a context manager; leaving it disables all axes and restores all settings.
 
     Args:
-        address: of the bus.
+        address: of the bus, or of the buses that share the axes.
         axes: the amplifiers, in the order of the samples' columns.
         heartbeat_ms: what every node is told to send, and we send while axes have power.
         guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/guard.py).
         bounds, policy: how long to wait.
         clock: monotonic time [ns].
-        opener: makes the bus of an address.
+        opener: makes the bus of an address, or the one that several make.
     """
 
     def __init__(
         self,
-        address: BusAddress,
+        address: CellAddress,
         axes: tuple[Axis, ...],
         *,
-        heartbeat_ms: int = 100,
+        heartbeat_ms: int = HEARTBEAT_MS,
         guard_ms: int = 500,
         bounds: Bounds = DEFAULT_BOUNDS,
         policy: SdoPolicy = DEFAULT_POLICY,
         clock: Clock = time.monotonic_ns,
-        opener: Callable[[BusAddress], can.BusABC] = open_bus,
+        opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
     ) -> None:
         self.axes = axes
         self.heartbeat_ms = heartbeat_ms
@@ -270,7 +272,8 @@ class CanopenNetwork:
         """To each node of ours, not to all of the bus: there may be others on it."""
         since = {node_id: self.link.command_nmt(node_id, command) for node_id in self.node_ids}
         for node_id, since_ns in since.items():
-            self.link.confirm_nmt(node_id, state, since_ns, self.bounds.nmt_s)
+            waited_s = (self.link.clock() - since_ns) * 1e-9
+            self.link.confirm_nmt(node_id, state, since_ns, max(self.bounds.nmt_s - waited_s, 0.0))
 
     def _map(self, axis: Axis) -> tuple[PdoRecord, ...]:
         node_id = axis.node_id

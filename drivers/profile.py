@@ -177,6 +177,8 @@ class DriveProfile:
         current: the signal whose gain is identified.
         current_scale: from raw unit to ampere in the stated amplitude convention.
         saturation_bit: bit of statusword 6041h that tells that a limit acts, None when the drive has none.
+        toggle_bit: bit of statusword 6041h that the drive inverts whenever it fills its PDO anew; None when it has
+            none: then frozen data show as values that do not change in a move (drivers/frozen.py).
         update_period_us: how often the drive refreshes the mapped objects.
         save_semantics: what saving stores, in words; it decides what must be restored before a save.
         source: where these facts stand, in short.
@@ -198,6 +200,7 @@ class DriveProfile:
     facts: tuple[Fact, ...] = ()
     rated: RatedMotor | None = None
     save: Save | None = None
+    toggle_bit: int | None = None
 
     @property
     def signal(self) -> str:

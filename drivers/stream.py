@@ -1,4 +1,4 @@
-"""The SYNC-grouped stream: one SYNC out, the answers of all axes back, one Sample.
+"""The SYNC-grouped stream: one SYNC, sent or followed, the answers of all axes back, one Sample.
 
 The stream is the only reader of the bus while it runs. A TPDO carries no cycle number, so an answer that comes after
 the next SYNC can be told from that SYNC's own answer only by waiting for both: after a missing frame the stream does
@@ -19,27 +19,35 @@ from drivers.event import CellEvent, EventKind, EventSink, discard
 from drivers.link import SYNC_COB_ID
 from drivers.mapping import Direction, feedback_entries, layout, pack, records
 from drivers.network import CanopenNetwork
-from drivers.pacing import LockstepSync, Pacing
+from drivers.pacing import FollowedSync, LockstepSync, Pacing, TimedSync
 from drivers.sample import Sample
+from drivers.socketcan import CapturedMessage, Losses, losses_of, remarks_of
+from drivers.stranger import SyncRate
 from drivers.watch import Watch
 
 SHORTENED, STRAGGLING = 16, 4
 """Parts of a lockstep cycle's bound: for a cell that was silent before, and for axes when others have answered."""
 
+LARGEST_LAG_NS = 1_000_000_000
+"""Of the reader behind a followed SYNC; what it sees of the axes is then older than what a person would bear."""
+
 
 @dataclass(frozen=True, slots=True)
 class StreamStatistics:
-    """What has become of the frames so far; a run is sound when all from `missing` to `skipped_periods` are zero.
+    """What has become of the frames so far; a run is sound when all from `missing` to `backlog_dropped` are zero.
 
     Attributes:
-        cycles: SYNCs sent.
+        cycles: SYNCs sent, or followed.
         frames: answers used.
         missing: answers that did not come in their cycle.
         late: answers that came in a later cycle, where that could be known.
         duplicate: second answers of an axis to one SYNC.
         surplus: PDOs of an axis of the cell that it was not told to send.
         wrong_length: answers that are not as long as the mapping says; they count as missing too.
-        skipped_periods: periods without a SYNC because the schedule slipped.
+        skipped_periods: periods without a SYNC because the schedule slipped, or a followed SYNC did not come.
+        kernel_dropped: frames of any kind that the kernel dropped because its receive buffer was full.
+        interface_dropped: the same, before they came to the buffer.
+        backlog_dropped: frames that the capture process dropped because nobody took them from it.
         foreign: PDOs that are explained: of nodes that are no axes of the cell, or from before the first SYNC.
     """
 
@@ -51,6 +59,9 @@ class StreamStatistics:
     surplus: int = 0
     wrong_length: int = 0
     skipped_periods: int = 0
+    kernel_dropped: int = 0
+    interface_dropped: int = 0
+    backlog_dropped: int = 0
     foreign: int = 0
 
 
@@ -79,6 +90,11 @@ def _slots(network: CanopenNetwork) -> dict[int, _Slot]:
     return slots
 
 
+def _is_sync(message: can.Message) -> bool:
+    plain = not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
+    return plain and message.arbitration_id == SYNC_COB_ID
+
+
 class SyncStream:
     """An iterator of Samples that never ends by itself; ``next`` raises what must stop a recording.
 
@@ -96,7 +112,7 @@ class SyncStream:
         LimitActive: a limit of a drive acts for too long.
         BusBusy: another master sends SYNC or NMT commands.
         HeartbeatLost: a node is silent for more than two of its periods.
-        BusError: the bus has gone.
+        BusError: the bus has gone, the followed SYNC does not come any more, or it is read more than a second late.
     """
 
     def __init__(
@@ -107,7 +123,7 @@ class SyncStream:
         max_missing_cycles: int = 3,
     ) -> None:
         self.network = network
-        self.pacing = pacing
+        self.pacing: Pacing = pacing
         self.max_missing_cycles = max_missing_cycles
         self._link = network.link
         self._on_event = on_event
@@ -127,6 +143,11 @@ class SyncStream:
         self._answered_ns = 0
         self._next_sync_ns = 0
         self._first_sync_ns = 0
+        self._last_sync_ns = 0
+        self._opened: can.Message | None = None
+        self._rate = SyncRate(pacing.period_ns)
+        self._behind = False
+        self._base = self._losses = Losses()
         self._time_ns = pacing.start_ns
         self._watch = Watch(network, on_event)
         self._cycles = self._frames = self._missing = self._late = 0
@@ -144,6 +165,9 @@ class SyncStream:
             self._surplus,
             self._wrong_length,
             self._skipped,
+            self._losses.kernel,
+            self._losses.interface,
+            self._losses.backlog,
             self._foreign,
         )
 
@@ -189,12 +213,79 @@ class SyncStream:
         """
         try:
             with bus_errors(self._link.address):
-                deadline_ns = self._send_sync()
-                self._collect(deadline_ns)
+                if self._cycles == 0:
+                    self._begin()
+                pacing = self.pacing
+                self._collect(self._follow_sync(pacing) if isinstance(pacing, FollowedSync) else self._send_sync())
         except BusError as error:
             self._on_event(CellEvent(self._time_ns, None, EventKind.BUS_LOST, 0, str(error)))
             raise
         return self._finish_cycle()
+
+    def _begin(self) -> None:
+        """What came before the first SYNC is nobody's, and what was lost before it is not missed."""
+        bus, begun_ns = self._link.bus, self.pacing.clock()
+        while self._opened is None and (message := bus.recv(0.0)) is not None:
+            fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
+            if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
+                self._opened = message  # a reader that is no faster than the bus would look for an end for ever
+            else:
+                self._between_cycles(message)
+        self._base = losses_of(bus)
+        for remark in remarks_of(bus):
+            self._on_event(CellEvent(self._time_ns, None, EventKind.CAPTURE, 0, remark))
+
+    def _follow_sync(self, pacing: FollowedSync) -> int:
+        """Send what waits, and find the next SYNC among the frames; returns its time, by the monotonic clock."""
+        bus = self._link.bus
+        self._link.beat()
+        if self._outgoing:
+            # As early in the period as can be: all of it should be there before the next SYNC.
+            outgoing, self._outgoing = self._outgoing, []
+            self._link.send(outgoing)
+        sync, self._opened = self._opened, None
+        while sync is None:
+            message = bus.recv(pacing.timeout_s)
+            if message is None:
+                return self._lose_sync(pacing)
+            if _is_sync(message):
+                sync = message
+            else:
+                self._between_cycles(message)
+        at_ns = sync.monotonic_ns if isinstance(sync, CapturedMessage) else pacing.clock()
+        periods = 0
+        if self._cycles == 0:
+            self._first_sync_ns = self._answered_ns = at_ns
+        else:
+            # One period after the SYNC before it, or more where others between them did not come.
+            since_ns = at_ns - self._last_sync_ns
+            periods = max(1, (since_ns + pacing.period_ns // 2) // pacing.period_ns)
+            self._skipped += periods - 1
+            if self._rate.too_fast(since_ns):
+                self._link.note_foreign(SYNC_COB_ID)
+        if pacing.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
+            self._link.note_foreign(SYNC_COB_ID)
+        if not self._behind and (behind_ns := pacing.clock() - at_ns) > LARGEST_LAG_NS:
+            self._behind = True
+            reason = f"read {behind_ns * 1e-9:.1f} s late: nothing is lost, but nobody watches axes that move so"
+            self._watch.faults.append(BusError(str(self._link.address), reason))
+        pacing.seen(at_ns, periods)
+        self._last_sync_ns = at_ns
+        self._time_ns = pacing.start_ns + at_ns - self._first_sync_ns
+        self._cycles += 1
+        return at_ns
+
+    def _lose_sync(self, pacing: FollowedSync) -> int:
+        """The producer is dead: tell it once, and send SYNC from now on, because the axes must be stopped."""
+        reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
+        self._on_event(CellEvent(self._time_ns, None, EventKind.SYNC_LOST, self._cycles, reason))
+        self._watch.faults.append(BusError(str(self._link.address), reason))
+        self.pacing = TimedSync(pacing.period_ns, pacing.start_ns, pacing.clock)
+        now = pacing.clock()
+        if self._cycles == 0:
+            self._first_sync_ns = self._answered_ns = now
+        self._next_sync_ns = now
+        return self._send_sync()
 
     def _send_sync(self) -> int:
         """Send what waits and the SYNC; returns until when its answers may come, by the clock."""
@@ -225,18 +316,41 @@ class SyncStream:
         self._cycles += 1
         return deadline_ns
 
-    def _collect(self, deadline_ns: int) -> None:
-        """Receive until all answers are there, or the deadline."""
-        recv, clock, slots, values = self._link.bus.recv, self.pacing.clock, self._slots, self._values
-        last_data = self._last_data
-        debt, seen, everything = self._debt, 0, self._all
-        while seen != everything or debt:
-            left_ns = deadline_ns - clock()
-            if left_ns <= 0:
-                break
+    def _next_frame(self, deadline_ns: int) -> can.Message | None:
+        """The next frame of this cycle; None when it is over: at its deadline, or with the next followed SYNC."""
+        recv, clock = self._link.bus.recv, self.pacing.clock
+        if isinstance(self.pacing, FollowedSync):
+            # By the order on the bus alone: whatever the clock says, what has come already is read first.
+            message = recv(self.pacing.timeout_s)
+            if message is not None and _is_sync(message):
+                self._opened = message
+                return None
+            return message
+        while (left_ns := deadline_ns - clock()) > 0:
             message = recv(left_ns * 1e-9)
             if message is None:
                 continue
+            if message.is_rx or not isinstance(message, CapturedMessage):
+                return message
+            self._note_own_sync(message)
+        return None
+
+    def _note_own_sync(self, message: CapturedMessage) -> None:
+        """The SYNC of this cycle as the kernel saw it; what is made up keeps its time."""
+        if isinstance(self.pacing, TimedSync):
+            if self._cycles == 1:
+                self._first_sync_ns = message.monotonic_ns
+            self._time_ns = self.pacing.start_ns + message.monotonic_ns - self._first_sync_ns
+
+    def _collect(self, deadline_ns: int) -> None:
+        """Receive until all answers are there, or the cycle is over."""
+        clock, slots, values = self.pacing.clock, self._slots, self._values
+        last_data = self._last_data
+        debt, seen, everything = self._debt, 0, self._all
+        while seen != everything or debt:
+            message = self._next_frame(deadline_ns)
+            if message is None:
+                break
             identifier = message.arbitration_id
             slot = slots.get(identifier)
             if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
@@ -321,9 +435,25 @@ class SyncStream:
         else:
             self._incomplete_cycles = 0
         self._frames += self._seen.bit_count()
+        self._note_losses()
         statuswords = tuple(values[2 * axes :])
         self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords, missing)
         return Sample(cycle, self._time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
+
+    def _note_losses(self) -> None:
+        """Frames that this machine lost; which they were nobody knows."""
+        losses = losses_of(self._link.bus).since(self._base)
+        if losses == self._losses:
+            return
+        new, self._losses = losses.since(self._losses), losses
+        for count, where in (
+            (new.kernel, "in the kernel's receive buffer, which was full"),
+            (new.interface, "by the interface, before the receive buffer"),
+            (new.backlog, "by the capture process, whose backlog was full"),
+        ):
+            if count:
+                text = f"{count} frames dropped {where}"
+                self._on_event(CellEvent(self._time_ns, None, EventKind.FRAMES_DROPPED, count, text))
 
     def _note_missing(self, cycle: int, missing: int) -> None:
         silent = tuple(axis for axis in range(self._axes) if missing >> axis & 1)

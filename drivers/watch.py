@@ -9,6 +9,7 @@ from collections import deque
 
 from drivers.errors import BusBusy, DriveFault, DriverError, HeartbeatLost, LimitActive
 from drivers.event import CellEvent, EventKind, EventSink
+from drivers.frozen import ToggleBits
 from drivers.link import SDO_REQUEST, NmtState, command_name, nmt_name
 from drivers.network import CanopenNetwork
 from drivers.state import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
@@ -39,6 +40,7 @@ class Watch:
         self._next_heartbeat_check_ns = 0
         self._heard_at: dict[int, tuple[int, int, int]] = {}
         self._limited_since_ns: dict[int, int] = {}
+        self._toggle_bits = ToggleBits(network.axes)
 
     def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
         """See to everything after one cycle.
@@ -55,6 +57,10 @@ class Watch:
             self._note_statuswords(time_ns, statuswords, missing)
         if self._limited_since_ns:
             self._check_limits(time_ns)
+        if self._toggle_bits:
+            for axis, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
+                self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, stale.bit, str(stale)))
+                self.faults.append(stale)
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
             self._check_heartbeats(time_ns, clock_ns)

@@ -16,6 +16,11 @@ from __future__ import annotations
 class IdentificationError(Exception):
     """Root of the tree; carries the evidence as attributes and says it in its message."""
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
+        # these to another.
+        return type(self).__new__, (type(self), *self.args), self.__dict__
+
 
 class ModelError(IdentificationError):
     """The URDF or drive train does not describe this robot."""

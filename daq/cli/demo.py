@@ -47,7 +47,7 @@ def demo(
 
 def show(outcome: Outcome, out: Path, console: Console) -> None:
     """The whole story for a person."""
-    console.print(scan_table(scan_rows(outcome.cell, outcome.nodes)))
+    console.print(scan_table(scan_rows(outcome.cell, outcome.nodes, outcome.cell.buses[0].name)))
     console.print()
     for number, step in enumerate(outcome.fitted.steps, start=1):
         console.print(ranking_table(outcome.fitted, step.findings, f"Turn {number}: best candidates on left-out moves"))

@@ -56,6 +56,7 @@ def describe_log(path: Path) -> dict[str, Any]:
         if run.payload is None
         else {"name": run.payload.name, "mounting": run.payload.mounting, "known": run.payload.known},
         "rate_hz": run.rate_hz,
+        "speed": run.speed,
         "samples": samples,
         "duration_s": samples / run.rate_hz,
         "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,

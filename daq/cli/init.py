@@ -38,6 +38,13 @@ HEADS = {
 """,
 }
 """Comment at the head of a new file, by the folder of its template, instead of what the template says of itself."""
+BUS = """\
+bus:
+  # A cell on two buses has a list here, and each axis says `bus: left` or `bus: right`:
+  #   - {name: left, interface: socketcan, channel: can0}
+  #   - {name: right, interface: socketcan, channel: can1}
+"""
+"""What stands over the bus of a new cell."""
 AXES = """\
 axes:
   # One entry for each motor, from the base to the tool, in the order of the joints in the URDF.
@@ -114,7 +121,7 @@ def _copy(source: str, folder: Path, target: str, name: str) -> Path:
         text = path.read_text(encoding="utf-8")
         text = re.sub(r"^(name|controller): (demo|tx40)$", rf"\1: {name}", text, flags=re.MULTILINE)
         text = re.sub(r"\A(#.*\n)+", HEADS.get(Path(source).parent.name, r"\g<0>").format(name=name), text)
-        text = text.replace("axes:\n", AXES).replace("payloads:\n", PAYLOADS)
+        text = text.replace("\nbus:\n", f"\n{BUS}").replace("axes:\n", AXES).replace("payloads:\n", PAYLOADS)
         text = text.replace("../controllers/demo.yaml", f"../controllers/{name}.yaml")
         text = text.replace("../cells/tx40.yaml", f"../cells/{name}.yaml")
         text = text.replace("interface: virtual  ", "interface: socketcan").replace("channel: demo", "channel: can0")

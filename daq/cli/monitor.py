@@ -21,7 +21,7 @@ from daq.cli.scan import ENABLED
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.bus_load import frame_bits
 from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_bus import cell_address, drive_axes
 from daq.configuration.cell_file import load_cell
 from drivers.errors import DriverError, NodeMissing
 from drivers.event import EventKind
@@ -56,7 +56,7 @@ def monitor_verb(
     with (
         suppress(KeyboardInterrupt),
         interruptible(),
-        CanopenNetwork(bus_address(declared), drive_axes(declared), policy=POLICY) as network,
+        CanopenNetwork(cell_address(declared), drive_axes(declared), policy=POLICY) as network,
     ):
         readings = _readings(declared, network, interval)
         if once or json or not console.is_terminal:
@@ -127,13 +127,15 @@ def describe(cell: Cell, reading: CellReading, ampere: list[float | None], event
                 "silent": axis.rate_hz == 0.0,
             }
         )
+    loads = bus_loads_percent(cell, reading)
     return {
         "cell": cell.name,
         "source": reading.source.value,
         "seconds": reading.seconds,
         "sync_hz": reading.sync_hz,
-        "frames_per_s": sum(reading.frames) / reading.seconds,
-        "bus_load_percent": bus_load_percent(cell, reading),
+        "frames_per_s": sum(map(sum, reading.frames)) / reading.seconds,
+        "bus_load_percent": max(loads),
+        "buses": [{"bus": bus.name, "load_percent": load} for bus, load in zip(cell.buses, loads, strict=True)],
         "axes": axes,
         "events": events,
     }
@@ -157,11 +159,14 @@ def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
     return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
 
 
-def bus_load_percent(cell: Cell, reading: CellReading) -> float:
-    """Of the bits that the wire could carry, with every frame as long as stuffing can make it [%]."""
-    bitrate = bus_address(cell).bitrate_bit_s
-    bits = sum(count * frame_bits(length) for length, count in enumerate(reading.frames))
-    return 100.0 * bits / (bitrate * reading.seconds)
+def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
+    """Of the bits that each wire could carry, with every frame as long as stuffing can make it [%]."""
+    return tuple(
+        100.0
+        * sum(count * frame_bits(length) for length, count in enumerate(frames))
+        / (bus.bitrate_bit_s * reading.seconds)
+        for bus, frames in zip(cell.buses, reading.frames, strict=True)
+    )
 
 
 def view(document: dict[str, Any]) -> Group:
@@ -172,10 +177,8 @@ def view(document: dict[str, Any]) -> Group:
     for axis in document["axes"]:
         table.add_row(*map(Text, _cells(axis)), style=_style(axis))
     head = Text(printable(f"{document['cell']}: {_SAID[Source(document['source'])]}"))
-    load = Text(
-        f"bus {document['bus_load_percent']:.1f} % at worst, {document['frames_per_s']:.0f} frames/s, "
-        f"SYNC {document['sync_hz']:.1f} Hz"
-    )
+    loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
+    load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
     return Group(head, table, load, *(Text(printable(event), "yellow") for event in document["events"]))
 
 

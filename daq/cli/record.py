@@ -14,6 +14,7 @@ from daq.cli.interrupt import interruptible
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell, MotionPolicy, Pacing
+from daq.configuration.cell_bus import bus_loads
 from daq.configuration.cell_file import load_cell
 from daq.errors import ExitCode, OutputExists, UsageError
 from daq.plan import slowed
@@ -36,7 +37,10 @@ def record_verb(
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     operator: Annotated[str | None, typer.Option(help="Who stands for this recording; you, by default.")] = None,
-    speed: Annotated[float, typer.Option(help="Speed override for a first run.", min=0.05, max=1.0)] = 1.0,
+    speed: Annotated[
+        float,
+        typer.Option(help="Speed override for a first run: share of the plan's; the log says it.", min=0.05, max=1.0),
+    ] = 1.0,
     json: JsonOption = False,
 ) -> None:
     """Make the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes."""
@@ -44,6 +48,8 @@ def record_verb(
     moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or getpass.getuser()
     part = _free(out)
+    for line in load_lines(declared):
+        typer.echo(line, err=True)
     try:
         with interruptible(), progress_bar("recording") as told:
             done = record(
@@ -55,6 +61,7 @@ def record_verb(
                 operator=who,
                 granted_by=granted(declared, who, enable_motion),
                 run_id=str(uuid.uuid4()),
+                speed=speed,
                 progress=lambda count, total: told(count, total, "moves"),
             )
     except KeyboardInterrupt as interrupt:
@@ -76,10 +83,19 @@ def record_verb(
     log = done.log
     if json:
         print_json({"log": str(out), "samples": log.samples, "lost_cycles": log.lost_cycles, "missing": log.missing,
-                    "valid": log.valid, "reason": log.reason, "warnings": done.warnings})  # fmt: skip
+                    "valid": log.valid, "reason": log.reason, "warnings": done.warnings,
+                    "bus_load": [{"bus": bus.name, "mean_percent": 100 * load.mean, "worst_percent": 100 * load.worst}
+                                 for bus, load in bus_loads(declared)]})  # fmt: skip
     else:
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
+
+
+def load_lines(cell: Cell) -> tuple[str, ...]:
+    """For a person: what the recording will take of each bus."""
+    lockstep = cell.sync is not None and cell.sync.pacing is Pacing.LOCKSTEP
+    says = "in lockstep; a real one would be loaded by" if lockstep else "loaded by"
+    return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))
 
 
 def _free(out: Path) -> Path:

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_bus import bus_parts, cell_address, drive_axes
 from daq.configuration.cell_file import load_cell
 from daq.report.current_signal import actual_current_note, signals
 from drivers.errors import NodeMissing
@@ -32,16 +32,23 @@ def scan_verb(
     wait: Annotated[float, typer.Option(help="How long to wait for answers [s].", min=0.05, max=60.0)] = 0.5,
     json: JsonOption = False,
 ) -> None:
-    """List the nodes on the cell's bus with identity, name and state, beside what the cell configuration expects."""
+    """List the nodes on the cell's buses with identity, name and state, beside what the cell configuration expects.
+
+    Each bus is searched by itself for every node id, so that an amplifier on the wrong one is found there.
+    """
     declared = load_cell(cell)
-    with CanopenNetwork(bus_address(declared), drive_axes(declared)) as network:
-        found = network.scan(wait_s=wait)
-    rows = scan_rows(declared, found)
+    found = {}
+    for part in bus_parts(declared):
+        axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
+        with CanopenNetwork(part.address, axes) as network:
+            found[part.name] = network.scan(wait_s=wait)
+    rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
-        print_json({"bus": str(network.link.address), "nodes": rows, "current": signals(declared)})
+        address = str(cell_address(declared))
+        print_json({"bus": address, "nodes": rows, "current": signals(declared)})
     else:
         console = Console(soft_wrap=True)
-        console.print(scan_table(rows, console.width))
+        console.print(scan_table(rows, console.width, several=len(found) > 1))
         for row in rows:
             if row["enabled"]:
                 name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
@@ -51,12 +58,19 @@ def scan_verb(
             console.print(Text(note, "yellow"))
     missing = tuple(row["node_id"] for row in rows if row["verdict"] == "missing")
     if missing:
-        raise NodeMissing(missing, tuple(node.node_id for node in found), wait)
+        raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
 
 
-def scan_rows(cell: Cell, found: tuple[FoundNode, ...]) -> list[dict[str, Any]]:
-    """One row a node, configured or found."""
-    axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None}
+def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[str, Any]]:
+    """One row for each node that is configured or found on a bus.
+
+    Args:
+        cell: what is expected.
+        found: on the bus.
+        bus: its name.
+    """
+    homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
+    axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
     nodes = {node.node_id: node for node in found}
     rows = []
     for node_id in sorted(axes.keys() | nodes.keys()):
@@ -66,11 +80,12 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...]) -> list[dict[str, Any]]:
         if node is None:
             verdict = "missing"
         elif axis is None:
-            verdict = "not configured"
+            verdict = f"belongs on {homes[node_id]}" if node_id in homes else "not configured"
         else:
             verdict = "ok" if expected is None or expected == identity else "other identity"
         rows.append(
             {
+                "bus": bus,
                 "node_id": node_id,
                 "axis": None if axis is None else axis.name,
                 "vendor_id": None if identity is None else identity.vendor_id,
@@ -92,9 +107,10 @@ _DISPENSABLE = ("nmt", "vendor", "product", "serial", "state")
 _POWER = {True: "ENABLED", False: "off", None: "?"}
 
 
-def scan_table(rows: list[dict[str, Any]], width: int = 80) -> Table:
-    """The rows for a person, in at most so many columns; node, axis, power and verdict are always whole."""
+def scan_table(rows: list[dict[str, Any]], width: int = 80, several: bool = False) -> Table:
+    """The rows for a person, in at most so many columns; bus (of several), node, axis, power and verdict are whole."""
     columns = {
+        **({"bus": [printable(row["bus"]) for row in rows]} if several else {}),
         "node": [str(row["node_id"]) for row in rows],
         "axis": [printable(row["axis"] or "") for row in rows],
         "vendor": ["" if row["vendor_id"] is None else f"{row['vendor_id']:#x}" for row in rows],

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +13,16 @@ import typer
 
 from daq.cli.interrupt import interruptible
 from daq.cli.verb import Verb
+from daq.configuration.fault_scenario import load_scenario
 from daq.configuration.simulation import load_simulation, shipped_simulation
-from drivers.bus import BusAddress, open_bus
+from daq.errors import UsageError
+from drivers.bus import BusAddress, open_answering_bus
 from drivers.hub import Hub
 from drivers.simulated.cell import SimulatedCell
+from drivers.split_bus import BusPart, SplitAddress, open_split_bus
 
 SHIPPED = ("demo", "clean", "seven-axis", "gantry")
+SHIPPED_FAULTS = "faults-example"
 
 
 def simulate(
@@ -24,10 +30,21 @@ def simulate(
         Path, typer.Argument(help="Simulation file, the truth of a cell; or demo or clean, which come with drivegain.")
     ],
     payload: Annotated[str | None, typer.Option(help="Mounted body, by its name in the simulation file.")] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(help="Scenario file of what goes wrong, and when; or faults-example, which lists all kinds."),
+    ] = None,
     interface: Annotated[
         str, typer.Option(help="socketcand starts a hub on 127.0.0.1; socketcan uses a real or virtual CAN.")
     ] = "socketcand",
     channel: Annotated[str, typer.Option(help="Of the bus.")] = "can0",
+    bus: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CHANNEL=NODE,NODE,...",
+            help="One of several buses with the nodes on it, instead of --channel; say it once for each bus.",
+        ),
+    ] = None,
     port: Annotated[int, typer.Option(help="Of the hub; 0 takes a free one.", min=0, max=65535)] = 29536,
 ) -> None:
     """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
@@ -36,30 +53,87 @@ def simulate(
     """
     shipped = simulation.name in SHIPPED and not simulation.exists()
     spec = load_simulation(shipped_simulation(simulation.name) if shipped else simulation, payload)
+    if faults is not None:
+        shipped = faults.name == SHIPPED_FAULTS and not faults.exists()
+        scenario = shipped_simulation(faults.name) if shipped else faults
+        spec = replace(spec, faults=spec.faults + load_scenario(scenario, len(spec.axes), spec.sync_period_us))
     # A terminal that has gone is no reason to end: that is what nohup is for.
     with suppress(KeyboardInterrupt), interruptible(signals=(signal.SIGINT, signal.SIGTERM)), ExitStack() as stack:
-        address = BusAddress(interface, channel)
-        if interface == "socketcand":
-            address = stack.enter_context(Hub((channel,), port)).address()
-        bus = open_bus(address)
-        stack.callback(bus.shutdown)
-        cell = SimulatedCell(spec, bus)
-        typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {payload or 'none'}; Ctrl-C ends it")
-        typer.echo(how_to_reach(address, spec.sync_period_us))
+        there = nodes_on_buses(bus, [axis.node_id for axis in spec.axes]) if bus else {channel: frozenset()}
+        hub = stack.enter_context(Hub(tuple(there), port)) if interface == "socketcand" else None
+        parts = tuple(
+            BusPart(name, BusAddress(interface, name) if hub is None else hub.address(name), nodes)
+            for name, nodes in there.items()
+        )
+        address = SplitAddress(parts) if bus else parts[0].address
+        end = open_split_bus(address) if isinstance(address, SplitAddress) else open_answering_bus(address)
+        stack.callback(end.shutdown)
+        cell = SimulatedCell(spec, end)
+        typer.echo(
+            f"{len(spec.axes)} amplifiers on {address}, payload {payload or 'none'}, "
+            f"{len(spec.faults) or 'no'} faults; Ctrl-C ends it"
+        )
+        typer.echo(how_to_reach(parts, spec.sync_period_us))
         cell.serve_forever()
 
 
-def how_to_reach(address: BusAddress, period_us: int) -> str:
+def nodes_on_buses(said: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:
+    """Nodes by the channel of their bus.
+
+    Args:
+        said: CHANNEL=NODE,NODE,... of each bus.
+        node_ids: of the cell; each must be on one of the buses.
+
+    Raises:
+        UsageError: something else was said.
+    """
+    there: dict[str, frozenset[int]] = {}
+    for one in said:
+        channel, _, nodes = one.partition("=")
+        numbers = [int(node) for node in nodes.split(",") if node.isascii() and node.isdigit()]
+        if not channel or channel in there or not numbers or len(numbers) != nodes.count(",") + 1:
+            raise UsageError(
+                f"--bus {one}",
+                found="no CHANNEL=NODE,NODE,..., or a channel for the second time",
+                expected="a channel and the nodes on it",
+                remedy="for example --bus can0=1,2,3 --bus can1=4,5,6",
+            )
+        there[channel] = frozenset(numbers)
+    everywhere = sorted(node for nodes in there.values() for node in nodes)
+    if everywhere != sorted(node_ids):
+        raise UsageError(
+            f"--bus {' --bus '.join(said)}",
+            found=f"node {', '.join(map(str, everywhere))}",
+            expected=f"each node of the cell once: {', '.join(map(str, sorted(node_ids)))}",
+            remedy="say on which bus each of them is",
+        )
+    return there
+
+
+def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     """What the cell file of the other verbs must say, ready to paste, and a first command."""
-    hub = f"  host: {address.host}\n  port: {address.port}\n" if address.interface == "socketcand" else ""
     # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
-    pacing = "timed" if address.interface == "socketcan" else "lockstep"
+    pacing = "timed" if parts[0].address.interface == "socketcan" else "lockstep"
+    several = len(parts) > 1
+    buses = "".join(("  - name: " + part.name + "\n" if several else "") + _keys(part, several) for part in parts)
+    nodes = "".join(
+        f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n" for part in parts
+    )
     return (
         "To reach it, let the cell file say this instead of its own `bus` and `sync`:\n\n"
-        f"bus:\n  interface: {address.interface}\n  channel: {address.channel}\n{hub}"
-        f"  bitrate_bit_s: {address.bitrate_bit_s}\nsync:\n  period_us: {period_us}\n  pacing: {pacing}\n\n"
-        "and try it in a second terminal: drivegain scan CELL"
+        f"bus:\n{buses}sync:\n  period_us: {period_us}\n  pacing: {pacing}\n\n"
+        + (f"{nodes}\n" if several else "")
+        + "and try it in a second terminal: drivegain scan CELL"
     )
 
 
-SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc")
+def _keys(part: BusPart, several: bool) -> str:
+    address, indent = part.address, "    " if several else "  "
+    keys = {"interface": address.interface, "channel": address.channel}
+    if address.interface == "socketcand":
+        keys |= {"host": address.host, "port": str(address.port)}
+    keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
+    return "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
+
+
+SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --faults faults-example")

@@ -1,14 +1,51 @@
-"""Whether the answers to one SYNC fit between two of them on a CAN bus."""
+"""How much of a CAN bus a recording takes: on average, at worst, and in the cycle in which all axes start."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
 
-from drivers.mapping import STATUSWORD, pack
-from drivers.profile import DriveProfile
+from drivers.mapping import SETPOINT_PDOS, STATUSWORD, pack
+from drivers.network import HEARTBEAT_MS
+from drivers.profile import DriveProfile, ObjectEntry
 
-LARGEST_SHARE = 0.95
-"""Of a period that SYNC and its answers may take at worst; what is left carries set-points and heartbeats."""
+LARGEST_MEAN = 0.80
+"""Of a bus that a recording may take on average. What is left is for repeated frames, SDO, EMCY and other nodes; above
+it frames wait for each other so often that answers come after the next SYNC."""
+LARGEST_WORST = 1.0
+"""Of a period that SYNC and its answers may take when every frame is as long as stuffing can make it: an answer that
+comes after the next SYNC is late, and makes a run invalid."""
+STUFFING = 13
+"""Of so many bits that are stuffed, one is doubled on average: positions and currents have runs of equal bits that
+random data have not (which double one in 30). tests/daq/test_bus_load.py compares it with real frames."""
+MOVES_PER_S = 1.0
+SETPOINTS = 4
+"""Controlwords of an axis in a move: new set-point until acknowledged, taken back until seen; each twice as a rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusLoad:
+    """What a recording takes of one bus, as shares of it.
+
+    Attributes:
+        mean: SYNC, the answers, heartbeats, and the set-points of a move a second, with usual stuffing.
+        worst: SYNC and the answers alone, of a period, with all the stuffing that can be.
+        start: of a period, of the cycle in which all axes are told to start, with usual stuffing. Above 1 that cycle
+            lasts longer than a period, and answers may be late.
+    """
+
+    mean: float
+    worst: float
+    start: float
+
+    @property
+    def allowed(self) -> bool:
+        """Whether a recording may take that."""
+        return self.mean <= LARGEST_MEAN and self.worst <= LARGEST_WORST
+
+    def __str__(self) -> str:
+        return f"{100 * self.mean:.0f} % on average, {100 * self.worst:.0f} % at worst"
 
 
 def frame_bits(data_bytes: int) -> int:
@@ -20,16 +57,77 @@ def frame_bits(data_bytes: int) -> int:
     return stuffed + 13 + (stuffed - 1) // 4
 
 
-def answer_us(profiles: Iterable[DriveProfile], bitrate_bit_s: int) -> float:
+def usual_bits(data_bytes: int) -> float:
+    """The same frame with as many stuff bits as a recording's frames have on average."""
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + 13 + stuffed / STUFFING
+
+
+def answer_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> float:
     """How long SYNC and one answer of each axis occupy the bus at worst [µs].
 
     Args:
         profiles: of the axes, one each.
         bitrate_bit_s: of the bus.
     """
-    bits = frame_bits(0) + sum(
-        frame_bits(sum(entry.bits for entry in pdo) // 8)
-        for profile in profiles
-        for pdo in pack((profile.position, profile.current, STATUSWORD))
+    return 1e6 * (frame_bits(0) + sum(map(frame_bits, _answers(profiles)))) / bitrate_bit_s
+
+
+def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: int) -> BusLoad:
+    """What a recording takes of a bus.
+
+    Args:
+        profiles: of the axes on it, one each.
+        bitrate_bit_s: of the bus.
+        period_us: of SYNC.
+    """
+    period_bits = bitrate_bit_s * period_us * 1e-6
+    cycle = _cycle_bits(profiles)
+    setpoints = len(profiles) * usual_bits(_SETPOINT_BYTES[0])
+    return BusLoad(
+        mean=cycle / period_bits + _steady_bits_s(profiles) / bitrate_bit_s,
+        worst=answer_us(profiles, bitrate_bit_s) / period_us,
+        start=(cycle + setpoints) / period_bits,
     )
-    return 1e6 * bits / bitrate_bit_s
+
+
+def shortest_period_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> int | None:
+    """The shortest period at which a bus may carry a recording; None where heartbeats and moves alone are too much."""
+    left_bits_s = LARGEST_MEAN * bitrate_bit_s - _steady_bits_s(profiles)
+    if left_bits_s <= 0:
+        return None
+    mean_us = 1e6 * _cycle_bits(profiles) / left_bits_s
+    # A period that is exact up to rounding must not be refused by it.
+    return ceil(max(mean_us, answer_us(profiles, bitrate_bit_s) / LARGEST_WORST) - 1e-6)
+
+
+def split_answers(profile: DriveProfile) -> bool:
+    """Whether one PDO cannot hold an axis's answer, which then takes two frames."""
+    return len(pack(_feedback(profile))) > 1
+
+
+def _feedback(profile: DriveProfile) -> tuple[ObjectEntry, ...]:
+    return (profile.position, profile.current, STATUSWORD)
+
+
+def _bytes(pdo: Sequence[ObjectEntry]) -> int:
+    return sum(entry.bits for entry in pdo) // 8
+
+
+_SETPOINT_BYTES = tuple(map(_bytes, SETPOINT_PDOS))
+
+
+def _answers(profiles: Sequence[DriveProfile]) -> tuple[int, ...]:
+    """Bytes of every frame that answers one SYNC."""
+    return tuple(_bytes(pdo) for profile in profiles for pdo in pack(_feedback(profile)))
+
+
+def _cycle_bits(profiles: Sequence[DriveProfile]) -> float:
+    return usual_bits(0) + sum(map(usual_bits, _answers(profiles)))
+
+
+def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
+    """Of heartbeats, the recorder's among them, and of set-points, whatever the period is [bit/s]."""
+    heartbeats = (len(profiles) + 1) * usual_bits(1) * 1000.0 / HEARTBEAT_MS
+    first, *others = map(usual_bits, _SETPOINT_BYTES)
+    return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))

@@ -28,8 +28,12 @@ class Pacing(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Bus:
-    """How the bus is reached, as python-can names it; host and port are those of a socketcand hub."""
+    """How a bus is reached, as python-can names it; host and port are those of a socketcand hub.
 
+    The name is what people call it; the only bus of a cell has that of its channel.
+    """
+
+    name: str
     interface: str
     channel: str
     bitrate_bit_s: int
@@ -37,12 +41,17 @@ class Bus:
     port: int
 
 
+RECORDER, KERNEL = "recorder", "kernel"
+"""Producers of SYNC that are no axis: the recording program, or this machine's kernel (SocketCAN's BCM)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """The sampling period [µs], and what paces it."""
+    """The sampling period [µs], what paces it, and who sends it: RECORDER, KERNEL or the name of an axis."""
 
     period_us: int
     pacing: Pacing
+    producer: str = RECORDER
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +76,7 @@ class Axis:
     Attributes:
         name: of the axis.
         node_id, drive, profile, identity: of the amplifier; None in a cell that only imports recordings.
+        bus: name of the one that its amplifier is on; None in such a cell.
         counts_per_revolution: encoder counts a motor revolution; None where the import chooses its own count.
         unit: in which people read the joint: degrees, or mm where it is prismatic.
         zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint].
@@ -80,6 +90,7 @@ class Axis:
     drive: str | None
     profile: DriveProfile | None
     identity: Identity | None
+    bus: str | None
     counts_per_revolution: int | None
     unit: JointUnit
     zero_offset_rad: float
@@ -141,7 +152,8 @@ class Cell:
         urdf: text of the URDF.
         gravity_m_s2: in the base frame.
         ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m for a prismatic joint.
-        bus, sync: None in a cell that only imports recordings.
+        buses: on which the amplifiers are, nearly always one; none in a cell that only imports recordings.
+        sync: None in such a cell.
         axes: n of them.
         payloads: bodies that can be mounted.
         conditioning: the filters.
@@ -156,7 +168,7 @@ class Cell:
     urdf: str
     gravity_m_s2: tuple[float, float, float]
     ratio: FloatArray
-    bus: Bus | None
+    buses: tuple[Bus, ...]
     sync: Sync | None
     axes: tuple[Axis, ...]
     payloads: tuple[WeighedPayload, ...]
@@ -173,6 +185,11 @@ class Cell:
         if self.controller is None or self.folder is None:
             return None
         return (self.folder / self.controller.file).resolve()
+
+    @property
+    def wiring(self) -> tuple[tuple[Bus, tuple[Axis, ...]], ...]:
+        """Each bus with the axes on it."""
+        return tuple((bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses)
 
     @property
     def axis_names(self) -> tuple[str, ...]:

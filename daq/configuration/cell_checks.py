@@ -9,19 +9,17 @@ from math import hypot
 import numpy as np
 
 from daq.configuration.axis_checks import axis_faults
-from daq.configuration.bus_load import LARGEST_SHARE, answer_us
-from daq.configuration.cell import Pacing
+from daq.configuration.bus_checks import bus_faults
 from daq.configuration.cell_schema import CellModel, PayloadModel
 from daq.configuration.clearance import clearance_faults
 from daq.configuration.drive_train import ratio_of
+from daq.configuration.sync_checks import producer_faults
 from daq.configuration.yaml_file import Document, Fault, describe
 from daq.errors import ConfigurationInconsistent
 from drivers.profile import DriveProfile
 from ident.errors import ModelError
 from ident.robot import Joint, robot_from_urdf
 
-SIMULATED_INTERFACES = ("virtual", "socketcand")
-"""Buses on which a simulated cell can be; every other one may have a machine on it."""
 LARGEST_CONDITION = 1e8
 """Of R; above it, joint positions cannot be told from motor positions."""
 
@@ -44,8 +42,8 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
     joints, faults = _robot(model, urdf)
     faults += [
         *_ratio_faults(model),
-        *_bus_faults(model),
-        *_sync_faults(model, profiles),
+        *bus_faults(model, profiles),
+        *producer_faults(model),
         *axis_faults(model, joints, urdf),
         *_list_faults(model),
         *clearance_faults(model.workspace, model.clearance, [axis.name for axis in model.axes]),
@@ -82,57 +80,6 @@ def _ratio_faults(model: CellModel) -> Iterator[Fault]:
     condition = float(np.linalg.cond(ratio_of(model)))
     if not np.isfinite(condition) or condition > LARGEST_CONDITION:
         yield Fault(path, f"a singular matrix (condition {condition:.3g})", "one that can be inverted")
-
-
-def _bus_faults(model: CellModel) -> Iterator[Fault]:
-    if model.bus is None:
-        return
-    if model.sync is None:
-        yield Fault(("sync",), "nothing", "a sampling period, because the cell has a bus")
-    for index, axis in enumerate(model.axes):
-        for key in ("node_id", "drive", "identity", "counts_per_revolution"):
-            if getattr(axis, key) is None:
-                yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
-    used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
-    for index, axis in enumerate(model.axes):
-        if axis.node_id is None:
-            continue
-        if not 1 <= axis.node_id <= 127:
-            yield Fault(("axes", index, "node_id"), str(axis.node_id), "1 to 127 (CiA 301)")
-        if used[axis.node_id] > 1:
-            yield Fault(
-                ("axes", index, "node_id"), f"{axis.node_id}, used {used[axis.node_id]} times", "each node once"
-            )
-
-
-def _sync_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    if model.bus is None or model.sync is None:
-        return
-    if model.sync.pacing is Pacing.LOCKSTEP and model.bus.interface not in SIMULATED_INTERFACES:
-        yield Fault(
-            ("sync", "pacing"),
-            f"lockstep on a bus of interface {model.bus.interface}",
-            f"timed: lockstep makes the time of the samples up, which is true of a simulated cell "
-            f"({' or '.join(SIMULATED_INTERFACES)}) alone",
-        )
-    used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None]
-    answers_us = answer_us(used, model.bus.bitrate_bit_s)
-    # In lockstep the next SYNC waits for the answers, however long they take.
-    if model.sync.pacing is Pacing.TIMED and answers_us > LARGEST_SHARE * model.sync.period_us:
-        yield Fault(
-            ("sync", "period_us"),
-            f"{model.sync.period_us}, while SYNC and the answers of {len(used)} axes can take {answers_us:.0f} µs "
-            f"at {model.bus.bitrate_bit_s} bit/s",
-            f"{answers_us / LARGEST_SHARE:.0f} or more, or a faster bus",
-        )
-    for drive in model.drives:
-        refresh_us = profiles[drive].update_period_us
-        if refresh_us > model.sync.period_us:
-            yield Fault(
-                ("sync", "period_us"),
-                f"{model.sync.period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
-                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
-            )
 
 
 def _list_faults(model: CellModel) -> Iterator[Fault]:

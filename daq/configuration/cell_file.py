@@ -85,9 +85,9 @@ def cell_from_bundle(
         urdf=urdf,
         gravity_m_s2=model.robot.gravity_m_s2,
         ratio=ratio_of(model),
-        bus=None if model.bus is None else Bus(**model.bus.model_dump()),
+        buses=tuple(Bus(**bus.model_dump()) for bus in model.buses),
         sync=None if model.sync is None else Sync(**model.sync.model_dump()),
-        axes=tuple(_axis(axis, profiles) for axis in model.axes),
+        axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
         payloads=tuple(_payload(payload) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
         controller=None if model.controller is None else Controller(**model.controller.model_dump()),
@@ -151,7 +151,7 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
     )
 
 
-def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
+def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> Axis:
     limits, unit = model.limits, model.limits.unit
     # The schema lets exactly one of the three be given, the checks only those of the joint's kind.
     gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
@@ -165,6 +165,7 @@ def _axis(model: AxisModel, profiles: Mapping[str, DriveProfile]) -> Axis:
         drive=model.drive,
         profile=profile,
         identity=None if model.identity is None else Identity(**model.identity.model_dump()),
+        bus=bus,
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,
         zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),

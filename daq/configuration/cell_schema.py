@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
-from daq.configuration.cell import MotionPolicy, Pacing
+from daq.configuration.cell import RECORDER, MotionPolicy, Pacing
 from daq.configuration.clearance import ClearanceModel, WorkspaceModel
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE, JointUnit
-from daq.configuration.yaml_file import StrictModel
+from daq.configuration.yaml_file import StrictModel, not_in_file
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
 FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 Positive = Annotated[float, Field(gt=0)]
+ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
@@ -40,11 +41,30 @@ class BusModel(StrictModel):
     port: Annotated[int, Field(ge=1, le=65535)] = 29536
 
 
+class NamedBusModel(BusModel):
+    """One of several buses; the only one of a cell has the name of its channel."""
+
+    name: FileName
+
+
+def _how_many(value: object) -> str:
+    return SEVERAL_BUSES if isinstance(value, list | tuple) else ONE_BUS
+
+
+Buses = Annotated[
+    Annotated[BusModel, Tag(ONE_BUS)]
+    | Annotated[tuple[NamedBusModel, ...], Tag(SEVERAL_BUSES), Field(min_length=1, max_length=8)],
+    Discriminator(_how_many),
+]
+"""One bus, or a list of named ones."""
+
+
 class SyncModel(StrictModel):
     """The sampling."""
 
     period_us: Annotated[int, Field(ge=250, le=1_000_000)]
     pacing: Pacing = Pacing.TIMED
+    producer: Name = RECORDER
 
 
 class IdentityModel(StrictModel):
@@ -103,6 +123,7 @@ class AxisModel(StrictModel):
 
     name: Name
     node_id: int | None = None
+    bus: Name | None = None
     drive: Name | None = None
     identity: IdentityModel | None = None
     counts_per_revolution: Annotated[int, Field(gt=0, le=2**31)] | None = None
@@ -199,7 +220,7 @@ class CellModel(StrictModel):
     name: Name
     robot: RobotModel
     drive_train: DriveTrainModel
-    bus: BusModel | None = None
+    bus: Buses | None = None
     sync: SyncModel | None = None
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
@@ -208,6 +229,17 @@ class CellModel(StrictModel):
     workspace: WorkspaceModel | None = None
     clearance: ClearanceModel | None = None
     policy: PolicyModel = PolicyModel()
+
+    @property
+    def buses(self) -> tuple[NamedBusModel, ...]:
+        """All of them, by their names; none in a cell that only imports recordings."""
+        if self.bus is None or isinstance(self.bus, tuple):
+            return self.bus or ()
+        return (NamedBusModel(name=self.bus.channel, **self.bus.model_dump()),)
+
+    def bus_of(self, axis: AxisModel) -> str | None:
+        """Name of the bus of an axis; the only one needs not be named."""
+        return axis.bus or (self.buses[0].name if len(self.buses) == 1 else None)
 
     @property
     def drives(self) -> tuple[str, ...]:

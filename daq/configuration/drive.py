@@ -153,11 +153,12 @@ class FactsModel(StrictModel):
     update_period_us: FactModel
     rated: FactModel
     save: FactModel
+    toggle_bit: FactModel | None = None
 
     def facts(self) -> tuple[Fact, ...]:
         """As drivers takes them."""
-        told: dict[str, FactModel] = {name: getattr(self, name) for name in type(self).model_fields}
-        return tuple(Fact(name, fact.basis, fact.where) for name, fact in told.items())
+        told: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
+        return tuple(Fact(name, fact.basis, fact.where) for name, fact in told.items() if fact is not None)
 
 
 class DriveModel(StrictModel):
@@ -170,6 +171,8 @@ class DriveModel(StrictModel):
     amplitude: Amplitude
     tap: TapPoint
     saturation_bit: Annotated[int, Field(ge=0, le=15)] | None = None
+    toggle_bit: Literal[8, 14, 15] | None = None
+    """Those that CiA 402 leaves to the maker; the others mean something in profile position mode."""
     update_period_us: Annotated[int, Field(gt=0)]
     rated: RatedModel | None = None
     save: SaveModel | None = None
@@ -178,6 +181,12 @@ class DriveModel(StrictModel):
     eds: Annotated[str, Field(pattern=r"^[^/\\\x00]+$", max_length=200)] | None = None
     """File beside the profile, the maker's data sheet; a log carries it."""
     facts: FactsModel | None = None
+
+    @model_validator(mode="after")
+    def _toggle_bit_and_source(self) -> DriveModel:
+        if self.facts is not None and (self.toggle_bit is None) != (self.facts.toggle_bit is None):
+            raise ValueError("toggle_bit and facts.toggle_bit, both or neither")
+        return self
 
 
 def drive_from_text(text: bytes, name: str) -> DriveProfile:
@@ -209,6 +218,7 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         facts=() if model.facts is None else model.facts.facts(),
         rated=None if model.rated is None else model.rated.rated(),
         save=None if model.save is None else model.save.save(),
+        toggle_bit=model.toggle_bit,
     )
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
+from daq.configuration.fault_scenario import AxisName, FaultModel, absent_axes, axis_index
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.resources import shipped_configurations
-from drivers.simulated.fault import FaultKind, FaultSpec
 from drivers.simulated.spec import AxisSpec, Body, CellSpec, Dialect, UndeclaredEffect
 
 Positive = Annotated[float, Field(gt=0)]
@@ -42,6 +41,7 @@ class AxisSpecModel(StrictModel):
     current_noise_a: NotNegative
     noise_correlation_s: NotNegative
     dialect: Dialect = Dialect.CIA402
+    toggle_bit: Literal[8, 14, 15] | None = None
 
 
 class BodyModel(StrictModel):
@@ -56,37 +56,8 @@ class EffectModel(StrictModel):
     """An undeclared effect."""
 
     name: Annotated[str, Field(min_length=1)]
-    axis: Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]
+    axis: AxisName
     parameters: dict[str, float] = Field(default_factory=dict)
-
-
-class FaultModel(StrictModel):
-    """Something that goes wrong; times count from power-on, in the time of the plant."""
-
-    fault: FaultKind
-    axis: Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)] | None = None
-    at_s: NotNegative | None = None
-    at_cycle: Annotated[int, Field(ge=0)] | None = None
-    for_s: Positive | None = None
-    cycles: Annotated[int, Field(ge=1)] | None = None
-    emcy_code: Annotated[int, Field(ge=0x1000, le=0xFFFF)] | None = None
-
-    @model_validator(mode="after")
-    def _one_spelling(self) -> FaultModel:
-        if self.at_s is not None and self.at_cycle is not None:
-            raise ValueError("at_s or at_cycle, not both")
-        if self.for_s is not None and self.cycles is not None:
-            raise ValueError("for_s or cycles, not both")
-        if (self.emcy_code is not None) != (self.fault is FaultKind.EMERGENCY):
-            raise ValueError("emcy_code for the fault emergency, and for no other")
-        return self
-
-    def spec(self, period_us: int) -> FaultSpec:
-        """In SYNCs."""
-        begin = self.at_cycle or 0 if self.at_s is None else round(self.at_s * 1e6 / period_us)
-        cycles = self.cycles if self.for_s is None else max(1, round(self.for_s * 1e6 / period_us))
-        axis = None if self.axis is None else axis_index(self.axis)
-        return FaultSpec(self.fault, axis, begin, cycles, self.emcy_code or 0)
 
 
 class SimulationModel(StrictModel):
@@ -152,12 +123,6 @@ def shipped_simulation(name: str = "demo") -> Path:
     return shipped_configurations() / "simulation" / f"{name}.yaml"
 
 
-def axis_index(axis: str | int) -> int:
-    """Index from 0 of an axis given as "J3" or by its number from 1."""
-    number = int(re.sub(r"^J", "", axis)) if isinstance(axis, str) else axis
-    return number - 1
-
-
 def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
     """Of each joint: degrees and millimetres, one of them None."""
     n = len(model.axes)
@@ -191,10 +156,6 @@ def _check(document: Document, model: SimulationModel) -> None:
         for index, effect in enumerate(model.effects)
         if axis_index(effect.axis) >= n
     ]
-    faults += [
-        Fault(("faults", index, "axis"), f"axis {fault.axis}", f"J1 to J{n}")
-        for index, fault in enumerate(model.faults)
-        if fault.axis is not None and axis_index(fault.axis) >= n
-    ]
+    faults += absent_axes(model.faults, n)
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")

@@ -25,6 +25,7 @@ MAX_EXPLAINED = 100
 """Faults for which the nearest known key is looked up; a hostile file has tens of thousands."""
 MAX_SHOWN = 8
 """Faults listed in one message."""
+_NOT_IN_FILE = "\0"
 
 
 class StrictModel(BaseModel):
@@ -153,6 +154,11 @@ def _refuse_bombs(text: bytes, name: str) -> None:
             )
 
 
+def not_in_file(kind: str) -> str:
+    """Tag of one kind of value where a key may have several: a part of pydantic's path that no file has."""
+    return _NOT_IN_FILE + kind
+
+
 def read_bytes(path: Path) -> bytes:
     """Bytes of a configuration file.
 
@@ -250,7 +256,7 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
 
 def _fault(item: Any, model: type[BaseModel]) -> Fault:
     """A validation error of pydantic as found and expected."""
-    path: Location = tuple(item["loc"])
+    path: Location = tuple(part for part in item["loc"] if not str(part).startswith(_NOT_IN_FILE))
     if item["type"] == "extra_forbidden":
         known = _known_keys(model, path[:-1])
         near = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)

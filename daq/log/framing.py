@@ -195,6 +195,10 @@ class RecordFile:
             remedy="the file was damaged after it was written; copy it again from where it was recorded",
         )
 
+    def foreign(self, found: str, expected: str) -> LogForeign:
+        """The error for MCAP that is no log of a cell."""
+        return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
+
     def definition(self, offset: int, opcode: int, body: bytes) -> McapRecord:
         """A schema or channel that stands inside the chunk at an offset."""
         if opcode == Opcode.SCHEMA:

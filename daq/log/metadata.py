@@ -41,6 +41,7 @@ class RunInfo:
         started_wall_ns: Unix time of the start [ns].
         started_monotonic_ns: the monotonic clock at the same moment [ns]; a clock jump shows in the difference.
         origin: where the samples came from: "recorded", or the import's sources.
+        speed: share of the plan's speed that the moves were made with; 1 but for a first run.
     """
 
     run_id: str
@@ -51,6 +52,7 @@ class RunInfo:
     started_wall_ns: int
     started_monotonic_ns: int
     origin: str = "recorded"
+    speed: float = 1.0
 
     @property
     def role(self) -> Role:
@@ -104,11 +106,12 @@ def run_record(info: RunInfo) -> dict[str, str]:
         "started_monotonic_ns": str(info.started_monotonic_ns),
         "wall_minus_monotonic_ns": str(info.wall_minus_monotonic_ns),
         "origin": info.origin,
+        "speed": repr(info.speed),
     }
 
 
 def run_from_record(record: Mapping[str, str]) -> RunInfo:
-    """What `run_record` wrote.
+    """What `run_record` wrote; logs of earlier versions say nothing of the speed.
 
     Raises:
         KeyError: an entry is missing.
@@ -128,6 +131,9 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     rate_hz = float(record["rate_hz"])
     if not 0.0 < rate_hz < 1e6:
         raise ValueError(f"sampling rate {record['rate_hz']!r}")
+    speed = float(record.get("speed", "1"))
+    if not 0.0 < speed <= 1.0:
+        raise ValueError(f"share of the plan's speed {record['speed']!r}")
     wall_ns = int(record["started_wall_ns"])
     if not 0 <= wall_ns < 2**63:
         raise ValueError(f"start time {record['started_wall_ns']!r}")
@@ -140,6 +146,7 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         started_wall_ns=wall_ns,
         started_monotonic_ns=int(record["started_monotonic_ns"]),
         origin=record["origin"],
+        speed=speed,
     )
 
 

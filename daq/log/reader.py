@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
 from numpy.typing import NDArray
 
-from daq.errors import LogForeign, LogIncomplete, LogMissing, LogUnreadable
+from daq.errors import LogIncomplete, LogMissing, LogUnreadable
+from daq.log.chunk import ChunkContents
 from daq.log.framing import UNFINISHED, RecordFile
-from daq.log.message import (
-    ENCAPSULATION_WORD,
-    EVENTS_SCHEMA,
-    EVENTS_TOPIC,
-    LARGEST_AXES,
-    SAMPLES_SCHEMA,
-    SAMPLES_TOPIC,
-    event_from_bytes,
-    sample_dtype,
-)
+from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC
 from daq.log.metadata import (
     RUN,
     SEAL,
@@ -38,7 +28,6 @@ from daq.log.readback import NAME as READBACK
 from daq.log.readback import Readback, readback_from_bytes
 from drivers.event import CellEvent
 
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 BLOCK_SAMPLES = 4096
 """That a block has before it is handed out; so many and one chunk are in memory at most."""
 
@@ -117,11 +106,9 @@ class LogReader:
     def __init__(self, path: Path) -> None:
         """Store the path."""
         self.path = path
-        self.events: list[CellEvent] = []
         self.damage: LogUnreadable | None = None
         self._file = RecordFile(path)
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._chunks = ChunkContents(self._file)
         self._attachments: dict[str, bytes] = {}
         self._metadata: dict[str, dict[str, str]] = {}
 
@@ -141,6 +128,11 @@ class LogReader:
             raise
         except LogUnreadable as damage:
             self.damage = damage
+
+    @property
+    def events(self) -> list[CellEvent]:
+        """Those that have been read."""
+        return self._chunks.events
 
     @property
     def whole_bytes(self) -> int:
@@ -184,11 +176,11 @@ class LogReader:
             elif isinstance(record, Metadata):
                 self._metadata[record.name] = self._entries(offset, record)
             elif isinstance(record, Header) and record.profile != "ros2":
-                raise self._foreign(f"profile {record.profile!r}", "ros2")
+                raise self._file.foreign(f"profile {record.profile!r}", "ros2")
             elif isinstance(record, Chunk):
-                yield from self._chunk(offset, self._file.unpack(offset, record))
+                yield from self._chunks.samples(offset, self._file.unpack(offset, record))
             else:
-                self._define(record)
+                self._chunks.define(record)
 
     @property
     def digest(self) -> str:
@@ -234,89 +226,6 @@ class LogReader:
         """See `Log.partial`; once the iteration has ended."""
         return _partial(self.path, self.statistics)
 
-    def _chunk(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Samples of a chunk: at once when it holds nothing else, else picked one by one."""
-        start = self._definitions(offset, data)
-        if start == len(data):
-            return
-        head = self._message_head(offset, data, start)
-        if self._topic(head[2]) == SAMPLES_TOPIC:
-            count, rest = divmod(len(data) - start, 9 + head[1])
-            axes = self._axes(offset, head[1])
-            if not rest:
-                records = np.frombuffer(data, dtype=sample_dtype(axes), count=count, offset=start)
-                words = zip((records[name] for name in ("opcode", "length", "channel")), head[:3], strict=True)
-                if all((column == word).all() for column, word in words):
-                    yield offset, records
-                    return
-        yield from self._mixed(offset, data, start)
-
-    def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """A chunk of events and viewers' topics, or one that another tool has packed anew."""
-        samples: list[bytes] = []
-        while start < len(data):
-            opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
-            record = data[start : start + 9 + length]
-            start += 9 + length
-            if opcode != Opcode.MESSAGE:
-                continue
-            topic = self._topic(channel)
-            if topic == SAMPLES_TOPIC:
-                samples.append(record)
-            elif topic == EVENTS_TOPIC:
-                try:
-                    self.events.append(event_from_bytes(record[_MESSAGE_HEAD.size :]))
-                except (ValueError, struct.error) as error:
-                    raise self._file.corrupt(offset, f"a broken event ({error})", EVENTS_SCHEMA) from error
-        if samples:
-            axes = self._axes(offset, len(samples[0]) - 9)
-            dtype = sample_dtype(axes)
-            if any(len(sample) != dtype.itemsize for sample in samples):
-                raise self._file.corrupt(offset, "samples of different sizes", "one number of axes")
-            yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
-
-    def _definitions(self, offset: int, data: bytes) -> int:
-        """Take the schemas and channels at the start of a chunk; position of the first message."""
-        start = 0
-        while start < len(data) and data[start] != Opcode.MESSAGE:
-            end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
-            if end > len(data):
-                raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")
-            if data[start] in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                self._define(self._file.definition(offset, data[start], data[start + 9 : end]))
-            start = end
-        return start
-
-    def _define(self, record: McapRecord) -> None:
-        if isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, Channel):
-            schema = self._schemas.get(record.schema_id)
-            expected = {SAMPLES_TOPIC: SAMPLES_SCHEMA, EVENTS_TOPIC: EVENTS_SCHEMA}.get(record.topic)
-            name = schema.name if schema else "no schema"
-            if expected and (record.message_encoding != "cdr" or name != expected):
-                raise self._foreign(f"{record.topic} as {name} in {record.message_encoding!r}", f"{expected} in 'cdr'")
-            self._channels[record.id] = record
-
-    def _message_head(self, offset: int, data: bytes, start: int) -> tuple[int, int, int, int, int, int]:
-        if start + _MESSAGE_HEAD.size > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        opcode, length, channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(data, start)
-        if start + 9 + length > len(data):
-            raise self._file.corrupt(offset, "a message beyond the end of its chunk", "one inside")
-        return opcode, length, channel, sequence, log_time, publish_time
-
-    def _topic(self, channel: int) -> str:
-        known = self._channels.get(channel)
-        return known.topic if known else ""
-
-    def _axes(self, offset: int, length: int) -> int:
-        """Number of axes of samples of this length."""
-        for axes in range(1, LARGEST_AXES + 1):
-            if sample_dtype(axes).itemsize == 9 + length:
-                return axes
-        raise self._file.corrupt(offset, f"a sample of {length} bytes", f"1 to {LARGEST_AXES} axes")
-
     def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
         # As bytes: numpy would promote the fields of one type to those of the same type, chunk by chunk.
         records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
@@ -336,9 +245,6 @@ class LogReader:
             statusword=records["statusword"].astype(np.uint16),
             missing=records["missing"].astype(np.uint32),
         )
-
-    def _foreign(self, found: str, expected: str) -> LogForeign:
-        return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
 
     def _incomplete(self, error: Exception, expected: str) -> LogIncomplete:
         found = f"none ({error.args[0]!r})" if isinstance(error, KeyError) else str(error)

@@ -109,7 +109,7 @@ class LogWriter:
         self._samples = 0
         self._lost = 0
         self._missing = [0] * self._axes
-        self._last_cycle: int | None = None
+        self._highest_cycle: int | None = None
         self._flushed_recorded_ns = self._flushed_wall_ns = 0
         self._joint_state_due_ns = 0
         self._verdict = _Verdict()
@@ -269,9 +269,9 @@ class LogWriter:
 
     def _count(self, sample: Sample) -> None:
         self._samples += 1
-        if self._last_cycle is not None:
-            self._lost += max(0, sample.cycle - self._last_cycle - 1)
-        self._last_cycle = sample.cycle
+        if self._highest_cycle is not None:
+            self._lost += max(0, sample.cycle - self._highest_cycle - 1)
+        self._highest_cycle = max(sample.cycle, self._highest_cycle or 0)
         if sample.missing:
             for axis in range(self._axes):
                 self._missing[axis] += sample.missing >> axis & 1

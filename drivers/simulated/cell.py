@@ -1,18 +1,19 @@
-"""A whole simulated cell on a CAN bus: n nodes and one plant that advance in lockstep with SYNC."""
+"""A whole simulated cell on a CAN bus, or on several: n nodes and one plant that advance in lockstep with SYNC."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from types import TracebackType
 
 import can
 import numpy as np
 
+from drivers.errors import BusError
 from drivers.simulated.amplifier import AmplifierSet
-from drivers.simulated.disturbance import FOREIGN_SDO, Disturbance
+from drivers.simulated.disturbance import ERROR_FRAMES, FOREIGN_SDO, Disturbance
 from drivers.simulated.drive import ErrorCode
 from drivers.simulated.effects import build_effect
 from drivers.simulated.effects.lag import Lag
@@ -22,13 +23,12 @@ from drivers.simulated.node import NmtCommand, Node
 from drivers.simulated.plant import Plant
 from drivers.simulated.readings import Readings, take
 from drivers.simulated.spec import CellSpec
+from drivers.simulated.sync_gate import Cycles, SyncGate
 from drivers.simulated.tuning import tuned
+from drivers.split_bus import SplitBus
 
 SYNC_ID = 0x080
 NMT_ID = 0x000
-
-BUS_OFF_CLASS = 0x40
-"""Class of an error frame (linux/can/error.h)."""
 
 IDLE_S = 0.02
 """Longest sleep while no frame comes; heartbeats by wall time are as punctual as this."""
@@ -39,6 +39,7 @@ class SimulatedCell:
 
     Each SYNC (COB-ID 80h) moves the plant by one sync period and is answered with the transmit PDOs, so that a run
     takes as long as its computing takes, and equal frames give equal answers. SDO, NMT and heartbeats need no SYNC.
+    On several buses the plant moves when SYNC has come on all of them, and each node hears its own bus alone.
 
     As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread. What is
     mounted is part of the description: for another payload make another cell.
@@ -54,11 +55,12 @@ class SimulatedCell:
 
         Args:
             spec: the truth of the cell.
-            bus: any python-can bus that does not receive its own messages; it stays the caller's to shut down.
+            bus: any python-can bus that does not receive its own messages, or a split bus of several; it stays the
+                caller's to shut down.
             clock: seconds, for heartbeats while no SYNC comes.
 
         Raises:
-            SpecInvalid, EffectUnknown: the description is wrong.
+            SpecInvalid, EffectUnknown: the description is wrong, or a node is on none of the buses.
         """
         ids = [axis.node_id for axis in spec.axes]
         if len(set(ids)) < len(ids) or not all(1 <= node_id <= 127 for node_id in ids):
@@ -82,11 +84,18 @@ class SimulatedCell:
             Node(index, axis, self._amplifiers, self._current_readings, partial(self._send_of, index))
             for index, axis in enumerate(spec.axes)
         )
+        self._wires, there = _wires(bus, ids)
+        self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
+        self._gate = SyncGate(len(self._wires))
         self._disturbance = Disturbance(spec.faults)
         for index, node in enumerate(self.nodes):
             node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
             if self._disturbance.active(FaultKind.OTHER_SERIAL, index):
                 node.change_serial()
+            if self._disturbance.active(FaultKind.REFUSES_MAPPING, index):
+                node.lock_mapping()
+            if self._disturbance.active(FaultKind.SYNC_PRODUCER, index):
+                node.produce_sync()
             if self._disturbance.active(FaultKind.NO_GUARD, index):
                 node.lose_guard()
         self._by_id = {node.node_id: node for node in self.nodes}
@@ -123,24 +132,38 @@ class SimulatedCell:
         """Power on and answer until ``stop`` is called.
 
         Raises:
-            can.CanError: the bus has gone.
+            can.CanError, BusError: the bus has gone, or all buses have.
             FrictionUnsolved: the plant could not be advanced.
         """
         wall_s = self._clock()
         for node in self.nodes:
             node.boot(wall_s)
         while not self._stopping.is_set():
-            message = self._bus.recv(IDLE_S)
+            message = self._next_frame()
             if message is not None and not (
                 message.is_error_frame or message.is_remote_frame or message.is_extended_id
             ):
-                self._receive(message.arbitration_id, bytes(message.data))
+                self._receive(message)
+            elif message is None and self._gate.open:
+                self._run(self._gate.close())
             wall_s, now_us = self._clock(), self.time_us
             for node in self.nodes:
                 node.watch(wall_s)
                 node.beat(now_us, wall_s)
             if message is None and self._disturbance:
                 self._interfere()  # other masters do not wait for our SYNC
+
+    def _next_frame(self) -> can.Message | None:
+        try:
+            return self._bus.recv(IDLE_S)
+        except BusError:
+            if not self._goes_on():
+                raise
+            return None
+
+    def _goes_on(self) -> bool:
+        """Whether amplifiers are left on a bus when another one has failed."""
+        return isinstance(self._bus, SplitBus) and self._bus.alive
 
     @property
     def time_us(self) -> int:
@@ -153,10 +176,12 @@ class SimulatedCell:
         except Exception as error:  # noqa: BLE001 - kept whole and raised again in the thread that owns the cell
             self._failure = error
 
-    def _receive(self, can_id: int, data: bytes) -> None:
-        hearing = self._hearing()
+    def _receive(self, message: can.Message) -> None:
+        can_id, data = message.arbitration_id, bytes(message.data)
+        wire = self._wires.index(str(message.channel)) if len(self._wires) > 1 else 0
+        hearing = self._hearing(wire)
         if can_id == SYNC_ID:
-            self._advance()
+            self._receive_sync(wire)
         elif can_id == NMT_ID:
             if len(data) >= 2:
                 for node in hearing:
@@ -173,17 +198,35 @@ class SimulatedCell:
             for node in hearing:
                 node.receive_pdo(can_id, data)
 
-    def _hearing(self) -> tuple[Node, ...]:
+    def _hearing(self, wire: int) -> tuple[Node, ...]:
+        """Nodes that a frame on one of the buses reaches."""
         if not self._disturbance:
-            return self.nodes
-        return tuple(node for index, node in enumerate(self.nodes) if not self._disturbance.cut_off(index))
+            return self._on_wire[wire]
+        return tuple(
+            node
+            for index, node in enumerate(self.nodes)
+            if node in self._on_wire[wire] and not self._disturbance.cut_off(index)
+        )
+
+    def _receive_sync(self, wire: int) -> None:
+        if self._gate.late(wire):
+            for node in self._on_wire[wire]:
+                node.begin_cycle()
+                node.send_sync(self.time_us)
+            return
+        self._run(self._gate.arrive(wire))
+
+    def _run(self, cycles: Cycles) -> None:
+        for wires in cycles:
+            self._advance(wires)
 
     def _interfere(self) -> None:
         """Frames of other masters on this bus."""
         for index, node in enumerate(self.nodes):
             if self._disturbance.active(FaultKind.SDO_MASTER, index):
                 self._send(0x600 + node.node_id, FOREIGN_SDO)
-        if any(self._disturbance.active(FaultKind.SECOND_MASTER, index) for index in range(len(self.nodes))):
+        masters = (FaultKind.SECOND_MASTER, FaultKind.SYNC_PRODUCER)
+        if any(self._disturbance.active(kind, index) for kind in masters for index in range(len(self.nodes))):
             self._send(SYNC_ID, b"")
 
     def _begin_faults(self) -> None:
@@ -194,8 +237,9 @@ class SimulatedCell:
             for index, node in enumerate(self.nodes):
                 if fault.concerns(index):
                     self._strike(fault, node)
-            if fault.kind is FaultKind.BUS_OFF:
-                self._bus.send(can.Message(is_error_frame=True, arbitration_id=BUS_OFF_CLASS, data=bytes(8)))
+            if fault.kind in ERROR_FRAMES:
+                error_class, data = ERROR_FRAMES[fault.kind]
+                self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))
 
     def _strike(self, fault: FaultSpec, node: Node) -> None:
         if fault.kind is FaultKind.EMERGENCY:
@@ -209,9 +253,11 @@ class SimulatedCell:
         elif fault.kind is FaultKind.LOSES_POWER:
             node.drive.reset()
 
-    def _advance(self) -> None:
+    def _advance(self, wires: Collection[int]) -> None:
+        """One cycle, of which the nodes on these buses got a SYNC."""
         plant, amplifiers = self.plant, self._amplifiers
-        for node in self.nodes:
+        synchronised = [node for wire in sorted(wires) for node in self._on_wire[wire]]
+        for node in synchronised:
             node.begin_cycle()
         if self._disturbance:
             self._disturbance.cycle = self.cycles
@@ -235,7 +281,7 @@ class SimulatedCell:
         now_us = self.time_us
         for node in self.nodes:
             node.end_cycle()
-        for node in self.nodes:
+        for node in synchronised:
             node.send_sync(now_us)
 
     def _current_readings(self) -> Readings:
@@ -249,7 +295,22 @@ class SimulatedCell:
             self._send(*frame)
 
     def _send(self, can_id: int, data: bytes) -> None:
-        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        try:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        except BusError:
+            if not self._goes_on():
+                raise
+
+
+def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], tuple[frozenset[int], ...]]:
+    """Names of the buses, as received frames have them, and the node ids on each."""
+    if not isinstance(bus, SplitBus):
+        return ("",), (frozenset(node_ids),)
+    there = tuple(part.node_ids for part in bus.address.parts)
+    alone = sorted(set(node_ids).difference(*there))
+    if alone:
+        raise SpecInvalid(f"node {', '.join(map(str, alone))} is on none of the buses {bus.address}")
+    return tuple(map(str, bus.address.parts)), there
 
 
 def _compile(spec: CellSpec) -> None:

@@ -10,6 +10,11 @@ Frame = tuple[int, bytes]
 
 FOREIGN_SDO = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
 """Somebody reads 6041h."""
+ERROR_FRAMES = {
+    FaultKind.BUS_OFF: (0x040, bytes(8)),
+    FaultKind.ERROR_PASSIVE: (0x004, bytes((0, 0x30, 0, 0, 0, 0, 0, 0))),
+}
+"""Class and data of an error frame of this end's controller (linux/can/error.h): bus-off; both counters passive."""
 _FROZEN_BYTES = 6
 """Of a TPDO: position and current; the statusword behind them goes on."""
 
@@ -40,7 +45,7 @@ class Disturbance:
 
     def cut_off(self, axis: int) -> bool:
         """Whether an axis neither hears nor is heard."""
-        gone = any(f.kind is FaultKind.BUS_OFF and f.at_cycle <= self.cycle for f in self._faults)
+        gone = any(f.kind is FaultKind.BUS_OFF and f.active(self.cycle) for f in self._faults)
         return gone or self.active(FaultKind.SILENT, axis)
 
     def sent(self, axis: int, node_id: int, identifier: int, data: bytes) -> list[Frame]:
@@ -54,9 +59,10 @@ class Disturbance:
             return [frame]
         if self.active(FaultKind.LOST, axis):
             return []
-        if self.active(FaultKind.FROZEN, axis):
+        frozen, stale = self.active(FaultKind.FROZEN, axis), self.active(FaultKind.STALE, axis)
+        if frozen or stale:
             kept = self._frozen.setdefault(axis, data)
-            frame = (identifier, kept[:_FROZEN_BYTES] + data[_FROZEN_BYTES:])
+            frame = (identifier, kept if stale else kept[:_FROZEN_BYTES] + data[_FROZEN_BYTES:])
         else:
             self._frozen.pop(axis, None)
         if self.active(FaultKind.SHIFTED, axis):

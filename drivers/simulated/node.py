@@ -93,6 +93,8 @@ class Node:
         self._now_us = 0
         self._beat_us, self._beat_wall_s = 0, 0.0
         self._heard_wall_s: float | None = None
+        self._toggle = 0
+        self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
         self.obeys_nmt = True
 
     # -- NMT and error control -------------------------------------------------------------------------------------
@@ -158,6 +160,15 @@ class Node:
         """Become another amplifier of the same kind."""
         self._values[0x1018, 4] = self._number(0x1018, 4) + 1
 
+    def produce_sync(self) -> None:
+        """Become an amplifier that was left as the bus's SYNC producer (1005h bit 30); the cell sends for it."""
+        self._values[0x1005, 0] = self._number(0x1005) | 1 << 30
+
+    def lock_mapping(self) -> None:
+        """Become an amplifier whose transmit PDOs are what they are."""
+        for pdo in self._transmit:
+            pdo.locked = True
+
     def lose_guard(self) -> None:
         """Become an amplifier without consumer heartbeat."""
         for key in ((0x1016, 0), (0x1016, 1)):
@@ -197,7 +208,8 @@ class Node:
                 self._unpack(self._receive[number], data)
 
     def end_cycle(self) -> None:
-        """After the plant has moved: see to faults and waiting set-points."""
+        """After the plant has moved: see to faults and waiting set-points, and tell that the values are new."""
+        self._toggle ^= self._toggle_mask
         fault = self.drive.monitor(self._readings(), self._settings())
         if fault is not ErrorCode.NONE:
             self._emergency(fault)
@@ -298,7 +310,7 @@ class Node:
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
             0x2240: lambda: readings().position[i],
-            0x6041: lambda: drive.statusword(readings()),
+            0x6041: lambda: drive.statusword(readings()) | self._toggle,
             0x6061: lambda: self._number(0x6060),
             0x6062: lambda: readings().demand[i],
             0x6063: lambda: readings().position[i],

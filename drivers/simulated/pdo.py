@@ -69,6 +69,7 @@ class Pdo:
     Attributes:
         parameters: as written last.
         layout: struct of the mapped values, and its entries' (index, subindex); empty while the PDO is invalid.
+        locked: its mapping cannot be written.
     """
 
     def __init__(self, direction: Direction, parameters: PdoParameters, dictionary: Dictionary) -> None:
@@ -77,6 +78,7 @@ class Pdo:
         self.parameters = parameters
         self.layout = struct.Struct("<")
         self.mapped: tuple[tuple[int, int], ...] = ()
+        self.locked = False
         self.restore(parameters)
 
     @property
@@ -145,6 +147,8 @@ class Pdo:
 
     def write_mapping(self, subindex: int, data: bytes) -> None:
         """1600h and 1A00h records: COB-ID invalid, count 0, entries, count, COB-ID valid, in this order."""
+        if self.locked:
+            raise SdoAbort(READ_ONLY)
         if self.valid:
             raise SdoAbort(UNSUPPORTED_ACCESS)
         if subindex == 0:

@@ -58,6 +58,7 @@ class AxisSpec:
         current_noise_a: standard deviation of the noise of the current reference [A].
         noise_correlation_s: correlation time of that noise (first-order); 0 is white.
         dialect: whose objects tell its current.
+        toggle_bit: of statusword 6041h, which it inverts with every SYNC; None for an amplifier without.
     """
 
     node_id: int
@@ -78,6 +79,7 @@ class AxisSpec:
     current_noise_a: float
     noise_correlation_s: float
     dialect: Dialect = Dialect.CIA402
+    toggle_bit: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""`make bench`: speed and memory against figaroh, growth to 4 million samples, and the processor time of a whole fit.
+"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, and reading logs.
 
 Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
 Each job runs in a child process of its own, and this one stays small: Linux counts what a parent holds to the peak of
@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench.log_reading import told
+
 OUT = Path("out/bench")
 RESULT = Path("out/bench.json")
 FIGAROH_VENV = Path("out/bench-venv")
@@ -32,21 +34,24 @@ ENVIRONMENT = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREA
 
 
 def main() -> int:
-    """All three, one after the other."""
+    """All four, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3, help="of the comparison with figaroh; the median counts")
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="samples, of the growth")
+    parser.add_argument("--hour", type=int, default=3600, help="seconds of the long log that is read")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     comparison = _comparison(arguments.repeats)
     growth = _growth(tuple(size for size in SIZES if size <= arguments.largest))
     whole_fit = _whole_fit(arguments.repeats)
+    log_reading = _log_reading(arguments.hour)
     result = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": _machine(),
         "comparison": comparison,
         "growth": growth,
         "fit": whole_fit,
+        "log_reading": log_reading,
     }
     RESULT.write_text(json.dumps(result, indent=2) + "\n")
     _tell(f"\nwritten: {RESULT}")
@@ -122,6 +127,13 @@ def _whole_fit(repeats: int) -> dict[str, Any]:
     for run in runs:
         _tell(f"  user {run['user']:.2f} s, system {run['system']:.2f} s, peak {run['peak_mb']:.0f} MB")
     return {"seconds": seconds, "runs": runs}
+
+
+def _log_reading(hour_s: int) -> dict[str, Any]:
+    _tell("")
+    found = _json_of([sys.executable, "-m", "tests.bench.log_reading", "--json", "--hour", str(hour_s)])
+    _tell(told(found))
+    return found
 
 
 def _figaroh_python() -> Path:

@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from daq.configuration.cell import Pacing
-from daq.configuration.cell_bus import bus_address, drive_axes
+from daq.configuration.cell_bus import bus_address, bus_parts, cell_address, drive_axes
 from daq.configuration.cell_file import bundle, cell_from_bundle, load_cell
 from daq.configuration.drive import drive_from_text
 from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
 from daq.resources import shipped_configurations
+from drivers.bus import BusAddress
 from drivers.profile import Amplitude, ObjectEntry, TapPoint
+from drivers.split_bus import SplitAddress
+from tests.two_buses import LEFT, RIGHT, on_two_buses
 
 
 @pytest.fixture
@@ -55,7 +58,7 @@ def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
 
 def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/tx40.yaml")
-    assert cell.bus is None
+    assert cell.buses == ()
     assert cell.axes[1].zero_offset_rad == radians(-90)
     assert cell.axes[0].gain_unit == "Nm/Nm(motor, a priori)"
     with pytest.raises(ConfigurationInconsistent, match="no bus"):
@@ -191,3 +194,80 @@ def test_a_wrong_drive_profile_is_refused(old: str, new: str) -> None:
     assert drive_from_text(text.encode(), "x").saturation_bit == 11
     with pytest.raises(ConfigurationError):
         drive_from_text(text.replace(old, new, 1).encode(), "x")
+
+
+@pytest.fixture
+def two_buses(configurations: Path) -> Path:
+    """The demo cell on two."""
+    path = configurations / "cells/demo.yaml"
+    path.write_text(on_two_buses(path.read_text(encoding="utf-8"), "socketcan", "can0", "can1"), encoding="utf-8")
+    return _spoil(path, "pacing: lockstep", "pacing: timed")
+
+
+def test_a_cell_may_have_several_buses(two_buses: Path) -> None:
+    cell = load_cell(two_buses)
+    assert [axis.bus for axis in cell.axes] == ["left"] * 3 + ["right"] * 3
+    address = cell_address(cell)
+    assert isinstance(address, SplitAddress)
+    assert str(address) == "left (socketcan:can0) + right (socketcan:can1)"
+    assert [sorted(part.node_ids) for part in bus_parts(cell)] == [list(LEFT), list(RIGHT)]
+    with pytest.raises(ConfigurationInconsistent, match="2 buses; expected one"):
+        bus_address(cell)
+
+
+def test_a_list_of_one_bus_is_one_bus(configurations: Path) -> None:
+    path = configurations / "cells/demo.yaml"
+    listed = _spoil(path, "bus:\n  interface: virtual", "bus:\n  - name: main\n    interface: virtual")
+    cell = load_cell(_spoil(_spoil(listed, "  channel: demo", "    channel: demo"), "  bitrate", "    bitrate"))
+    assert cell_address(cell) == BusAddress("virtual", "demo")
+    assert {axis.bus for axis in cell.axes} == {"main"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("    bus: right\n", "", r"axes\[3\].bus: found nothing; expected the bus .* several: left, right"),
+        ("bus: right\n", "bus: middle\n", r"axes\[3\].bus: found middle, .* one of left, right"),
+        ("name: right", "name: left", r"bus\[1\].name: found left, used 2 times; expected each name once"),
+        ("channel: can1", "channel: can0", r"bus\[1\]: found socketcan can0, which bus left is too"),
+        ("node_id: 4", "node_id: 1", r"node_id: found 1, used 2 times; expected each node once, on all buses"),
+        (
+            "  - {name: right",
+            "  - {name: spare, interface: pcan, channel: x}\n  - {name: right",
+            "spare without an axi",
+        ),
+        ("pacing: timed", "pacing: lockstep", "lockstep on a bus of interface socketcan"),
+        ("pacing: timed", "pacing: timed\n  producer: J1", "J1, with 2 buses; expected recorder: one SYNC must"),
+        ("channel: can1", "channel: can1, bitrate_bit_s: 250000", r"load bus right by 1\d\d % .* at 250000 bit/s"),
+    ],
+)
+def test_two_buses_that_contradict_each_other_are_refused(two_buses: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(_spoil(two_buses, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("name: right, ", "", r"bus\[1\].name: found nothing"),
+        ("channel: can1", "chanel: can1", r"bus\[1\].chanel: found unknown key .*channel"),
+        ("channel: can1", "channel: 1", r"demo.yaml:\d+: bus\[1\].channel: found integer 1"),
+    ],
+)
+def test_a_misspelt_bus_of_several_is_refused_with_its_place(two_buses: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(_spoil(two_buses, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("  channel: demo", "  chanel: demo", r"demo.yaml:\d+: bus.chanel: found unknown key .*channel"),
+        ("  channel: demo", "  name: x", "bus.name: found unknown key"),
+    ],
+)
+def test_a_misspelt_single_bus_is_refused_with_its_place(
+    configurations: Path, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(_spoil(configurations / "cells/demo.yaml", old, new))

@@ -170,8 +170,7 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
     assert written == {path for path in folder.rglob("*") if path.is_file()}
     cell = load_cell(folder / "cells/press-4.yaml")
     assert cell.name == "press-4"
-    assert cell.bus is not None
-    assert (cell.bus.interface, cell.bus.channel) == ("socketcan", "can0")
+    assert [(bus.interface, bus.channel) for bus in cell.buses] == [("socketcan", "can0")]
     assert cell.controller_path == folder / "controllers/press-4.yaml"
     assert cell.controller_path.is_file()
     assert load_import(folder / "imports/press-4.yaml").cell.resolve() == folder / "cells/press-4.yaml"

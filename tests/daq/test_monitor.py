@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.cli.app import main
-from daq.cli.monitor import bus_load_percent, describe, joint_positions, view
+from daq.cli.monitor import bus_loads_percent, describe, joint_positions, view
 from daq.configuration.bus_load import answer_us
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import drive_axes
@@ -106,7 +106,7 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(b
     assert reading.axes[2].rate_hz == pytest.approx(498 / 5.005, rel=1e-6)
     # SYNC and six answers in 10 ms, by the count that a recording is refused with.
     profiles = [axis.profile for axis in CELL.axes if axis.profile is not None]
-    assert bus_load_percent(CELL, reading) == pytest.approx(answer_us(profiles, 1_000_000) / 100.0, rel=0.01)
+    assert bus_loads_percent(CELL, reading)[0] == pytest.approx(answer_us(profiles, 1_000_000) / 100.0, rel=0.01)
 
 
 def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: QuietBus) -> None:
@@ -136,7 +136,7 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus) -> None:
     reading = monitor.watch(5.0)
     assert all(axis.rate_hz == pytest.approx(1 / READING_S, rel=0.15) for axis in reading.axes)
     assert answered == pytest.approx(6 * 3 * 5.0 / READING_S, rel=0.15)
-    assert bus_load_percent(CELL, reading) < 6.0
+    assert bus_loads_percent(CELL, reading)[0] < 6.0
 
 
 @pytest.mark.parametrize("identifier", [0x000, 0x080, 0x601])
@@ -178,14 +178,14 @@ def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(joints: 
 
 def _reading(counts: list[int | None]) -> CellReading:
     axes = tuple(AxisReading(count, 5, 0x237, 5, 10.0, 0) for count in counts)
-    return CellReading(Source.ASKED, 0.5, axes, 0.0, (0,) * 9, ())
+    return CellReading(Source.ASKED, 0.5, axes, 0.0, ((0,) * 9,), ())
 
 
 def test_what_is_not_known_is_shown_as_that() -> None:
     out = io.StringIO()
     dead = AxisReading(None, None, None, None, 0.0, 3)
     reading = _reading([0] * 6)
-    reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, (0,) * 9, ())
+    reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
     document = describe(CELL, reading, [0.002, None, None, None, None, None], ["a\x1b[2Jb"])
     Console(file=out, width=100).print(view(document))
     text = out.getvalue()

@@ -11,9 +11,10 @@ from rich.console import Console
 
 from daq.cli.scan import scan_rows, scan_table
 from daq.configuration.cell import Cell
-from daq.configuration.cell_file import load_cell
+from daq.configuration.cell_file import bundle, cell_from_bundle, load_cell
 from drivers.axis import Identity
 from drivers.scan import FoundNode
+from tests.two_buses import on_two_buses
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes), width))
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo"), width))
     return out.getvalue()
 
 
@@ -48,7 +49,7 @@ def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
 )
 def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled: bool | None) -> None:
     nodes = (_node(1, 0x250), _node(2, statusword))
-    rows = scan_rows(cell, nodes)
+    rows = scan_rows(cell, nodes, "demo")
     assert [row["enabled"] for row in rows] == [False, enabled, None, None, None, None]
     assert [row["verdict"] for row in rows] == ["ok", "ok", *["missing"] * 4]
     for width in (40, 80, 200):
@@ -66,5 +67,32 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> Non
 
 
 def test_identity_and_power_are_told_apart(cell: Cell) -> None:
-    (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),))
+    (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
     assert (row["verdict"], row["enabled"]) == ("other identity", True)
+
+
+@pytest.fixture(scope="module")
+def two(checkout: Path) -> Cell:
+    """The demo cell on two buses."""
+    files = bundle(checkout / "configs/cells/demo.yaml")
+    text = on_two_buses(files["cell.yaml"].decode(), "virtual", "a", "b")
+    return cell_from_bundle({**files, "cell.yaml": text.encode()})
+
+
+def test_a_node_is_told_where_it_is_and_where_it_belongs(two: Cell) -> None:
+    left = scan_rows(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
+    assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in left] == [
+        ("left", 1, "J1", "ok"),
+        ("left", 2, "J2", "ok"),
+        ("left", 3, "J3", "missing"),
+        ("left", 4, None, "belongs on right"),
+        ("left", 9, None, "not configured"),
+    ]
+    right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
+    assert [row["verdict"] for row in right] == ["ok"] * 3
+    out = io.StringIO()
+    Console(file=out, width=50, soft_wrap=True).print(scan_table(left + right, 50, several=True))
+    heading, _, *lines = out.getvalue().splitlines()
+    assert heading.split()[:2] == ["bus", "node"]
+    assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3
+    assert "belongs on right" in out.getvalue()

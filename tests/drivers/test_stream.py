@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import BusError, DriveFault, HeartbeatLost, SampleLost
+from drivers.errors import BusBusy, BusError, DriveFault, HeartbeatLost, SampleLost
 from drivers.event import CellEvent, EventKind
-from drivers.pacing import LockstepSync, TimedSync
+from drivers.pacing import FollowedSync, LockstepSync, TimedSync
+from drivers.producer import steered_us
+from drivers.socketcan import CapturedMessage, Losses
+from drivers.stranger import SyncRate
 from drivers.stream import StreamStatistics, SyncStream
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
@@ -304,3 +307,253 @@ def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -
                     assert sample.position_counts[axis] == sample.cycle
         assert stream.statistics.missing == len(dropped)
         bus.tamper = lambda m: (m,)
+
+
+class Producer:
+    """Somebody who sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
+
+    Attributes:
+        pulses: SYNCs sent.
+        steered: what the stream said that it saw.
+    """
+
+    def __init__(self, bus: ScriptedBus) -> None:
+        self._bus = bus
+        self.pulses = 0
+        self.at_ns = bus.clock.now_ns
+        self.steered: list[tuple[int, int]] = []
+
+    def pulse(self, after_ns: int = PERIOD_NS, local: bool = True) -> None:
+        """A SYNC so long after the last one, and its answers."""
+        self.at_ns += after_ns
+        sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False)
+        sync.kernel_ns, sync.monotonic_ns, sync.local = 0, self.at_ns, local
+        self._bus.inject(sync)
+        for node in self._bus.nodes:
+            node.position = self.pulses
+            for answer in node.on_sync(self.pulses):
+                for frame in self._bus.tamper(answer):
+                    self._bus.inject(frame)
+        self.pulses += 1
+
+    def seen(self, monotonic_ns: int, periods: int) -> None:
+        self.steered.append((monotonic_ns, periods))
+
+
+Followed = tuple[SyncStream, ScriptedBus, Producer, list[CellEvent]]
+
+
+def followed_stream() -> Iterator[Followed]:
+    network, bus = cell()
+    events: list[CellEvent] = []
+    with network:
+        network.prepare()
+        for node in bus.nodes:
+            node.beats = False
+        network.link.sync_producer = "J1"
+        producer = Producer(bus)
+        pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.01, seen=producer.seen, start_ns=77, clock=bus.clock)
+        stream = SyncStream(network, pacing, events.append)
+        receive = bus.recv
+
+        def recv(timeout: float | None = None) -> can.Message | None:
+            message = receive(timeout)
+            if message is None and timeout == 0.0 and producer.pulses == 0:
+                producer.pulse()  # the first: once the stream has thrown away what waited before it began
+            return message
+
+        bus.recv = recv  # type: ignore[method-assign]
+        yield stream, bus, producer, events
+        bus.tamper = lambda message: (message,)
+        for node in bus.nodes:
+            node.beats, node.nmt = True, 5
+
+
+@pytest.fixture
+def followed() -> Iterator[Followed]:
+    yield from followed_stream()
+
+
+def test_a_followed_sync_opens_a_cycle_with_its_own_time(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    sent = len(bus.sent)
+    samples = [next(stream)]
+    for _ in range(4):
+        producer.pulse()
+        bus.clock.now_ns += 7 * PERIOD_NS  # when it is read is nobody's concern
+        samples.append(next(stream))
+    assert [sample.cycle for sample in samples] == list(range(5))
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
+    assert len(bus.sent) == sent
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    assert [periods for _, periods in producer.steered] == [0, 1, 1, 1, 1]
+
+
+def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
+    """A thousand cycles wait; they are told apart by their order, not by the clock."""
+    stream, bus, producer, _ = followed
+    next(stream)
+    for _ in range(1000):
+        producer.pulse()
+    bus.clock.now_ns += 10**12
+    samples = [stream.advance() for _ in range(1000)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(1, 1001)]
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(1, 1001)]
+    assert stream.statistics == StreamStatistics(cycles=1001, frames=2002)
+    with pytest.raises(BusError, match=r"read 1000\.0 s late"):  # but axes do not move on such old news
+        stream.check()
+    stream.check()
+
+
+def test_a_sync_that_did_not_come_is_a_period_that_was_left_out(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    next(stream)
+    producer.pulse(3 * PERIOD_NS)
+    producer.pulse(PERIOD_NS // 2 * 3 - 1)  # late, but none is missing
+    samples = [next(stream), next(stream)]
+    assert [sample.cycle for sample in samples] == [3, 4]
+    assert stream.statistics.skipped_periods == 2
+
+
+def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.tamper = lambda m: () if m.arbitration_id == 0x182 else (m,)
+    producer.pulse()
+    bus.tamper = lambda message: (message,)
+    producer.pulse()
+    producer.pulse()
+    samples = [next(stream) for _ in range(3)]
+    assert [sample.missing for sample in samples] == [2, 0, 0]
+    assert [sample.position_counts for sample in samples] == [(1, 0), (2, 2), (3, 3)]
+    assert stream.statistics == StreamStatistics(cycles=4, frames=7, missing=1)
+
+
+def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    frame = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6))
+    stream.send((frame,))
+    producer.pulse()
+    next(stream)
+    assert bus.sent[-1] is frame
+
+
+def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(followed: Followed) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    last_ns = stream.time_ns
+    assert stream.advance().missing == 0  # by a SYNC of ours
+    lost = next(event for event in events if event.kind is EventKind.SYNC_LOST)
+    assert lost.time_ns == last_ns
+    with pytest.raises(BusError, match=r"no SYNC from J1 for 0\.01 s"):
+        next(stream)
+    before = bus.cycle
+    assert [stream.advance().missing for _ in range(3)] == [0, 0, 0]
+    assert bus.cycle == before + 3
+
+
+def test_a_second_producer_is_another_master(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    next(stream)
+    with pytest.raises(BusBusy, match="a SYNC"):
+        for _ in range(20):
+            producer.pulse(PERIOD_NS // 2)
+            next(stream)
+    assert producer.pulses < 12
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(-400_000, 400_000), min_size=50, max_size=50))
+def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
+    rate, before_ns = SyncRate(PERIOD_NS), 0
+    for number, late in enumerate(late_ns, start=1):
+        at_ns = number * PERIOD_NS * 9999 // 10000 + late  # and its clock is 100 ppm fast
+        assert not rate.too_fast(at_ns - before_ns)
+        before_ns = at_ns
+
+
+def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    stream.pacing = FollowedSync(PERIOD_NS, "the kernel", in_kernel=True, timeout_s=0.01, clock=stream.pacing.clock)
+    next(stream)
+    producer.pulse(local=False)
+    next(stream)
+    with pytest.raises(BusBusy, match="a SYNC"):
+        next(stream)
+
+
+@settings(deadline=None)
+@given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
+def test_every_answer_dropped_from_a_followed_cycle_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
+    for stream, bus, producer, _ in followed_stream():
+        stream.max_missing_cycles = 40
+        next(stream)
+        bus.tamper = lambda m, p=producer: () if (p.pulses - 1, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
+        for _ in range(31):
+            producer.pulse()
+        samples = [next(stream) for _ in range(30)]
+        for number, sample in enumerate(samples):
+            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (number, cob) in dropped)
+            assert sample.missing == expected
+            for axis in range(2):
+                if not sample.missing >> axis & 1:
+                    assert sample.position_counts[axis] == number + 1
+        assert stream.statistics.missing == len(dropped)
+        assert stream.statistics.late == 0
+
+
+@settings(deadline=None)
+@given(st.integers(250, 100_000), st.floats(0.0, 0.1), st.floats(-0.002, 0.002))
+def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise: float) -> None:
+    """Each interval becomes longer by what the timer is late: the schedule still keeps the period."""
+    interval_us, phase_ns, window = period_us, 0.0, max(8, round(250_000 / period_us))
+    for number in range(40):
+        lasts_ns = window * 1000 * (interval_us + late * period_us + (noise if number % 2 else -noise) * period_us)
+        late_ns = lasts_ns - window * 1000 * period_us
+        phase_ns += late_ns
+        interval_us = steered_us(period_us, interval_us, round(late_ns), round(phase_ns), window)
+    assert abs(phase_ns) < window * 1000 * (1.0 + 5 * abs(noise) * period_us)
+
+
+def test_frames_that_this_machine_lost_are_counted_and_told(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: nobody misses those
+    next(stream)
+    bus.losses = Losses(kernel=7, backlog=1, interface=4)  # type: ignore[attr-defined]
+    sample = next(stream)
+    next(stream)
+    assert stream.statistics == StreamStatistics(
+        cycles=3, frames=6, kernel_dropped=2, backlog_dropped=1, interface_dropped=4
+    )
+    told = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
+    assert [(event.code, event.time_ns) for event in told] == [(count, sample.time_ns) for count in (2, 4, 1)]
+
+
+def test_what_is_to_be_known_of_the_bus_is_told_at_the_start(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.remarks = ("a small buffer",)  # type: ignore[attr-defined]
+    next(stream)
+    next(stream)
+    assert [event.text for event in events if event.kind is EventKind.CAPTURE] == ["a small buffer"]
+
+
+def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
+    """Our own SYNC comes back with it, before its answers."""
+    stream, bus, _ = timed
+    send = bus.send
+
+    def echo(msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x80:
+            sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False, is_rx=False)
+            sync.kernel_ns, sync.local = 0, True
+            sync.monotonic_ns = bus.clock.now_ns + 1000 + 10 * (bus.cycle + 1)
+            bus.inject(sync)
+        send(msg, timeout)
+
+    bus.send = echo  # type: ignore[method-assign]
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.time_ns for sample in samples] == [77 + (PERIOD_NS + 10) * k for k in range(5)]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    bus.send = send  # type: ignore[method-assign]

@@ -21,6 +21,7 @@ from drivers.network import Bounds, CanopenNetwork
 from drivers.pacing import LockstepSync
 from drivers.sdo import SdoPolicy
 from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.errors import SdoAbort
 from drivers.simulated.fault import FaultSpec
 from drivers.simulated.node import Node
 from drivers.simulated.power_state import PowerState
@@ -34,6 +35,9 @@ STRIKE = 120
 """SYNCs since power-on: in the middle of the move, which begins at about 25 and takes more than 300."""
 
 
+Settings = tuple[tuple[tuple[bytes, ...], ...], ...]
+
+
 @dataclass
 class Outcome:
     """What became of a run.
@@ -43,7 +47,7 @@ class Outcome:
         events: in their order.
         statistics: of the stream; None when it never began.
         states: CiA 402 state of each axis at the end, read in the simulator.
-        settings: values of all nodes' 1017h, 6007h, 6060h and the parameters of their PDOs, before and after.
+        settings: of each node its 1016h:01, 1017h, 6007h, 6060h and the parameters of its PDOs, before and after.
         ended_cycle: SYNCs since power-on at the end.
         unguarded: what the network says of amplifiers that cannot watch it.
     """
@@ -52,7 +56,7 @@ class Outcome:
     events: list[CellEvent] = field(default_factory=list)
     statistics: StreamStatistics | None = None
     states: tuple[PowerState, ...] = ()
-    settings: tuple[object, object] = (None, None)
+    settings: tuple[Settings, Settings] = ((), ())
     ended_cycle: int = 0
     unguarded: tuple[str, ...] = ()
 
@@ -67,7 +71,12 @@ class Outcome:
     @property
     def restored(self) -> bool:
         """Whether all nodes have the settings from before."""
-        return self.settings[0] == self.settings[1]
+        return self.restored_axes == tuple(range(len(self.states)))
+
+    @property
+    def restored_axes(self) -> tuple[int, ...]:
+        """Nodes that have the settings from before."""
+        return tuple(axis for axis, (one, other) in enumerate(zip(*self.settings, strict=True)) if one == other)
 
     def told(self, kind: EventKind, axis: int | None = None) -> list[int]:
         """Cycles, counted as `FaultSpec.at_cycle` is, of the events of a kind."""
@@ -78,22 +87,33 @@ class Outcome:
         ]
 
 
-def settings_of(cell: SimulatedCell) -> object:
-    """What a recording changes and must give back."""
-    return [
-        [_settings(node, base, number) for base in (0x1400, 0x1800) for number in range(4)]
-        + [node.read(*key) for key in ((0x1017, 0), (0x6007, 0), (0x6060, 0))]
+def settings_of(cell: SimulatedCell) -> Settings:
+    """What a recording changes and must give back, of each node."""
+    return tuple(
+        (
+            *(_pdo(node, base, number) for base in (0x1400, 0x1800) for number in range(4)),
+            tuple(_value(node, *key) for key in ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6060, 0))),
+        )
         for node in cell.nodes
-    ]
+    )
 
 
-def _settings(node: Node, base: int, number: int) -> list[bytes]:
+def _pdo(node: Node, base: int, number: int) -> tuple[bytes, ...]:
     mapped = node.read(base + 0x200 + number, 0)[0]
     used = [node.read(base + 0x200 + number, sub) for sub in range(mapped + 1)]
-    return [node.read(base + number, 1), node.read(base + number, 2), *used]
+    return (node.read(base + number, 1), node.read(base + number, 2), *used)
 
 
-def run(name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int = 0) -> Outcome:
+def _value(node: Node, index: int, subindex: int) -> bytes:
+    try:
+        return node.read(index, subindex)
+    except SdoAbort:
+        return b""  # it was built without
+
+
+def run(
+    name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int = 0, toggle_bit: int | None = None
+) -> Outcome:
     """One move of all axes there and back in a cell with these faults.
 
     The driver's clock runs with the plant's time beside the wall's: a silence lasts as long in samples on a fast
@@ -104,10 +124,15 @@ def run(name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int =
         faults: of the cell.
         guard_ms: silence of the recorder that the amplifiers bear.
         afterwards: SYNCs of somebody else when the recorder has gone, to let the plant's time pass.
+        toggle_bit: of the amplifiers and of their profile.
     """
     address, outcome = BusAddress("virtual", f"faults {name}"), Outcome()
-    spec = replace(load_simulation(CONFIGS / "simulation" / "clean.yaml"), faults=faults)
-    axes = drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+    spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
+    spec = replace(spec, faults=faults, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in spec.axes))
+    axes = tuple(
+        replace(axis, profile=replace(axis.profile, toggle_bit=toggle_bit))
+        for axis in drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+    )
     bus: can.BusABC = open_bus(address)
     try:
         cell = SimulatedCell(spec, bus, lambda: time.monotonic() + cell.cycles * PERIOD_NS * 1e-9)

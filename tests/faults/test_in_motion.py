@@ -11,6 +11,7 @@ from drivers.errors import (
     BusError,
     CellSilent,
     DataFrozen,
+    DataStale,
     DriveFault,
     DriverError,
     HeartbeatLost,
@@ -36,6 +37,7 @@ class Promise:
         error, text: that ends the recording.
         event: that the log gets.
         within_cycles: from the fault to that event.
+        toggle_bit: of the amplifiers.
     """
 
     fault: FaultSpec
@@ -43,6 +45,7 @@ class Promise:
     text: str
     event: EventKind
     within_cycles: int
+    toggle_bit: int | None = None
 
 
 def at(kind: FaultKind, value: int = 0, cycles: int | None = None, axis: int | None = AXIS) -> FaultSpec:
@@ -62,6 +65,16 @@ STOPS = {
     "heartbeat": Promise(at(FaultKind.NO_HEARTBEAT), HeartbeatLost, "node 3: no heart", EventKind.HEARTBEAT_LOST, 330),
     "limit": Promise(at(FaultKind.LIMIT), LimitActive, "node 3: a limit acts for 0.5 s", EventKind.LIMIT, 2),
     "frozen": Promise(at(FaultKind.FROZEN), DataFrozen, "node 3: move 0: .* do not change", EventKind.FROZEN, 60),
+    "stale": Promise(at(FaultKind.STALE), DataFrozen, "node 3: move 0: .* do not change", EventKind.FROZEN, 60),
+    "stale, toggle bit": Promise(
+        at(FaultKind.STALE), DataStale, "node 3: statusword bit 14 has not toggled", EventKind.FROZEN, 2, toggle_bit=14
+    ),
+    "frozen, toggle bit": Promise(
+        at(FaultKind.FROZEN), DataFrozen, "node 3: move 0: .* do not change", EventKind.FROZEN, 60, toggle_bit=14
+    ),
+    "sync-producer": Promise(
+        at(FaultKind.SYNC_PRODUCER), BusBusy, r"a SYNC \(080h\) that we did not send", EventKind.BUS_BUSY, 2
+    ),
     "short-pdo": Promise(
         at(FaultKind.SHORT_PDO), PdoLengthWrong, "PDO 183h has 7 bytes, its mapping says 8", EventKind.PDO_LENGTH, 2
     ),
@@ -76,7 +89,7 @@ STOPS = {
 @pytest.mark.parametrize("name", STOPS)
 def test_a_fault_is_named_logged_in_time_and_stops_all_axes(name: str) -> None:
     promise = STOPS[name]
-    outcome = run(name, promise.fault)
+    outcome = run(name, promise.fault, toggle_bit=promise.toggle_bit)
     error = outcome.error
     assert isinstance(error, promise.error), error
     assert_matches(promise.text, error)
@@ -114,6 +127,7 @@ def test_an_axis_that_falls_silent_stops_the_others_and_is_shouted() -> None:
     assert set(others) == {PowerState.SWITCH_ON_DISABLED}
     assert [event.axis for event in outcome.events if event.kind is EventKind.STOP_UNCONFIRMED] == [AXIS]
     assert "node 3 did not answer" in " ".join(outcome.error.__notes__)
+    assert outcome.restored_axes == tuple(axis for axis in range(6) if axis != AXIS)
 
 
 def test_an_axis_that_is_cut_off_stops_by_itself_since_it_hears_no_recorder() -> None:
@@ -139,6 +153,20 @@ def test_a_single_bad_frame_is_counted_and_the_run_goes_on(kind: FaultKind, fiel
     assert outcome.error is None
     assert getattr(outcome.statistics, field) == 1
     assert outcome.powerless
+    assert outcome.restored
+
+
+def test_an_error_passive_controller_is_told_and_the_run_goes_on() -> None:
+    outcome = run("passive", at(FaultKind.ERROR_PASSIVE, axis=None))
+    assert outcome.error is None
+    assert outcome.told(EventKind.BUS_PASSIVE)[0] - STRIKE <= 2
+    assert outcome.restored
+
+
+def test_toggle_bits_of_a_sound_cell_are_no_fault_and_a_lost_frame_is_none_of_theirs() -> None:
+    outcome = run("toggles", at(FaultKind.LOST, cycles=2), toggle_bit=15)
+    assert outcome.error is None
+    assert not outcome.told(EventKind.FROZEN)
     assert outcome.restored
 
 

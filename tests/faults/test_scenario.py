@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import can
 import pytest
 
 from daq.cli.app import main
 from daq.cli.record import granted
 from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
-from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
+from daq.configuration.fault_scenario import load_scenario
+from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
 from daq.log.reader import read_log
 from drivers.bus import open_bus
 from drivers.event import EventKind
 from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.fault import FaultKind, FaultSpec
 from drivers.simulated.power_state import PowerState
+from drivers.simulated.spec import CellSpec
 from tests.faults.cells import CONFIGS
 
 PLAN = """format: drivegain-plan
@@ -106,3 +110,75 @@ def test_a_scenario_that_means_nothing_is_refused(tmp_path: Path, fault: str) ->
 def test_a_scenario_for_an_axis_that_the_cell_lacks_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationInconsistent, match="J7"):
         load_simulation(scenario(tmp_path, "  - {fault: lost, axis: J7}\n"))
+
+
+# -- a scenario file of faults alone -----------------------------------------------------------------------------------
+
+
+def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    built: list[CellSpec] = []
+
+    class Cell:
+        def __init__(self, spec: CellSpec, _bus: can.BusABC) -> None:
+            built.append(spec)
+
+        def serve_forever(self) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("daq.cli.simulate.SimulatedCell", Cell)
+    faults = tmp_path / "faults.yaml"
+    faults.write_text("faults:\n  - {fault: limit, axis: J2, at_s: 1.5}\n  - {fault: silent}\n", encoding="utf-8")
+    simulation = scenario(tmp_path, "  - {fault: lost, axis: 2, at_cycle: 7}\n")
+    arguments = ["simulate", str(simulation), "--interface", "virtual", "--channel", "scenario", "--faults"]
+    assert main([*arguments, str(faults)]) == ExitCode.OK
+    assert built[0].faults == (
+        FaultSpec(FaultKind.LOST, 1, 7),
+        FaultSpec(FaultKind.LIMIT, 1, 1500),
+        FaultSpec(FaultKind.SILENT),
+    )
+    assert "3 faults" in capsys.readouterr().out
+    assert main([*arguments, "faults-example"]) == ExitCode.OK
+    assert built[1].faults == built[0].faults[:1] + load_scenario(shipped_simulation("faults-example"), 6, 1000)
+
+
+def test_the_example_names_every_kind_of_fault() -> None:
+    text = shipped_simulation("faults-example").read_text(encoding="utf-8")
+    words = set(re.findall(r"^#   ?([a-z-]+)  |  ([a-z-]+)  ", text, re.MULTILINE))
+    assert {kind.value for kind in FaultKind} <= {word for pair in words for word in pair}
+    assert load_scenario(shipped_simulation("faults-example"), 6, 1000) == (
+        FaultSpec(FaultKind.LOST, 1, 1500, 1),
+        FaultSpec(FaultKind.EMERGENCY, 2, 4000, None, 0x7305),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "found"),
+    [
+        (
+            "faults:\n  - {fault: lost, axis: J7}\n",
+            ConfigurationInconsistent,
+            r"faults.yaml:2: faults\[0\].axis.*J1 to J6",
+        ),
+        ("faults:\n  - {fault: explodes}\n", SchemaMismatch, r"faults.yaml:2: faults\[0\].fault"),
+        ("faults:\n  - {fault: lost, axsi: J2}\n", SchemaMismatch, "axsi"),
+        ("faults: []\n", SchemaMismatch, "faults"),
+        ("- {fault: lost}\n", SchemaMismatch, "faults.yaml"),
+        ("seed: 1\nfaults:\n  - {fault: lost}\n", SchemaMismatch, "seed"),
+        (None, ConfigurationMissing, "faults.yaml"),
+    ],
+)
+def test_a_wrong_scenario_file_is_refused_with_its_line(
+    tmp_path: Path, text: str | None, error: type[Exception], found: str
+) -> None:
+    path = tmp_path / "faults.yaml"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    with pytest.raises(error, match=found):
+        load_scenario(path, 6, 1000)
+
+
+def test_the_help_of_simulate_shows_how_to_give_a_scenario(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--help"]) == ExitCode.OK
+    assert "drivegain simulate demo --payload disc --faults faults-example" in capsys.readouterr().out

@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -47,9 +47,13 @@ def write_simulation(folder: Path, period_us: int) -> Path:
 
 
 @contextmanager
-def simulated(simulation: Path, payload: str | None = None) -> Iterator[None]:
-    """`drivegain simulate` on vcan0 until the block ends."""
+def simulated(
+    simulation: Path, payload: str | None = None, buses: Mapping[str, Sequence[int]] | None = None
+) -> Iterator[None]:
+    """`drivegain simulate` on vcan0, or on several interfaces with their nodes, until the block ends."""
     command = [sys.executable, "-m", "daq", "simulate", str(simulation), "--interface", "socketcan"]
+    for channel, nodes in (buses or {}).items():
+        command += ["--bus", f"{channel}={','.join(map(str, nodes))}"]
     command += ["--channel", INTERFACE, *(() if payload is None else ("--payload", payload))]
     folder = CONFIGURATIONS.parent
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as process:

@@ -39,8 +39,10 @@ def main(folder: Path) -> None:
     _mount("sysfs", "/sys", "sysfs")
     for module in MODULES:
         _load(Path(job["modules"]) / f"{module}.ko")
-    for command in ("link set lo up", f"link add {job['interface']} type vcan", f"link set {job['interface']} up"):
-        subprocess.run(["ip", *command.split()], check=True)
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    for interface in job["interfaces"]:
+        for command in (f"link add {interface} type vcan", f"link set {interface} up"):
+            subprocess.run(["ip", *command.split()], check=True)
     _enter_root([str(folder), *([job["out"]] if job["out"] else [])])
     code = _run(job)
     (folder / "code").write_text(str(code), encoding="ascii")

@@ -1,4 +1,4 @@
-"""Run a command where the kernel has vcan0: here if this kernel can, else in a guest kernel (User-Mode Linux).
+"""Run a command where the kernel has vcan0 and vcan1: here if this kernel can, else in a guest (User-Mode Linux).
 
     python -m tests.vcan.run COMMAND ...
 
@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 
 INTERFACE = "vcan0"
+SECOND_INTERFACE = "vcan1"
 OUT = "DRIVEGAIN_VCAN_OUT"
 FAILED = 125
 """Exit code where the command could not be run at all."""
@@ -35,23 +36,25 @@ def main(command: Sequence[str]) -> int:
         return FAILED
     if (Path("/sys/class/net") / INTERFACE).exists():
         return subprocess.call(command)
-    if _make_interface():
+    made = tuple(name for name in (INTERFACE, SECOND_INTERFACE) if _make_interface(name))
+    if made:
         try:
             return subprocess.call(command)
         finally:
-            subprocess.call(["ip", "link", "delete", INTERFACE])
+            for name in made:
+                subprocess.call(["ip", "link", "delete", name])
     kernel = shutil.which("linux.uml")
     if kernel is None:
         return _say(f"this kernel has no vcan, and there is no linux.uml to bring one: {PACKAGES}")
     return _in_guest(kernel, command)
 
 
-def _make_interface() -> bool:
-    """Whether this kernel, and what we may do with it, gave us the interface."""
+def _make_interface(name: str) -> bool:
+    """Whether this kernel, and what we may do with it, gave us an interface of that name."""
     if shutil.which("ip") is None or os.geteuid() != 0:
         return False
-    add = subprocess.run(["ip", "link", "add", INTERFACE, "type", "vcan"], capture_output=True, check=False)
-    return add.returncode == 0 and subprocess.call(["ip", "link", "set", INTERFACE, "up"]) == 0
+    add = subprocess.run(["ip", "link", "add", name, "type", "vcan"], capture_output=True, check=False)
+    return add.returncode == 0 and subprocess.call(["ip", "link", "set", name, "up"]) == 0
 
 
 def _in_guest(kernel: str, command: Sequence[str]) -> int:
@@ -66,7 +69,7 @@ def _in_guest(kernel: str, command: Sequence[str]) -> int:
             "folder": str(Path.cwd()),
             "environment": dict(os.environ),
             "modules": str(modules),
-            "interface": INTERFACE,
+            "interfaces": [INTERFACE, SECOND_INTERFACE],
             "out": os.environ.get(OUT),
         }
         (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")

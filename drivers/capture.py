@@ -1,0 +1,320 @@
+"""The process that reads a SocketCAN bus, and nothing else: receive, stamp, hand on.
+
+    python capture.py SOCKET OUT INTERFACE [RECORDS]     (two inherited file descriptors by their numbers)
+
+It runs by its path, isolated and with the standard library alone, so that it is there in some milliseconds. Its parent
+sends on the same socket; only this process receives. Frames leave as records of fixed size; while the parent is busy
+they wait here, in a bounded backlog, and what overflows that is counted. It ends when the parent has gone.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from contextlib import suppress
+from enum import IntEnum
+from typing import NamedTuple
+
+SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
+MSG_OWN, MSG_LOCAL = 0x800, 0x4
+"""What linux/can/raw.h makes of MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
+BACKLOG_RECORDS = 1 << 20
+"""A hundred seconds of a full bus in 48 MiB."""
+BURST = 128
+"""Frames between two looks at the parent."""
+IDLE_MS = 20
+"""Silence after which losses are told that no frame came behind."""
+LOOK_NS = 200_000_000
+"""Between two looks at the interface's own counters, and at who the parent is."""
+INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
+"""Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
+_FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+_TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
+_DROPS = 8  # SK_MEMINFO_DROPS
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
+_SEND_BYTES = 1 << 16
+_PAUSE_NS = 200_000
+_CLOCK_STEP_NS = 1_000_000
+"""No slewing changes the difference of the two clocks that much between two bursts: somebody set the wall clock."""
+
+
+class Kind(IntEnum):
+    """What a record tells."""
+
+    READY = 0
+    FRAME = 1
+    LOSSES = 2
+    """Nothing but the counts, where no frame followed that could carry them."""
+    END = 3
+    """Nothing more will come; `can_id` is the error number."""
+
+
+class Record(NamedTuple):
+    """One frame, or a note of the capture process.
+
+    Attributes:
+        kernel_ns: when the kernel received the frame, by the wall clock [ns since 1970].
+        monotonic_ns: the same moment by the monotonic clock [ns].
+        kernel_dropped, interface_dropped, backlog_dropped: frames lost so far: in the socket's buffer, before it, and
+            in the backlog.
+        can_id: identifier and flags, as struct can_frame has them.
+        kind: a Kind.
+        length: of the data [bytes].
+        own, local: sent by this very socket, by any program of this machine.
+        data: eight bytes.
+    """
+
+    kernel_ns: int
+    monotonic_ns: int
+    kernel_dropped: int
+    interface_dropped: int
+    backlog_dropped: int
+    can_id: int
+    kind: int
+    length: int
+    own: bool
+    local: bool
+    data: bytes
+
+
+RECORD = struct.Struct("=qqQQQIBB??8s")
+
+
+class DropCounter:
+    """The kernel's drop counter of 32 bits, continued beyond them.
+
+    Attributes:
+        total: frames dropped since the first.
+    """
+
+    def __init__(self) -> None:
+        self.total = 0
+
+    def see(self, raw: int) -> int:
+        """Take a reading; returns the total.
+
+        A frame carries the count from when it was queued, and so may tell less than a reading of the socket did.
+        """
+        ahead = (raw - self.total) & 0xFFFF_FFFF
+        if ahead < 0x8000_0000:
+            self.total += ahead
+        return self.total
+
+
+class MonotonicTime:
+    """The kernel's wall-clock stamps on the monotonic clock, across settings of the wall clock.
+
+    The kernel stamps received frames by CLOCK_REALTIME alone. The difference of the clocks, read after each burst,
+    takes that to the monotonic clock; after a step of the wall clock a frame may still have been stamped before it.
+
+    Args:
+        wall_ns, monotonic_ns: both clocks, read together; no stamp becomes older than that.
+
+    Attributes:
+        offset_ns: wall minus monotonic time, as last known [ns].
+    """
+
+    def __init__(self, wall_ns: int, monotonic_ns: int) -> None:
+        self.offset_ns = wall_ns - monotonic_ns
+        self._last_ns = monotonic_ns
+
+    def of(self, stamp_ns: int, wall_ns: int, monotonic_ns: int) -> int:
+        """Monotonic time of a stamp [ns]; never before that of the one before, never after `monotonic_ns`.
+
+        Args:
+            stamp_ns: of the kernel.
+            wall_ns, monotonic_ns: both clocks, read together after the frame.
+        """
+        offset_ns = wall_ns - monotonic_ns
+        found_ns = stamp_ns - offset_ns
+        stepped = abs(offset_ns - self.offset_ns) > _CLOCK_STEP_NS
+        if stepped and not self._last_ns <= found_ns <= monotonic_ns:
+            found_ns = stamp_ns - self.offset_ns  # it is still from before the step
+        else:
+            self.offset_ns = offset_ns
+        self._last_ns = min(max(found_ns, self._last_ns), max(monotonic_ns, self._last_ns))
+        return self._last_ns
+
+
+class Capture:
+    """One bus and the parent that gets its frames.
+
+    Args:
+        bus: non-blocking use of a CAN_RAW socket, or of a packet socket that carries struct can_frame.
+        out: stream socket to the parent.
+        interface: name of the bus's interface, for its counters.
+        backlog_records: that may wait for the parent.
+    """
+
+    def __init__(
+        self, bus: socket.socket, out: socket.socket, interface: str, backlog_records: int = BACKLOG_RECORDS
+    ) -> None:
+        self._bus = bus
+        self._out = out
+        self._most_bytes = backlog_records * RECORD.size
+        self._backlog = bytearray()
+        self._drops = DropCounter()
+        self._now_ns = time.monotonic_ns()
+        self._time = MonotonicTime(time.time_ns(), self._now_ns)
+        self._backlog_dropped = self._interface_dropped = 0
+        self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
+        self._interface_before = self._read_interface()
+        self._told = (0, 0, 0)
+        self._frame = bytearray(_FRAME.size)
+
+    def run(self, parent: int) -> None:
+        """Capture until the parent has gone, or the bus has.
+
+        Args:
+            parent: its process id.
+        """
+        poller = select.poll()
+        poller.register(self._bus, select.POLLIN)
+        poller.register(self._out, 0)
+        bus_number, out_number = self._bus.fileno(), self._out.fileno()
+        self._note(Kind.READY)
+        look_ns, ended = self._now_ns + LOOK_NS, False
+        while not (ended and not self._backlog):
+            poller.modify(self._out, select.POLLOUT if self._backlog else 0)
+            ready = dict(poller.poll(IDLE_MS))
+            if ready.get(out_number, 0) & (select.POLLHUP | select.POLLERR):
+                return
+            if bus_number in ready:
+                number = self.receive()
+                if number:
+                    self._note(Kind.END, number)
+                    poller.unregister(self._bus)
+                    ended = True
+            elif not ready:
+                self._now_ns = time.monotonic_ns()
+                self._read_drops()
+            if not self.forward():
+                return
+            if self._now_ns >= look_ns:
+                look_ns = self._now_ns + LOOK_NS
+                self._interface_dropped = self._read_interface() - self._interface_before
+                if os.getppid() != parent:
+                    return  # somebody else holds the parent's end of the pair open
+
+    def receive(self) -> int:
+        """Take what has come, a burst at most; returns the error number that ended the bus, else 0."""
+        burst: list[tuple[int, int, bytes, int, int]] = []
+        number = 0
+        while len(burst) < BURST:
+            try:
+                size, ancillary, flags, _ = self._bus.recvmsg_into(
+                    (self._frame,), _ANCILLARY_BYTES, socket.MSG_DONTWAIT
+                )
+            except BlockingIOError:
+                break
+            except InterruptedError:
+                continue
+            except OSError as error:
+                number = error.errno or errno.EIO
+                break
+            if size == 0:
+                number = errno.ENODEV
+                break
+            stamp_ns = 0
+            for level, kind, data in ancillary:
+                if level == socket.SOL_SOCKET and kind == SCM_TIMESTAMPNS:
+                    seconds, rest_ns = _TIMESPEC.unpack(data)
+                    stamp_ns = seconds * 1_000_000_000 + rest_ns
+                elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
+                    self._drops.see(_U32.unpack(data)[0])
+            can_id, length, payload = _FRAME.unpack(self._frame)
+            burst.append((can_id, length, payload, stamp_ns, flags))
+        before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        now_ns = (before_ns + self._now_ns) // 2
+        if self._now_ns - before_ns > _PAUSE_NS:
+            wall_ns = now_ns + self._time.offset_ns  # somebody else ran between the readings: they belong not together
+        for can_id, length, payload, stamp_ns, flags in burst:
+            monotonic_ns = self._time.of(stamp_ns or wall_ns, wall_ns, now_ns)
+            self._keep(
+                Record(
+                    stamp_ns or wall_ns,
+                    monotonic_ns,
+                    self._drops.total,
+                    self._interface_dropped,
+                    self._backlog_dropped,
+                    can_id,
+                    Kind.FRAME,
+                    length,
+                    bool(flags & MSG_OWN),
+                    bool(flags & MSG_LOCAL),
+                    payload,
+                )
+            )
+        return number
+
+    def _keep(self, record: Record) -> None:
+        if len(self._backlog) >= self._most_bytes:
+            self._backlog_dropped += 1
+            return
+        self._backlog += RECORD.pack(*record)
+        self._told = (record.kernel_dropped, record.interface_dropped, record.backlog_dropped)
+
+    def _note(self, kind: Kind, number: int = 0) -> None:
+        """Into the backlog even when that is full: these are few."""
+        self._told = self._counts
+        self._backlog += RECORD.pack(0, 0, *self._told, number, kind, 0, False, False, bytes(8))
+
+    @property
+    def _counts(self) -> tuple[int, int, int]:
+        return (self._drops.total, self._interface_dropped, self._backlog_dropped)
+
+    def _read_interface(self) -> int:
+        total = 0
+        for name in self._counters:
+            try:
+                with open(name, "rb") as file:  # noqa: PTH123 - pathlib costs the start of this process some ms
+                    total += int(file.read())
+            except (OSError, ValueError):
+                continue  # it has gone, or does not count this
+        return total
+
+    def _read_drops(self) -> None:
+        """Ask the socket itself: a drop is told with the next frame, and there may be none."""
+        try:
+            told = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
+        except OSError:
+            return  # before Linux 4.12: then the next frame tells it
+        if len(told) == _MEMINFO.size:
+            self._drops.see(_MEMINFO.unpack(told)[_DROPS])
+
+    def forward(self) -> bool:
+        """Hand on what the parent takes without waiting; tells whether there is still a parent."""
+        try:
+            while self._backlog:
+                with memoryview(self._backlog) as waiting:
+                    sent = self._out.send(waiting[:_SEND_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+                del self._backlog[:sent]
+            if self._told != self._counts:
+                self._note(Kind.LOSSES)
+        except BlockingIOError:
+            pass
+        except OSError:
+            return False
+        return True
+
+
+def main(arguments: list[str]) -> None:
+    """Capture from one inherited socket to the other."""
+    # Ctrl-C is the parent's to handle: it stops the axes first, and needs to see them for that.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = os.getppid()
+    # It does little and may not wait for those who do much, where we may ask for that (root, CAP_SYS_NICE).
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    with socket.socket(fileno=int(arguments[0])) as bus, socket.socket(fileno=int(arguments[1])) as out:
+        Capture(bus, out, arguments[2], *map(int, arguments[3:])).run(parent)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

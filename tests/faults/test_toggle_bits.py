@@ -1,0 +1,73 @@
+"""The toggle bit of an amplifier: what its standing proves, and how soon."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.configuration.drive import drive_from_text
+from daq.errors import SchemaMismatch
+from drivers.axis import Axis
+from drivers.frozen import ToggleBits
+from tests.drivers.scripted import PROFILE
+from tests.faults.cells import CONFIGS
+
+PERIOD_NS = 1_000_000
+BIT = 14
+
+
+def told(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()) -> list[int]:
+    """Cycles in which the first of two axes is told; the second has no such bit."""
+    profile = replace(PROFILE, toggle_bit=BIT, update_period_us=update_period_us)
+    bits = ToggleBits((Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None)))
+    found = []
+    for cycle, value in enumerate(values):
+        lost = int(cycle in missing)
+        for axis, error in bits.stale(cycle * PERIOD_NS, (value << BIT | 0x27, 0x27), lost):
+            assert (axis, error.node_id, error.bit) == (0, 1, BIT)
+            found.append(cycle)
+    return found
+
+
+def test_a_bit_that_stands_is_told_once_after_two_periods() -> None:
+    assert told([0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1]) == [5, 11]
+
+
+@settings(deadline=None)
+@given(st.integers(1, 5), st.integers(0, 4), st.integers(5, 60))
+def test_an_amplifier_that_is_slower_than_sync_is_told_after_two_of_its_periods(
+    cycles_a_refresh: int, phase: int, hangs: int
+) -> None:
+    values = [(min(cycle, hangs) + phase) // cycles_a_refresh % 2 for cycle in range(hangs + 40)]
+    found = told(values, update_period_us=1000 * cycles_a_refresh)
+    assert len(found) == 1
+    assert hangs < found[0] <= hangs + 2 * cycles_a_refresh
+
+
+@settings(deadline=None)
+@given(st.sets(st.integers(0, 199)))
+def test_a_lost_frame_proves_nothing(lost: set[int]) -> None:
+    """The values repeat the last ones then, and how often the bit has changed meanwhile is not known."""
+    values: list[int] = []
+    for cycle in range(200):
+        values.append(values[-1] if cycle in lost and values else cycle % 2)
+    assert told(values, missing=tuple(lost)) == []
+
+
+def test_only_a_bit_that_is_the_makers_own_can_be_a_toggle_bit_and_it_needs_a_source() -> None:
+    text = (CONFIGS / "drives" / "generic-cia402.yaml").read_text(encoding="utf-8")
+    sourced = text + "  toggle_bit:\n    basis: manual\n    where: of some maker\n"
+    for spoiled in (
+        text.replace("tap:", "toggle_bit: 14\ntap:", 1),
+        sourced,
+        sourced.replace("tap:", "toggle_bit: 10\ntap:", 1),
+    ):
+        with pytest.raises(SchemaMismatch, match="toggle_bit"):
+            drive_from_text(spoiled.encode(), "spoiled.yaml")
+    profile = drive_from_text(sourced.replace("tap:", "toggle_bit: 14\ntap:", 1).encode(), "good.yaml")
+    assert profile.toggle_bit == 14
+    assert {fact.about for fact in profile.facts} >= {"toggle_bit", "save"}
