@@ -284,11 +284,14 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
 
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
     accepted = []
+    kept = fitted.steps[-1].after.effects if fitted.steps else ()
     before: Identification | Evidence = fitted.identification
     for step in fitted.steps:
         if step.accepted is None:
             continue
         placed = step.after.effects[-1]
+        if placed not in kept:
+            continue  # a later one has made it idle
         names = {column.name for column in placed.columns}
         error_before, error_after = _axis_error(before, placed.axis), _axis_error(step.after, placed.axis)
         accepted.append(

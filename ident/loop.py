@@ -10,20 +10,25 @@ from numpy.typing import NDArray
 
 from ident.conditioning import Conditioning
 from ident.dataset import Dataset, differentiate
+from ident.effects import EFFECTS
+from ident.effects.effect import Effect
 from ident.effects.placed import PlacedEffect
 from ident.effects.torque import effect_torque
 from ident.estimate import Estimate
 from ident.identify import Identification, estimate_with
+from ident.inquiry import ColumnCache, inquire
 from ident.model import Column, Model
 from ident.observation import Observation, observe
 from ident.relative_error import RelativeError
 from ident.run import Run
-from ident.search import Finding, Gates, find
-from ident.signals import signals
+from ident.search import Finding, Gates, choose, find, judge
+from ident.setting import refined
+from ident.signals import session_began_s, signals
+from ident.structure import detection_limits_nm, find_structure, is_inadequate
 
 FloatArray = NDArray[np.float64]
 
-MAX_EFFECTS = 6
+MAX_EFFECTS = 12
 """More than this on one robot means that the declared model is wrong, not that it lacks an effect."""
 
 
@@ -76,9 +81,20 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One turn of the loop: what was found, and the model with it."""
+    """One turn of the loop: what was found, and the model with it.
+
+    Attributes:
+        findings: named effects on all axes, the best on left-out moves first.
+        structures: smooth and periodic terms: on the axis of the best named effect, which must not be much worse than
+            they are, or on all axes where no named effect passed.
+        limits_nm: torque (root mean square) that an effect must have at each motor to be found, shape (n,).
+        accepted: the finding, or the structure that no name was found for, that joined the model; None ends the loop.
+        after: the model with it.
+    """
 
     findings: tuple[Finding, ...]
+    structures: tuple[Finding, ...]
+    limits_nm: FloatArray
     accepted: Finding | None
     after: Evidence
 
@@ -104,10 +120,10 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     Load and current are the model's predictions, so the columns are built twice: with the estimate before, and with
     the estimate that they led to.
     """
-    current = before
+    current, began_s = before, session_began_s(before.datasets)
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
     for _ in range(2):
-        runs = [signals(before.model, data, current.training, current.estimate) for data in before.datasets]
+        runs = [signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets]
         whole = before.bare
         for placed in effects:
             torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, whole.conditioning, before.model)
@@ -122,6 +138,7 @@ def close_the_loop(
     start: Evidence,
     rng: np.random.Generator,
     gates: Gates | None = None,
+    families: tuple[tuple[Effect, ...], ...] = EFFECTS,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Step, ...]:
     """Find what the residual asks for, add it, refit everything, and look again, until nothing passes the gates.
@@ -132,25 +149,53 @@ def close_the_loop(
         start: identified by ``ml``.
         rng: of the bootstrap.
         gates: what a candidate must show.
+        families: the dictionary.
         progress: told what is being done, in words.
 
     Returns:
         the turns taken; the last one has accepted nothing, unless MAX_EFFECTS was reached.
     """
+    gates = gates or Gates()
     steps: list[Step] = []
     current = start
+    cache: ColumnCache = {}
     for _ in range(MAX_EFFECTS):
         known = len(current.effects)
         progress("looking for an effect that the model lacks" + (f" beside the {known} found" if known else ""))
-        findings = find(current.model, start.trained, current.training, current.estimate, rng, gates)
-        accepted = next((finding for finding in findings if finding.passed), None)
+        inquiry = inquire(current.model, start.trained, current.training, current.estimate, cache)
+        findings = find(inquiry, rng, gates, families)
+        accepted = choose(findings)
+        axes = range(inquiry.axes) if accepted is None else (accepted.axis,)
         if accepted is None:
-            steps.append(Step(findings, None, current))
+            progress("looking for structure that no named effect explains")
+        structures = find_structure(inquiry, axes, rng, gates)
+        best = choose(structures)
+        if accepted is None or (best is not None and is_inadequate(accepted, best)):
+            accepted = best
+        limits_nm = detection_limits_nm(inquiry, gates)
+        if accepted is None:
+            steps.append(Step(findings, structures, limits_nm, None, current))
             break
+        accepted = replace(accepted, effect=refined(inquiry, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         current = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
-        steps.append(Step(findings, accepted, current))
+        current = _without_idle(current, rng, gates)
+        steps.append(Step(findings, structures, limits_nm, accepted, current))
     return tuple(steps)
+
+
+def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> Evidence:
+    """Take out what the effect that joined last has made idle: earlier ones on its axis must pass the gates anew."""
+    *earlier, last = current.effects
+    for placed in earlier:
+        if placed.axis != last.axis:
+            continue
+        rest = with_effects(current, tuple(other for other in current.effects if other != placed))
+        inquiry = inquire(rest.model, rest.trained, rest.training, rest.estimate)
+        (finding, *_) = judge(inquiry.folds, inquiry.test(((placed.effect,),), placed.axis), rng, gates) or (None,)
+        if finding is None or not finding.passed:
+            current = rest
+    return current
 
 
 def _parted(whole: Observation, held_out: int) -> tuple[Observation, Observation | None]:

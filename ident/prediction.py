@@ -45,8 +45,9 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
         placed, coefficients = placed_effect(accepted, calibration)
-        columns = coefficients @ placed.effect.columns(run, placed.axis)
-        torque += at_joints(placed.effect, placed.axis, columns[None], model.drive_train)[:, 0]
+        columns = placed.effect.columns(run, placed.axis)
+        at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
+        torque += np.einsum("p,npk->nk", coefficients, at_all)
     return torque
 
 

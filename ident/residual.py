@@ -21,18 +21,36 @@ IntArray = NDArray[np.int64]
 class Folds:
     """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
 
+    A block holds the rows of one motor in one move; what is wanted of a fold, a move or a motor is a sum over blocks.
+
     Attributes:
-        problem: the linearisation, its rows sorted by fold so that a fold is a slice and never a copy.
-        slices: rows of each fold.
-        factors: Cholesky factor of JᵀJ without each fold, with scipy's flag.
+        problem: the linearisation, its rows sorted by fold, move and motor.
+        moves: whole moves that the folds were dealt, whatever pieces the problem's clusters are.
+        blocks: rows of each block.
+        fold, move, motor: of each block, shape (blocks,).
+        whole: Cholesky factor of JᵀJ, with scipy's flag.
+        factors: the same without each fold.
         scores: Jᵀe without each fold, shape (folds, f).
-        residual: e of each row, predicted by a fit that did not see its fold, shape (rows,).
+        move_hessian, move_score: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f).
+        part_hessian, part_score: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f).
+        motor_score: Jᵀe of each motor, shape (n, f).
+        residual: r, the e of each row predicted by a fit that did not see its fold, shape (rows,).
     """
 
     problem: Linearisation
-    slices: tuple[slice, ...]
+    moves: int
+    blocks: tuple[slice, ...]
+    fold: IntArray
+    move: IntArray
+    motor: IntArray
+    whole: tuple[FloatArray, bool]
     factors: tuple[tuple[FloatArray, bool], ...]
     scores: FloatArray
+    move_hessian: FloatArray
+    move_score: FloatArray
+    part_hessian: FloatArray
+    part_score: FloatArray
+    motor_score: FloatArray
     residual: FloatArray
 
     @property
@@ -42,100 +60,78 @@ class Folds:
 
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
-        n, squares = len(self.problem.gamma), residual**2
-        sums = [np.bincount(self.problem.motor[rows], squares[rows], n) for rows in self.slices]
-        return np.asarray(np.stack(sums), dtype=np.float64)
+        total = np.zeros((self.count, len(self.problem.gamma)))
+        for rows, fold, motor in zip(self.blocks, self.fold, self.motor, strict=True):
+            total[fold, motor] += float(residual[rows] @ residual[rows])
+        return total
 
 
-def cut(problem: Linearisation, count: int = 8) -> Folds:
+def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -> Folds:
     """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
 
     Args:
         problem: around an estimate.
         count: of folds; fewer where there are fewer moves.
+        whole: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
 
     Raises:
         TooFewMoves: to leave some out.
     """
-    if problem.moves < FEWEST_MOVES:
-        raise TooFewMoves(problem.moves, FEWEST_MOVES)
-    count = min(count, problem.moves)
-    fold = problem.cluster % count
-    order = np.argsort(fold, kind="stable")
-    problem = problem.ordered(order)
-    bounds = np.searchsorted(fold[order], np.arange(count + 1))
-    slices = tuple(slice(int(first), int(last)) for first, last in pairwise(bounds))
-    hessian, score = problem.jacobian.T @ problem.jacobian, problem.jacobian.T @ problem.residual
-    factors, scores = [], []
-    residual = np.empty_like(problem.residual)
-    for rows in slices:
+    whole = np.arange(problem.moves) if whole is None else np.unique(whole, return_inverse=True)[1]
+    moves = int(whole.max()) + 1
+    if moves < FEWEST_MOVES:
+        raise TooFewMoves(moves, FEWEST_MOVES)
+    count = min(count, moves)
+    fold_of = whole % count
+    motors, width = len(problem.gamma), problem.jacobian.shape[1]
+    problem = problem.ordered(np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster])))
+    change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
+    starts = np.flatnonzero(change)
+    blocks = tuple(slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
+    move, motor = problem.cluster[starts], problem.motor[starts]
+    fold = fold_of[move]
+    move_hessian, move_score = np.zeros((problem.moves, width, width)), np.zeros((problem.moves, width))
+    part_hessian = np.zeros((count, motors, width, width))
+    motor_score = np.zeros((motors, width))
+    for rows, k, m, i in zip(blocks, fold, move, motor, strict=True):
         inside = problem.jacobian[rows]
-        rest = hessian - inside.T @ inside
+        gram, score = inside.T @ inside, inside.T @ problem.residual[rows]
+        move_hessian[m] += gram
+        move_score[m] += score
+        part_hessian[k, i] += gram
+        motor_score[i] += score
+    by_fold = part_hessian.sum(axis=1)
+    hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
+    # Two effects may say nearly the same: the direction in which they differ is left as it is.
+    hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
+    factors, scores = [], []
+    for k in range(count):
+        rest = hessian - by_fold[k]
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
         rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
         factors.append(linalg.cho_factor(rest, lower=True))
-        scores.append(score - inside.T @ problem.residual[rows])
-        residual[rows] = problem.residual[rows] - inside @ linalg.cho_solve(factors[-1], scores[-1])
-    return Folds(problem, slices, tuple(factors), np.stack(scores), residual)
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """One candidate's columns put to the test on a problem.
-
-    Attributes:
-        coefficients: in-sample, in the unit of the columns, shape (p,).
-        fallen: in-sample fall of ‖e‖² of each motor, shape (n,).
-        training_fall: fall of ‖e‖² on the other folds, which may choose among settings, shape (folds,).
-        held_out: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n).
-        score: Φ⊥ᵀe, shape (p,).
-        scatter: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (clusters, p).
-    """
-
-    coefficients: FloatArray
-    fallen: FloatArray
-    training_fall: FloatArray
-    held_out: FloatArray
-    score: FloatArray
-    scatter: FloatArray
-
-
-def put_to_test(folds: Folds, hessian: tuple[FloatArray, bool], columns: FloatArray) -> Trial | None:
-    """Project the columns off all declared directions, gains included, and see what they explain.
-
-    Args:
-        folds: the problem in folds.
-        hessian: Cholesky factor of the whole JᵀJ.
-        columns: whitened candidate columns, shape (rows, p).
-
-    Returns:
-        None where the declared model says the same already (less than 1e-6 of a column is left).
-    """
-    problem = folds.problem
-    whole = problem.jacobian.T @ columns
-    projected = columns - problem.jacobian @ linalg.cho_solve(hessian, whole)
-    gram = projected.T @ projected
-    if np.any(np.diag(gram) < 1e-6 * np.sum(columns**2, axis=0)):
-        return None
-    score = np.asarray(projected.T @ problem.residual)
-    coefficients = np.asarray(np.linalg.solve(gram, score), dtype=np.float64)
-    after = problem.residual - projected @ coefficients
-    by_move = [np.bincount(problem.cluster, part, problem.moves) for part in (projected * after[:, None]).T]
-    scatter = np.asarray(np.stack(by_move, axis=1), dtype=np.float64)
-    difference = problem.residual**2 - after**2
-    fallen = np.asarray(np.bincount(problem.motor, difference, len(problem.gamma)), dtype=np.float64)
-    left = np.empty_like(problem.residual)
-    training_fall = np.empty(folds.count)
-    size = columns.T @ columns
-    against = columns.T @ problem.residual
-    folded = zip(folds.slices, folds.factors, folds.scores, strict=True)
-    for index, (rows, factor, nuisance) in enumerate(folded):
-        inside, j = columns[rows], problem.jacobian[rows]
-        coupling = whole - j.T @ inside
-        moved = linalg.cho_solve(factor, coupling)
-        schur = size - inside.T @ inside - coupling.T @ moved
-        drive = against - inside.T @ problem.residual[rows] - moved.T @ nuisance
-        fitted = np.linalg.solve(schur, drive)
-        training_fall[index] = float(drive @ fitted)
-        left[rows] = folds.residual[rows] - (inside - j @ moved) @ fitted
-    return Trial(coefficients, fallen, training_fall, folds.square_sum(left), score, scatter)
+        scores.append(score - move_score[fold_of == k].sum(axis=0))
+    steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores, strict=True)]
+    residual = np.empty_like(problem.residual)
+    part_score = np.zeros((count, motors, width))
+    for rows, k, i in zip(blocks, fold, motor, strict=True):
+        inside = problem.jacobian[rows]
+        residual[rows] = problem.residual[rows] - inside @ steps[k]
+        part_score[k, i] += inside.T @ residual[rows]
+    return Folds(
+        problem=problem,
+        moves=moves,
+        blocks=blocks,
+        fold=fold,
+        move=move,
+        motor=motor,
+        whole=linalg.cho_factor(hessian, lower=True),
+        factors=tuple(factors),
+        scores=np.stack(scores),
+        move_hessian=move_hessian,
+        move_score=move_score,
+        part_hessian=part_hessian,
+        part_score=part_score,
+        motor_score=motor_score,
+        residual=residual,
+    )

@@ -14,25 +14,26 @@ each fold, by the other folds alone: the score of a family has not seen what it 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import stats
 
-from ident.dataset import Dataset
 from ident.effects import EFFECTS
 from ident.effects.effect import Effect
-from ident.effects.torque import effect_torque
-from ident.estimate import Estimate
-from ident.linearisation import linearise
-from ident.model import Model
-from ident.observation import Observation
-from ident.residual import Folds, Trial, cut, put_to_test
-from ident.signals import signals
+from ident.effects.placed import PlacedEffect
+from ident.inquiry import Inquiry, Tested
+from ident.residual import Folds
+from ident.trial import Trial
 
 FloatArray = NDArray[np.float64]
+
+AS_GOOD = 0.99
+"""Of the best one's fall on left-out moves."""
+CLEARLY = 1.0
+"""Standard errors of a paired comparison over folds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,11 @@ class Gates:
     explained: float = 0.03
     error_fall: float = 0.02
     draws: int = 999
+
+    @property
+    def smallest_share(self) -> float:
+        """Of a motor's squared residual: what explains less passes no gate."""
+        return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +67,8 @@ class Finding:
         error_fall: relative fall from one to the other.
         held_out_fall: fall of the whole whitened ‖e‖² on left-out moves; the rank.
         passed: whether every gate is open.
-        ambiguity: other families whose left-out score cannot be told from this one's.
+        fold_errors: ‖e‖² of the whole on each fold, shape (folds,); what a paired comparison with another one needs.
+        ambiguity: others whose left-out score cannot be told from this one's.
     """
 
     effect: Effect
@@ -75,14 +82,13 @@ class Finding:
     error_fall: float
     held_out_fall: float
     passed: bool
-    ambiguity: tuple[str, ...] = ()
+    fold_errors: FloatArray
+    ambiguity: tuple[PlacedEffect, ...] = ()
+    share_of_excess: float | None = None
 
 
 def find(
-    model: Model,
-    datasets: Sequence[Dataset],
-    observation: Observation,
-    estimate: Estimate,
+    inquiry: Inquiry,
     rng: np.random.Generator,
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
@@ -90,56 +96,67 @@ def find(
     """All families on all axes, the best on left-out moves first.
 
     Args:
-        model: the declared model.
-        datasets: the runs of the fit, in the observation's order.
-        observation: their rows, with the columns of effects accepted so far.
-        estimate: by ``ml`` on that observation.
+        inquiry: the residual.
         rng: of the bootstrap.
         gates: what a candidate must show.
         families: the dictionary.
     """
-    gates = gates or Gates()
-    runs = [signals(model, data, observation, estimate) for data in datasets]
-    problem = linearise(
-        observation, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=estimate.gains_fixed
-    )
-    folds = cut(problem)
-    problem = folds.problem
-    hessian = linalg.cho_factor(problem.jacobian.T @ problem.jacobian, lower=True)
-    to_motor = model.drive_train.to_motor
-    tried: list[tuple[int, tuple[tuple[Effect, Trial], ...]]] = []
-    for axis in range(observation.joint_count):
-        for family in families:
-            members: list[tuple[Effect, Trial]] = []
-            for effect in family:
-                torque = effect_torque(effect, axis, runs, datasets, observation.conditioning, model)
-                motors = (to_motor @ torque.reshape(len(torque), -1)).reshape(torque.shape)
-                trial = put_to_test(folds, hessian, problem.whitened(motors))
-                if trial is not None:
-                    members.append((effect, trial))
-            if members:
-                tried.append((axis, tuple(members)))
-    probabilities = _max_t(tuple(trial for _, members in tried for _, trial in members), rng, gates.draws)
-    findings, first = [], 0
-    for axis, tested in tried:
-        findings.append(_judge(folds, axis, tested, probabilities[first : first + len(tested)], gates))
-        first += len(tested)
-    return _with_ambiguity(folds, tuple(findings), tuple(members for _, members in tried))
+    tested = [found for axis in range(inquiry.axes) for found in inquiry.test(families, axis)]
+    return judge(inquiry.folds, tested, rng, gates or Gates())
 
 
-def _nested(members: tuple[tuple[Effect, Trial], ...]) -> FloatArray:
-    """‖e‖² of each fold and motor, the setting chosen by the other folds alone."""
-    chosen = np.argmax(np.stack([trial.training_fall for _, trial in members]), axis=0)
-    return np.stack([members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
+def choose(findings: Sequence[Finding]) -> Finding | None:
+    """The best that passed; of those as good on the same axis, the one with the fewest parameters.
+
+    A hinge that begins where the joint never comes is a spring, and is called one.
+    """
+    passed = [finding for finding in findings if finding.passed]
+    if not passed:
+        return None
+    best = passed[0]
+    alike = [
+        finding
+        for finding in passed
+        if finding.axis == best.axis and finding.held_out_fall >= AS_GOOD * best.held_out_fall
+    ]
+    return min(alike, key=lambda finding: _parameters(finding.effect))
 
 
-def _judge(
-    folds: Folds, axis: int, members: tuple[tuple[Effect, Trial], ...], probability: FloatArray, gates: Gates
-) -> Finding:
-    problem = folds.problem
+def judge(folds: Folds, tested: Sequence[Tested], rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
+    """What the data say of each family, ranked by left-out moves.
+
+    Args:
+        folds: the problem.
+        tested: on it; they compete for the largest statistic that noise alone would give.
+        rng: of the bootstrap.
+        gates: what a candidate must show.
+    """
+    if not tested:
+        return ()
+    trials = tuple(trial for family in tested for _, trial in family.members)
+    probabilities = iter(_max_t(trials, rng, gates.draws))
+    findings = [_judge(folds, family, probabilities, gates) for family in tested]
+    ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
+    return tuple(replace(finding, ambiguity=_alike(finding, ranked)) for finding in ranked)
+
+
+def is_better(one: Finding, other: Finding) -> bool:
+    """Whether a paired comparison over folds tells that one explains more than another."""
+    gain = other.fold_errors - one.fold_errors
+    error = float(np.std(gain, ddof=1)) * float(np.sqrt(len(gain)))
+    return float(gain.sum()) > CLEARLY * error
+
+
+def _parameters(effect: Effect) -> int:
+    return len(effect.coefficients) + len(effect.settings)
+
+
+def _judge(folds: Folds, family: Tested, probabilities: Iterator[float], gates: Gates) -> Finding:
+    problem, members = folds.problem, family.members
+    probability = [next(probabilities) for _ in members]
     best = int(np.argmax([float(trial.fallen.sum()) for _, trial in members]))
     effect, trial = members[best]
-    before, after = folds.square_sum(folds.residual), _nested(members)
+    before, after = folds.square_sum(folds.residual), family.nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
     # A joint's torque may be another motor's to give (R): the drive in question is the one whose residual falls most.
     motor = int(np.argmax(trial.fallen))
@@ -157,7 +174,7 @@ def _judge(
     )
     return Finding(
         effect=effect,
-        axis=axis,
+        axis=family.axis,
         coefficients=trial.coefficients,
         probability=float(probability[best]),
         folds_better=folds_better,
@@ -167,6 +184,7 @@ def _judge(
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
         passed=bool(passed),
+        fold_errors=after.sum(axis=1),
     )
 
 
@@ -178,29 +196,37 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
     for index, trial in enumerate(trials):
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
         inverse = np.linalg.pinv(trial.scatter.T @ trial.scatter)
-        freedom, drawn = len(trial.score), signs @ trial.scatter
+        freedom = len(trial.score)
         # On the scale of −log p, so that candidates with one and with two coefficients compete alike.
         observed[index] = -stats.chi2.logsf(float(trial.score @ inverse @ trial.score), freedom)
-        largest = np.maximum(largest, -stats.chi2.logsf(np.einsum("dp,pq,dq->d", drawn, inverse, drawn), freedom))
+        largest = np.maximum(largest, -stats.chi2.logsf(_drawn_wald(trial, signs), freedom))
     return np.asarray((1.0 + np.sum(largest[None] >= observed[:, None], axis=1)) / (draws + 1.0))
 
 
-def _with_ambiguity(
-    folds: Folds, findings: tuple[Finding, ...], members: tuple[tuple[tuple[Effect, Trial], ...], ...]
-) -> tuple[Finding, ...]:
-    """Rank, and name for each finding the others that a paired comparison over folds cannot tell from it."""
-    scores = [_nested(family).sum(axis=1) for family in members]
-    order = sorted(range(len(findings)), key=lambda i: -findings[i].held_out_fall)
-    ranked = []
-    for index in order:
-        finding = findings[index]
-        alike = []
-        for other in order:
-            if other == index or findings[other].held_out_fall <= 0:
-                continue
-            difference = scores[other] - scores[index]
-            error = float(np.std(difference, ddof=1)) * np.sqrt(len(difference))
-            if abs(float(difference.sum())) <= error:
-                alike.append(f"{findings[other].effect.name} on axis {findings[other].axis + 1}")
-        ranked.append(replace(finding, ambiguity=tuple(alike)))
-    return tuple(ranked)
+def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
+    """The Wald statistic of each draw, with a scatter of its own: few moves would else look surer than they are.
+
+    In a draw, x_m becomes s_m x_m; its sum S is taken for an effect β = G⁻¹S, and what is left in move m is
+    s_m x_m − G_m β (the studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
+    """
+    x, gram = trial.scatter, trial.gram
+    p = x.shape[1]
+    sums = signs @ x
+    fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
+    crossed = (signs @ np.einsum("ma,mbc->mabc", x, gram).reshape(len(x), -1)).reshape(-1, p, p, p)
+    mixed = np.einsum("dabc,dc->dab", crossed, fitted)
+    squares = np.einsum("mab,mcd->abcd", gram, gram)
+    left = x.T @ x - mixed - np.swapaxes(mixed, 1, 2) + np.einsum("abcd,nb,nd->nac", squares, fitted, fitted)
+    return np.asarray(np.einsum("da,dab,db->d", sums, np.linalg.pinv(left, hermitian=True), sums))
+
+
+def _alike(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedEffect, ...]:
+    """The others that a paired comparison over folds cannot tell from it."""
+    return tuple(
+        PlacedEffect(other.effect, other.axis)
+        for other in ranked
+        if other is not finding
+        and other.held_out_fall > 0
+        and not is_better(finding, other)
+        and not is_better(other, finding)
+    )

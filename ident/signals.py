@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,15 @@ from ident.dataset import Dataset
 from ident.estimate import Estimate
 from ident.link import LINK_PARAMETERS
 from ident.model import Model
+from ident.motion import Motion
 from ident.observation import Observation
 from ident.payload import Payload
 
 FloatArray = NDArray[np.float64]
 
 CHUNK_SAMPLES = 4096
+POSTURE_SAMPLES = 20
+"""Between two postures in which the inertia of a joint is computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,25 +33,33 @@ class Signals:
     Attributes:
         rate_hz: sampling rate.
         time_s: since the start of the run, shape (k,).
+        session_s: since the first run of the session began, shape (k,); as time_s where no clock tells.
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
         motor_position_rad: of the motors, R q.
+        inertia_kg_m2: torque at joint i per unit of acceleration of joint j, of links and payload, shape (n, n, k).
         load_torque_nm: what links and payload ask of each joint, friction and drive chain left out.
+        geared_torque_nm: what goes through the gear of each joint: its load and its friction.
         motor_torque_nm: what each motor must give, in joint units (g v), friction included, effects left out.
         current_a: the same in the unit of the current reference.
     """
 
     rate_hz: float
     time_s: FloatArray
+    session_s: FloatArray
     position_rad: FloatArray
     velocity_rad_s: FloatArray
     acceleration_rad_s2: FloatArray
     motor_position_rad: FloatArray
+    inertia_kg_m2: FloatArray
     load_torque_nm: FloatArray
+    geared_torque_nm: FloatArray
     motor_torque_nm: FloatArray
     current_a: FloatArray
 
 
-def signals(model: Model, data: Dataset, observation: Observation, estimate: Estimate) -> Signals:
+def signals(
+    model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
+) -> Signals:
     """Predict a run's torques with the declared part of an estimate.
 
     Args:
@@ -56,15 +67,18 @@ def signals(model: Model, data: Dataset, observation: Observation, estimate: Est
         data: the run.
         observation: whose base parameters the estimate speaks of.
         estimate: gains and parameters; columns of effects, behind the base parameters, are left out.
+        session_began_s: of the first run, by the clock of `Dataset.started_s`; None where the runs do not tell.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
     standard[independent] = estimate.parameters[: len(independent)]
     standard[model.flange] += inertia(data.payload, _identified(data.payload, observation, estimate))
-    return declared_signals(model, data, standard, estimate.gains)
+    return declared_signals(model, data, standard, estimate.gains, session_began_s)
 
 
-def declared_signals(model: Model, data: Dataset, standard: FloatArray, gains: FloatArray) -> Signals:
+def declared_signals(
+    model: Model, data: Dataset, standard: FloatArray, gains: FloatArray, session_began_s: float | None = None
+) -> Signals:
     """Predict a run's torques with standard parameters.
 
     Args:
@@ -73,27 +87,55 @@ def declared_signals(model: Model, data: Dataset, standard: FloatArray, gains: F
         standard: χ_st with the payload on the flange; base parameters at their leading columns, zero elsewhere,
             are as good as the true standard ones (paper §2.1). Shape (c,).
         gains: g of each motor [Nm at the joint per A], shape (n,).
+        session_began_s: of the first run, by the clock of `Dataset.started_s`.
     """
     names = tuple(column.name for column in model.columns)
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
     inertial = np.array([not name.startswith(("Ia", "fv", "fs", "off")) for name in names])
-    load, total = [], []
+    friction = np.array([name.startswith(("fv", "fs")) and not name.startswith(("fvm", "fsm")) for name in names])
+    load, total, geared = [], [], []
     for first in range(0, len(data.time_s), CHUNK_SAMPLES):
         columns = model.regressor(data.motion(slice(first, first + CHUNK_SAMPLES)))
         load.append(np.einsum("jck,c->jk", columns, standard * inertial))
         total.append(np.einsum("jck,c->jk", columns, standard))
+        geared.append(load[-1] + np.einsum("jck,c->jk", columns[:, friction], standard[friction]))
     motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
     return Signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
+        session_s=data.time_s - data.time_s[0] + max(0.0, (data.started_s or 0.0) - (session_began_s or 0.0)),
         position_rad=data.position_rad,
         velocity_rad_s=data.velocity_rad_s,
         acceleration_rad_s2=data.acceleration_rad_s2,
         motor_position_rad=model.drive_train.ratio @ data.position_rad,
+        inertia_kg_m2=_inertia_of_joints(model, data, standard * inertial),
         load_torque_nm=np.concatenate(load, axis=1),
+        geared_torque_nm=np.concatenate(geared, axis=1),
         motor_torque_nm=motor,
         current_a=motor / gains[:, None],
     )
+
+
+def session_began_s(datasets: Sequence[Dataset]) -> float | None:
+    """When the first of some runs began, or None where one of them does not tell."""
+    told = [data.started_s for data in datasets if data.started_s is not None]
+    return min(told) if told and len(told) == len(datasets) else None
+
+
+def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
+    """Mass matrix of links and payload, shape (n, n, k), drawn between few postures because it changes slowly."""
+    samples, count = len(data.time_s), len(data.position_rad)
+    postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
+    position = np.ascontiguousarray(data.position_rad[:, postures])
+    still = np.zeros_like(position)
+    weight = np.einsum("jck,c->jk", model.regressor(Motion(position, still, still)), load)
+    mass = np.empty((count, count, samples))
+    for joint, unit in enumerate(np.eye(count)):
+        moved = Motion(position, still, np.repeat(unit[:, None], len(postures), axis=1))
+        column = np.einsum("jck,c->jk", model.regressor(moved), load) - weight
+        for row, along in enumerate(column):
+            mass[row, joint] = np.interp(np.arange(samples), postures, along)
+    return mass
 
 
 def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:

@@ -99,15 +99,29 @@ def legend_below(figure: Figure, *places: Axes) -> None:
     )
 
 
-def save_png(figure: Figure, path: Path) -> None:
+def save_png(figure: Figure, path: Path | None) -> bytes:
     """Draw a figure and put it at `path` whole; the same figure gives the same bytes.
+
+    Args:
+        figure: to draw.
+        path: None where the bytes alone are wanted, as for a page that carries its pictures.
+
+    Returns:
+        the file's content.
 
     Raises:
         OSError: from the file system.
     """
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DPI, metadata={"Software": None})
-    replace_file(path, drawn.getvalue())
+    if path is not None:
+        replace_file(path, drawn.getvalue())
+    return drawn.getvalue()
+
+
+def unformatted(text: str) -> str:
+    """Text from a file as matplotlib shall show it: a dollar sign is one, and begins no formula."""
+    return text.replace("$", r"\$")
 
 
 def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tuple[FloatArray, FloatArray]:

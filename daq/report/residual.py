@@ -19,6 +19,7 @@ from daq.report.picture import (
     legend_below,
     save_png,
     thinned,
+    unformatted,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ _BINS = 40
 
 
 def plot_residual(
-    path: Path,
+    path: Path | None,
     time_s: FloatArray,
     before_nm: FloatArray,
     after_nm: FloatArray,
@@ -39,7 +40,7 @@ def plot_residual(
     velocity_rad_s: FloatArray,
     title: str,
     force: str = "Nm",
-) -> None:
+) -> bytes:
     """Draw the residual of one axis before and after an effect joined the model.
 
     Left over time, right against the variable that the effect depends on, with the mean of each stretch of it for
@@ -47,7 +48,7 @@ def plot_residual(
     model still lacks.
 
     Args:
-        path: of the PNG.
+        path: of the PNG; None where its bytes alone are wanted.
         time_s: shape (k,) [s].
         before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN where a row was left
             out.
@@ -57,10 +58,13 @@ def plot_residual(
         title: says which axis, which effect and which run it is.
         force: "Nm", or "N" along a prismatic joint.
 
+    Returns:
+        the PNG.
+
     Raises:
         OSError: from the file system.
     """
-    title = f"{title}\ngaps: samples left out, most of them at standstill"
+    title = f"{unformatted(title)}\ngaps: samples left out, most of them at standstill"
     figure, ((before_time, before_scatter), (after_time, after_scatter)) = grid(2, (1.7, 1.0), title, height_in=2.5)
     rows = (
         ("without the effect", before_nm, ORANGE, before_time, before_scatter),
@@ -77,7 +81,7 @@ def plot_residual(
     after_scatter.set_xlabel(variable_label, fontsize=8)
     before_scatter.set_title("the same against the variable of the effect", fontsize=9, loc="left")
     legend_below(figure, before_scatter)
-    save_png(figure, path)
+    return save_png(figure, path)
 
 
 def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> None:

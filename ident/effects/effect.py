@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.effects.abscissa import Abscissa
 from ident.model import Column
 from ident.signals import Signals
 
@@ -15,21 +16,17 @@ FloatArray = NDArray[np.float64]
 
 
 class Side(Enum):
-    """Where the torque acts: on the joint, or on the motor of that number (and through R on all joints it turns)."""
+    """Where the torque acts.
+
+    JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it turns. TWO_JOINTS: on
+    the joint and on another one, whose number is the setting `other_axis`. ALL_JOINTS: on every joint, through the
+    links.
+    """
 
     JOINT = "joint"
     MOTOR = "motor"
-
-
-class Abscissa(Enum):
-    """What a person plots a residual against to see an effect: label with unit."""
-
-    VELOCITY = "joint velocity [rad/s]"
-    POSITION = "joint position [rad]"
-    LOAD = "load torque [Nm]"
-    MOTOR_ANGLE = "motor angle, one revolution [rad]"
-    CURRENT = "predicted current [A]"
-    TORQUE_RATE = "rate of the motor torque [Nm/s]"
+    TWO_JOINTS = "two joints"
+    ALL_JOINTS = "all joints"
 
 
 class Property(Enum):
@@ -40,23 +37,32 @@ class Property(Enum):
     INDEPENDENT_OF_VELOCITY = "does not change when the velocity does"
     PERIODIC_IN_MOTOR_ANGLE = "repeats after one motor revolution"
     ODD_IN_CURRENT = "turns its sign with the current"
+    ODD_IN_LOAD = "turns its sign with the load"
     RATE_OF_TORQUE = "is zero where the torque does not change"
+    SMOOTH = "changes little where its variable does"
+    RATE_OF_LOAD = "is zero where the load does not change"
 
 
 class Effect(Protocol):
     """An entry of the dictionary: a frozen dataclass whose fields are its searched (non-linear) parameters.
 
     Attributes:
-        name: what a technician calls it.
         side: where it acts.
         holds: what it claims about its columns.
-        abscissa: what shows it in a picture.
     """
 
-    name: ClassVar[str]
     side: ClassVar[Side]
     holds: ClassVar[Property]
-    abscissa: ClassVar[Abscissa]
+
+    @property
+    def name(self) -> str:
+        """What a technician calls it."""
+        ...
+
+    @property
+    def abscissa(self) -> Abscissa:
+        """What shows it in a picture."""
+        ...
 
     @property
     def settings(self) -> dict[str, float]:
@@ -69,5 +75,5 @@ class Effect(Protocol):
         ...
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque at the axis per unit of each coefficient [Nm], shape (coefficients, k)."""
+        """Torque per unit of each coefficient [Nm], shape (p, k), where several joints feel it (joints, p, k)."""
         ...

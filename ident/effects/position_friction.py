@@ -8,7 +8,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.effects.effect import Abscissa, Property, Side
+from ident.effects.abscissa import Abscissa
+from ident.effects.effect import Property, Side
 from ident.model import Column
 from ident.signals import Signals
 

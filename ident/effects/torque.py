@@ -19,9 +19,20 @@ FloatArray = NDArray[np.float64]
 
 
 def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
-    """An effect's columns at its axis, shape (p, k), as torque of all joints, shape (n, p, k)."""
-    acts_on = drive_train.direction[axis] if effect.side is Side.MOTOR else np.eye(len(drive_train.ratio))[axis]
-    return np.asarray(acts_on[:, None, None] * columns[None])
+    """An effect's columns at its axis, shape (p, k) or (joints, p, k), as torque of all joints, shape (n, p, k)."""
+    if effect.side is Side.MOTOR:
+        return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
+    if effect.side is Side.ALL_JOINTS:
+        return columns
+    joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is Side.TWO_JOINTS else [axis]
+    torque = np.zeros((len(drive_train.ratio), *columns.shape[-2:]))
+    torque[joints] = columns
+    return torque
+
+
+def is_placeable(effect: Effect, axis: int, axes: int) -> bool:
+    """Whether an effect can act on an axis of so many; a pair of joints is named by the lower one."""
+    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= axes
 
 
 def effect_torque(
@@ -36,4 +47,4 @@ def effect_torque(
     parts = [
         decimate_rows(data, conditioning, effect.columns(run, axis)) for run, data in zip(runs, datasets, strict=True)
     ]
-    return at_joints(effect, axis, np.concatenate(parts, axis=1), model.drive_train)
+    return at_joints(effect, axis, np.concatenate(parts, axis=-1), model.drive_train)

@@ -58,7 +58,12 @@ def _calibration(
         ),
         effects=(
             AcceptedEffect(
-                "load-friction", "J3", {}, (Parameter("load-friction coefficient 3", 0.1, 0.01, "1"),), 6.1, 3.4
+                "load-friction",
+                "J3",
+                {"speed_exponent": 0},
+                (Parameter("load-friction coefficient 3", 0.1, 0.01, "1"),),
+                6.1,
+                3.4,
             ),
         ),
         relative_error_percent=RelativeError((3.0,) * count, 3.0),

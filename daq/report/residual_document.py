@@ -1,0 +1,161 @@
+"""`residual.json`: everything that `drivegain residual` found, by stable names (docs/residual.md)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from daq.calibration_file import as_document
+from daq.effect_words import placed_name
+from daq.fit import Fit
+from daq.report.effect_coefficients import coefficients
+from daq.report.residual_summary import summary
+from ident.before_after import Account, BeforeAfter, Errors, GainChange, LeftOutRuns
+from ident.calibration import Calibration
+from ident.effects.placed import PlacedEffect
+from ident.loop import Step
+from ident.relative_error import RelativeError
+from ident.search import Finding
+
+FORMAT = "drivegain-residual"
+VERSION = 1
+METRIC = (
+    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
+    "declared model"
+)
+
+
+def residual_document(fitted: Fit, account: Account, calibration: Calibration) -> dict[str, Any]:
+    """The object of `residual --json`, and the body of `residual.json`.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+        calibration: with the accepted effects.
+    """
+    axes = fitted.cell.axis_names
+    return {
+        **as_document(calibration),
+        "summary": list(summary(fitted, account)),
+        "axes": list(axes),
+        "metric": METRIC,
+        "noise_floor": {
+            "motors": [
+                None
+                if floor is None
+                else {
+                    "axis": axis,
+                    "noise": floor.noise_a,
+                    "std_percent": floor.std_percent,
+                    "dwells": floor.dwells,
+                    "degrees_of_freedom": floor.freedom,
+                }
+                for axis, floor in zip(axes, account.floors, strict=True)
+            ],
+            "relative_error_percent": _error(account.floor),
+            "holdout_error_percent": _error(account.holdout_floor),
+        },
+        **_before_after(fitted, account.total),
+        "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
+    }
+
+
+def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
+    nothing = {"before": None, "after": None, "gain_changes": None}
+    added, removed = ((), ()) if turn is None else (turn.added, turn.removed)
+    return {
+        "accepted": None if step.accepted is None else _finding(fitted, step.accepted),
+        "added": [_effect(fitted, step, placed) for placed in added],
+        "removed": [placed_name(placed, fitted.cell.axis_names) for placed in removed],
+        **(nothing if turn is None else _before_after(fitted, turn)),
+        "findings": [_finding(fitted, finding) for finding in step.findings],
+        "structures": [_finding(fitted, finding) for finding in step.structures],
+        "detection_limits": [
+            {"axis": axis.name, "rms": float(limit), "unit": axis.unit.force}
+            for axis, limit in zip(fitted.cell.axes, step.limits_nm, strict=True)
+        ],
+    }
+
+
+def _effect(fitted: Fit, step: Step, placed: PlacedEffect) -> dict[str, Any]:
+    return {
+        "effect": placed.effect.name,
+        "axis": fitted.cell.axis_names[placed.axis],
+        "settings": {name: float(value) for name, value in placed.effect.settings.items()},
+        "coefficients": [
+            {"name": c.name, "value": c.value, "std": c.std, "unit": c.unit} for c in coefficients(step.after, placed)
+        ],
+    }
+
+
+def _before_after(fitted: Fit, compared: BeforeAfter) -> dict[str, Any]:
+    return {
+        "before": _errors(compared.before),
+        "after": _errors(compared.after),
+        "gain_changes": [
+            _gain_change(axis.name, axis.gain_unit, change)
+            for axis, change in zip(fitted.cell.axes, compared.gains, strict=True)
+        ],
+    }
+
+
+def _gain_change(axis: str, unit: str, change: GainChange) -> dict[str, Any]:
+    return {
+        "axis": axis,
+        "unit": unit,
+        "before": change.before,
+        "before_std": change.before_std,
+        "after": change.after,
+        "after_std": change.after_std,
+        "change_percent": change.change_percent,
+        "change_std_percent": change.change_std_percent,
+        "significant": change.significant,
+    }
+
+
+def _errors(errors: Errors) -> dict[str, Any]:
+    return {
+        "relative_error_percent": _error(errors.in_sample),
+        "cross_validated_error_percent": _error(errors.cross_validated),
+        "left_out_runs": _left_out_runs(errors.left_out_runs),
+        "holdout_error_percent": _error(errors.holdout),
+    }
+
+
+def _left_out_runs(left_out: LeftOutRuns | None) -> dict[str, Any] | None:
+    if left_out is None:
+        return None
+    return {
+        "error_percent": _error(left_out.together),
+        "runs": [
+            {"run": run.run, "error_percent": _error(run.error), "reason": run.reason or None} for run in left_out.runs
+        ],
+    }
+
+
+def _error(error: RelativeError | None) -> dict[str, Any] | None:
+    return None if error is None else {"axes": list(error.axes), "total": error.total}
+
+
+def _finding(fitted: Fit, finding: Finding) -> dict[str, Any]:
+    axes = fitted.cell.axis_names
+    return {
+        "effect": finding.effect.name,
+        "axis": axes[finding.axis],
+        "settings": {name: float(value) for name, value in finding.effect.settings.items()},
+        "variable": finding.effect.abscissa.value,
+        "coefficients": [
+            {"name": column.name, "value": float(value), "unit": column.unit}
+            for column, value in zip(finding.effect.coefficients, finding.coefficients, strict=True)
+        ],
+        "probability": finding.probability,
+        "folds_better": finding.folds_better,
+        "explained": finding.explained,
+        "error_before_percent": finding.error_before_percent,
+        "error_after_percent": finding.error_after_percent,
+        "error_fall": finding.error_fall,
+        "held_out_fall": finding.held_out_fall,
+        "passed": finding.passed,
+        "share_of_excess": finding.share_of_excess,
+        # Of what has a closed gate nobody asks it, and all pairs would be most of the file.
+        "ambiguity": [placed_name(rival, axes) for rival in finding.ambiguity] if finding.passed else None,
+    }

@@ -1,0 +1,213 @@
+"""`report.html`: the residual, what was added for it and what that changed, for a person and for paper."""
+
+from __future__ import annotations
+
+from daq.effect_words import in_words, placed_name, variable_words
+from daq.fit import Fit
+from daq.report.effect_coefficients import coefficients
+from daq.report.excitation import cannot_tell
+from daq.report.fit import draw_effect, draw_torques, start_of
+from daq.report.gain_change import plot_gain_changes
+from daq.report.gain_table import partial_note, with_deviation
+from daq.report.html import listed, page, paragraph, picture, section, table
+from daq.report.ranking import Bar, plot_ranking
+from daq.report.residual_summary import WHEN, ErrorRow, error_rows, spelt, summary
+from ident.before_after import Account, BeforeAfter
+from ident.calibration import Calibration
+from ident.effects.placed import PlacedEffect
+from ident.loop import Evidence, Step
+from ident.search import Finding
+
+SHOWN = 10
+"""Candidates of a turn that are drawn or listed; residual.json has them all."""
+
+
+def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> str:
+    """The whole page.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+        calibration: with the accepted effects.
+    """
+    axes = fitted.cell.axis_names
+    note = partial_note(calibration)
+    start = start_of(fitted)
+    final = fitted.steps[-1].after
+    return page(
+        f"Residual of cell {fitted.cell.name}",
+        (
+            *(() if note is None else (paragraph(note),)),
+            listed(summary(fitted, account), "summary"),
+            section(
+                "Before and after",
+                error_table(axes, error_rows(account)),
+                paragraph(
+                    "Error: what the model leaves of each motor's current, ‖e‖/‖v‖, over the rows in motion; in total "
+                    "with each current weighed by its gain. It means nothing without the filter at the end of this "
+                    "page. Noise floor: what the current's noise at standstill would leave; in motion there is more."
+                ),
+            ),
+            *_effects(fitted, account, start),
+            section("Torques", picture(draw_torques(None, final, fitted.cell), "Measured and predicted joint torques")),
+            _gains(fitted, account),
+            *(
+                _turn(fitted, number, step)
+                for number, step in enumerate(fitted.steps, start=1)
+                if step.findings or step.structures
+            ),
+            section("What these data can and cannot tell", listed(_limits(fitted))),
+            _origin(calibration),
+        ),
+    )
+
+
+def error_table(axes: tuple[str, ...], rows: tuple[ErrorRow, ...]) -> str:
+    """Relative error of each axis and of all together."""
+    return table(
+        "Relative error ‖e‖/‖v‖ [%]",
+        ("", *axes, "total"),
+        [(name, *map(spelt, (*error.axes, error.total))) for name, error in rows],
+    )
+
+
+def _effects(fitted: Fit, account: Account, start: Evidence) -> list[str]:
+    sections, before = [], start
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        if turn is not None:
+            sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
+        before = step.after
+    return sections
+
+
+def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
+    axes = fitted.cell.axis_names
+    settings = ", ".join(f"{name} {value:.4g}" for name, value in placed.effect.settings.items())
+    rivals = () if step.accepted is None else step.accepted.ambiguity
+    final = fitted.steps[-1].after
+    kept = placed in final.effects
+    known = final if kept else step.after
+    replaced = "" if kept else " A later turn made it idle and took it out again."
+    ambiguous = ", ".join(placed_name(rival, axes) for rival in rivals)
+    pairs = (
+        ("fit", turn.before.in_sample, turn.after.in_sample),
+        ("moves left out", turn.before.cross_validated, turn.after.cross_validated),
+        ("unused", turn.before.holdout, turn.after.holdout),
+    )
+    return section(
+        f"{axes[placed.axis]}: {in_words(placed.effect, axes)}",
+        paragraph(
+            f"Effect {placed_name(placed, axes)}"
+            + (f" ({settings})." if settings else ".")
+            + (f" These data cannot tell it from: {ambiguous}." if ambiguous else " No other one does as well.")
+            + replaced
+        ),
+        table(
+            "Identified coefficients",
+            ("coefficient", "value ± σ", "unit"),
+            [(c.name, with_deviation(c.value, c.std), c.unit) for c in coefficients(known, placed)],
+        ),
+        table(
+            f"Relative error of {axes[placed.axis]} [%]",
+            ("", *WHEN),
+            [
+                (name, spelt(first.axes[placed.axis]), spelt(second.axes[placed.axis]))
+                for name, first, second in pairs
+                if first is not None and second is not None
+            ],
+        ),
+        picture(
+            draw_effect(None, before, step.after, placed, fitted.cell),
+            f"Residual of {axes[placed.axis]} over time and against {variable_words(placed.effect, axes)}, "
+            "without and with the effect. A mean that still leaves zero is torque that the model still lacks.",
+        ),
+    )
+
+
+def _gains(fitted: Fit, account: Account) -> str:
+    axes, changes = fitted.cell.axis_names, account.total.gains
+    if fitted.final.estimate.gains_fixed:
+        return section("Drive gains", paragraph("The gains were held at their nameplate values."))
+    rows = [
+        (
+            axis.name,
+            with_deviation(change.before, change.before_std),
+            with_deviation(change.after, change.after_std),
+            f"{change.change_percent:+.2f} ± {change.change_std_percent:.2f}",
+            "yes" if change.significant else "no",
+            axis.gain_unit,
+        )
+        for axis, change in zip(fitted.cell.axes, changes, strict=True)
+    ]
+    return section(
+        "Drive gains",
+        table("Before and after", ("axis", *WHEN, "change ± σ [%]", "more than noise", "unit"), rows),
+        picture(
+            plot_gain_changes(None, changes, axes, title=f"Drive gains of {fitted.cell.name}"),
+            "Gains with their intervals, before and after, in per cent of the gain before; * changed by more than "
+            "noise. Both estimates share their noise, so intervals that overlap do not say that nothing changed.",
+        ),
+    )
+
+
+def _turn(fitted: Fit, number: int, step: Step) -> str:
+    axes = fitted.cell.axis_names
+    shown = (*step.findings[:SHOWN], *(finding for finding in step.structures[:SHOWN] if finding.passed))
+    best = step.accepted or next(iter(step.findings), None)
+    rivals = set() if best is None else {(rival.effect.name, rival.axis) for rival in best.ambiguity}
+    bars = [
+        Bar(
+            _finding_name(finding, axes),
+            finding.held_out_fall,
+            finding.passed,
+            rival=(finding.effect.name, finding.axis) in rivals,
+        )
+        for finding in sorted(shown, key=lambda finding: -finding.held_out_fall)
+    ]
+    outcome = (
+        "Nothing passed every gate and nothing was added."
+        if step.accepted is None
+        else f"Added: {_finding_name(step.accepted, axes)}."
+    )
+    return section(
+        f"Turn {number}: what was tried",
+        paragraph(outcome),
+        picture(
+            plot_ranking(None, bars, title=f"Turn {number}: the best candidates"),
+            "Candidates by what they take off the error of moves that their fit did not see.",
+        ),
+    )
+
+
+def _finding_name(finding: Finding, axes: tuple[str, ...]) -> str:
+    return placed_name(PlacedEffect(finding.effect, finding.axis), axes)
+
+
+def _limits(fitted: Fit) -> tuple[str, ...]:
+    held = fitted.final.estimate.gains_fixed
+    return (
+        *cannot_tell(fitted),
+        "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
+        "every speed, load and position is part of the parameters: neither leaves a residual.",
+        *(("The gains were given: an error in them is hidden in the parameters.",) if held else ()),
+        "Play or give behind an encoder on the motor may leave no trace in these signals.",
+        "Effects are named by what depends on the same variable in the same way: another cause that does so would get "
+        "the same name. What cannot be told apart is listed with each effect.",
+        "The noise floor is that of standstill, a lower bound: an error above it need not be an effect.",
+    )
+
+
+def _origin(calibration: Calibration) -> str:
+    filters = [
+        (name, ", ".join(f"{v:g}" for v in value) if isinstance(value, list) else f"{value:g}")
+        for name, value in calibration.filter.items()
+    ]
+    return section(
+        "Filters and sources",
+        table("Filter settings", ("setting", "value"), filters),
+        table("Logs", ("log", "role", "sha256"), [(s.name, s.role, s.sha256) for s in calibration.sources]),
+        paragraph(
+            f"{calibration.rows} rows, condition {calibration.condition:.0f}, configuration "
+            f"{calibration.configuration_sha256}, made {calibration.created} by {calibration.software}."
+        ),
+    )

@@ -1,0 +1,128 @@
+"""What the closing of the loop came to, in words that need no other page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from daq.effect_words import in_words, is_unnamed
+from daq.fit import Fit
+from ident.before_after import Account, BeforeAfter, Errors, GainChange
+from ident.effects.placed import PlacedEffect
+from ident.loop import MAX_EFFECTS
+from ident.relative_error import RelativeError
+
+ErrorRow = tuple[str, RelativeError]
+"""What is measured on what, and the error [%]."""
+WHEN = ("before", "after")
+
+
+def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
+    """Sentences: one for each accepted effect, the whole, the gains, and what would have been found.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+    """
+    kept = fitted.steps[-1].after.effects
+    found = tuple(
+        _effect_sentence(fitted, account, turn, placed, step.accepted.share_of_excess)
+        for step, turn in zip(fitted.steps, account.turns, strict=True)
+        if step.accepted is not None and turn is not None
+        for placed in turn.added
+        if placed in kept
+    )
+    if not found:
+        return (f"No structure found: the declared model explains these runs. {_silence(fitted)}",)
+    (before, _), (after, where) = least_seen(account.total.before), least_seen(account.total.after)
+    return (
+        *found,
+        f"All axes together: the error {where} {fell(before.total, after.total)}.",
+        *(() if fitted.final.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
+        _silence(fitted),
+    )
+
+
+def error_rows(account: Account) -> tuple[ErrorRow, ...]:
+    """The rows of the table of errors; what nobody asked for or nobody knows is left out."""
+    before, after = account.total.before, account.total.after
+    pairs = (
+        ("fit", before.in_sample, after.in_sample),
+        ("moves left out", before.cross_validated, after.cross_validated),
+        ("runs left out", _together(before), _together(after)),
+        ("unused", before.holdout, after.holdout),
+    )
+    floors = (("noise floor", account.floor), ("noise floor, unused", account.holdout_floor))
+    named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
+    return tuple(
+        (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
+    )
+
+
+def spelt(percent: float) -> str:
+    """Two decimals; a dash for what is not known."""
+    return f"{percent:.2f}" if math.isfinite(percent) else "-"
+
+
+def least_seen(errors: Errors) -> tuple[RelativeError, str]:
+    """The error that has seen least of what it is measured on, and on what that was."""
+    if errors.holdout is not None:
+        return errors.holdout, "on runs that were not used"
+    if errors.left_out_runs is not None and errors.left_out_runs.together is not None:
+        return errors.left_out_runs.together, "on runs left out in turn"
+    return errors.cross_validated, "on moves left out in turn"
+
+
+def fell(before_percent: float, after_percent: float) -> str:
+    """`falls from 6.9 to 2.8 %`; what rises is said to."""
+    before, after = f"{before_percent:.1f}", f"{after_percent:.1f}"
+    if before == after:
+        return f"stays at {after} %"
+    return f"{'falls' if after_percent < before_percent else 'rises'} from {before} to {after} %"
+
+
+def _effect_sentence(
+    fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, share_of_excess: float | None
+) -> str:
+    axes = fitted.cell.axis_names
+    name = axes[placed.axis]
+    (before, _), (after, where) = least_seen(turn.before), least_seen(turn.after)
+    floors = account.floor if turn.after.holdout is None else account.holdout_floor
+    floor = math.nan if floors is None else floors.axes[placed.axis]
+    told = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
+    excess = ""
+    if is_unnamed(placed.effect) and share_of_excess is not None:
+        excess = f" ({100.0 * share_of_excess:.0f} % of what the model leaves beyond noise)"
+    return (
+        f"{name} has {in_words(placed.effect, axes)}{excess}: the error of {name} {where} "
+        f"{fell(before.axes[placed.axis], after.axes[placed.axis])} ({told})."
+    )
+
+
+def _gains_sentence(axes: Sequence[str], changes: Sequence[GainChange]) -> str:
+    told = [
+        f"{axis} by {change.change_percent:+.1f} %"
+        for axis, change in zip(axes, changes, strict=True)
+        if change.significant
+    ]
+    if not told:
+        return "No drive gain changes by more than noise."
+    return f"Drive gains that change by more than noise: {', '.join(told)}."
+
+
+def _silence(fitted: Fit) -> str:
+    last = fitted.steps[-1]
+    if last.accepted is not None:
+        return (
+            f"The search ended after {MAX_EFFECTS} effects with more to find: look at the declared model first "
+            "(drive train, payload, channels)."
+        )
+    limits = ", ".join(
+        f"{limit:.2g} {axis.unit.force} on {axis.name}"
+        for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
+    )
+    return f"Any other effect of more than this (root mean square in motion) would have been found: {limits}."
+
+
+def _together(errors: Errors) -> RelativeError | None:
+    return None if errors.left_out_runs is None else errors.left_out_runs.together

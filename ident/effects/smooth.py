@@ -1,0 +1,85 @@
+"""A smooth function of one variable: what no named effect explains, and still depends on something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.effects.abscissa import Abscissa, values
+from ident.effects.effect import Property, Side
+from ident.model import Column
+from ident.signals import Signals
+
+FloatArray = NDArray[np.float64]
+
+INTERVALS = 4
+"""Of the variable's range; cubic B-splines over them have three more coefficients."""
+MOTOR_VARIABLES = frozenset({Abscissa.CURRENT, Abscissa.TORQUE_RATE})
+FOLDED = frozenset({Abscissa.VELOCITY, Abscissa.OTHER_VELOCITY})
+"""Variables of which the size is taken: dry friction has its jump at zero, which no smooth function of v follows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Smooth:
+    """τ = p · Σ c_k B_k(x)
+
+    B_k are the cubic B-splines over a uniform division of the range of x (de Boor, A Practical Guide to Splines), and p
+    is 1, or sign(q̇) where `signed`. Of a velocity x is the size, and p its own sign.
+
+    Attributes:
+        variable: x.
+        lower, upper: its range; outside of it the function keeps its value at the end.
+        signed: 1 where p turns with the direction of motion, else 0.
+        other_axis: number of the other axis, from 1, where x speaks of one; else 0.
+    """
+
+    side: ClassVar[Side] = Side.JOINT
+    holds: ClassVar[Property] = Property.SMOOTH
+
+    variable: Abscissa
+    lower: float = 0.0
+    upper: float = 1.0
+    signed: int = 0
+    other_axis: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of the variable."""
+        return f"smooth-{self.variable.name.lower().replace('_', '-')}"
+
+    @property
+    def abscissa(self) -> Abscissa:
+        """The variable."""
+        return self.variable
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """The searched parameters."""
+        return {"lower": self.lower, "upper": self.upper, "signed": self.signed, "other_axis": self.other_axis}
+
+    @property
+    def coefficients(self) -> tuple[Column, ...]:
+        """Linear parameters."""
+        return tuple(Column(f"part {number}", "Nm") for number in range(1, INTERVALS + 4))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Torque per unit of each coefficient, shape (INTERVALS + 3, k)."""
+        x = values(self.variable, signals, axis, self.other_axis - 1 if self.other_axis else None)
+        sign = np.sign(x if self.variable in FOLDED else signals.velocity_rad_s[axis])
+        basis = cubic_basis(np.abs(x) if self.variable in FOLDED else x, self.lower, self.upper)
+        return np.asarray(basis * sign if self.signed else basis)
+
+
+def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:
+    """Uniform cubic B-splines, shape (INTERVALS + 3, k); they sum to one."""
+    place = np.clip((x - lower) / (upper - lower), 0.0, 1.0) * INTERVALS
+    interval = np.minimum(place.astype(np.int64), INTERVALS - 1)
+    u = place - interval
+    parts = ((1.0 - u) ** 3, 3.0 * u**3 - 6.0 * u**2 + 4.0, -3.0 * u**3 + 3.0 * u**2 + 3.0 * u + 1.0, u**3)
+    basis = np.zeros((INTERVALS + 3, len(x)))
+    for offset, part in enumerate(parts):
+        basis[interval + offset, np.arange(len(x))] = part / 6.0
+    return basis

@@ -1,0 +1,71 @@
+"""The setting of an accepted effect, found between those that the dictionary tries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+
+from ident.effects.effect import Effect
+from ident.inquiry import Inquiry
+
+STEPS = 6
+"""Of the golden section: the bracket between two neighbours becomes an eighteenth."""
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+
+
+def refined(inquiry: Inquiry, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]) -> Effect:
+    """Golden section on the squared residual, over the logarithm of a setting, between its neighbours in the family.
+
+    An effect without a positive real setting, or at the end of its family, is returned as it is.
+
+    Args:
+        inquiry: the residual.
+        effect, axis: accepted.
+        families: the dictionary that it came from.
+    """
+    family = next((members for members in families if effect in members), None)
+    if family is None:
+        return effect
+    for name, value in effect.settings.items():
+        if not isinstance(value, float) or not is_dataclass(effect):
+            continue
+        others = {key: setting for key, setting in effect.settings.items() if key != name}
+        grid = sorted(
+            member.settings[name]
+            for member in family
+            if {key: setting for key, setting in member.settings.items() if key != name} == others
+        )
+        place = grid.index(value)
+        if grid[0] > 0 and 0 < place < len(grid) - 1:
+            return _golden(inquiry, effect, axis, name, grid[place - 1], grid[place + 1])
+    return effect
+
+
+def _golden(inquiry: Inquiry, effect: Effect, axis: int, name: str, lower: float, upper: float) -> Effect:
+    a, b = float(np.log(lower)), float(np.log(upper))
+
+    def fall(x: float) -> float:
+        (trial,) = inquiry.trials([inquiry.torque(_with(effect, name, float(np.exp(x))), axis)])
+        return -np.inf if trial is None else float(trial.fallen.sum())
+
+    inner, outer = b - GOLDEN * (b - a), a + GOLDEN * (b - a)
+    at_inner, at_outer = fall(inner), fall(outer)
+    for _ in range(STEPS):
+        if at_inner > at_outer:
+            b, outer, at_outer = outer, inner, at_inner
+            inner = b - GOLDEN * (b - a)
+            at_inner = fall(inner)
+        else:
+            a, inner, at_inner = inner, outer, at_outer
+            outer = a + GOLDEN * (b - a)
+            at_outer = fall(outer)
+    return _with(effect, name, float(f"{np.exp((a + b) / 2.0):.4g}"))
+
+
+def _with(effect: Effect, name: str, value: float) -> Effect:
+    if not is_dataclass(effect) or name not in {part.name for part in fields(effect)}:
+        return effect
+    changed: Effect = replace(effect, **{name: value})
+    return changed

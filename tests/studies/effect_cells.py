@@ -1,0 +1,196 @@
+"""The cells of the effects study: which plant does what beyond the declared model.
+
+An effect is made by the plant's own physics (drivers/simulated/effects/), by parameters that a mechanic would know;
+nothing here comes from the formulas that the search tries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import chain
+
+from drivers.simulated.spec import CellSpec, UndeclaredEffect
+from tests.studies.study_cells import spec_of, study_cell
+
+NOISE_FACTOR = 1.59
+"""Of the clean cell's current noise: a relative error of 3.5 % without any effect (docs/estimators.md)."""
+SMALL = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class EffectCase:
+    """One simulated cell of the study.
+
+    Attributes:
+        name: of its file.
+        seed: of its truth and its noise; cases of one seed differ in their effects alone.
+        effects: of the plant.
+    """
+
+    name: str
+    seed: int
+    effects: tuple[UndeclaredEffect, ...]
+
+    def spec(self, payload: str | None, run: int) -> CellSpec:
+        """The plant of one of its runs."""
+        return replace(spec_of(study_cell(self.seed, NOISE_FACTOR), payload, run), effects=self.effects)
+
+
+def _effect(name: str, joint: int, **parameters: float) -> UndeclaredEffect:
+    return UndeclaredEffect(name, joint - 1, parameters)
+
+
+SINGLE_EFFECTS = (
+    (_effect("stribeck", 2, rise_nm=4.0, speed_rad_s=0.25), _effect("stribeck", 4, rise_nm=1.2, speed_rad_s=0.2)),
+    (
+        _effect("nonlinear-viscous", 1, torque_at_1_rad_s_nm=4.0, exponent=1 / 3),
+        _effect("nonlinear-viscous", 3, torque_at_1_rad_s_nm=2.0, exponent=2.0),
+    ),
+    (
+        _effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0),
+        _effect("asymmetric-viscous", 5, coefficient_nm_s_rad=0.5),
+    ),
+    (_effect("load-friction", 3, coefficient=0.12), _effect("load-friction", 2, coefficient=0.08)),
+    (
+        _effect("warm-up", 1, cold_fraction=0.6, time_constant_s=60.0),
+        _effect("warm-up", 4, cold_fraction=0.6, time_constant_s=40.0),
+    ),
+    (
+        _effect("presliding", 2, torque_nm=6.0, distance_rad=0.06),
+        _effect("presliding", 4, torque_nm=1.6, distance_rad=0.08),
+    ),
+    (
+        _effect("backlash", 3, gap_rad=0.005, stiffness_nm_per_rad=20000.0, damping_nm_s_per_rad=30.0),
+        _effect("backlash", 2, gap_rad=0.004, stiffness_nm_per_rad=40000.0, damping_nm_s_per_rad=100.0),
+    ),
+    (
+        _effect("elasticity", 1, stiffness_nm_per_rad=12000.0, damping_nm_s_per_rad=60.0),
+        _effect("elasticity", 3, stiffness_nm_per_rad=5000.0, damping_nm_s_per_rad=20.0),
+    ),
+    (
+        _effect("spring", 2, stiffness_nm_per_rad=12.0, rest_rad=0.2),
+        _effect("spring", 3, stiffness_nm_per_rad=6.0, rest_rad=1.0),
+    ),
+    (
+        _effect("position-friction", 3, amplitude_nm=2.0, phase_rad=0.4),
+        _effect("position-friction", 5, amplitude_nm=0.9, phase_rad=-1.0),
+    ),
+    (
+        _effect("cogging", 4, amplitude_nm=1.2, order=1.0, phase_rad=0.5),
+        _effect("cogging", 6, amplitude_nm=0.8, order=2.0, phase_rad=-0.7),
+    ),
+    (_effect("saturation", 2, half_current_a=9.0), _effect("saturation", 3, half_current_a=8.0)),
+    (_effect("lag", 1, time_constant_s=0.006), _effect("lag", 3, time_constant_s=0.006)),
+    (
+        _effect("coupling", 4, other_axis=5.0, coulomb_nm=0.9, viscous_nm_s_rad=0.4),
+        _effect("coupling", 3, other_axis=2.0, coulomb_nm=2.0, viscous_nm_s_rad=1.0),
+    ),
+)
+"""Each family on two axes."""
+
+_SIZES = frozenset(
+    {
+        "rise_nm",
+        "torque_at_1_rad_s_nm",
+        "coefficient_nm_s_rad",
+        "coefficient",
+        "cold_fraction",
+        "torque_nm",
+        "gap_rad",
+        "amplitude_nm",
+        "coulomb_nm",
+        "viscous_nm_s_rad",
+        "time_constant_s",
+    }
+)
+
+
+def _smaller(effect: UndeclaredEffect) -> UndeclaredEffect:
+    """The same effect at SMALL of its size: what it adds to the torque, not how it is shaped."""
+    parameters = dict(effect.parameters)
+    if effect.name == "saturation":
+        parameters["half_current_a"] /= SMALL**0.5
+    elif effect.name == "elasticity":
+        parameters["stiffness_nm_per_rad"] /= SMALL
+    else:
+        sizes = _SIZES - ({"time_constant_s"} if effect.name == "warm-up" else set())
+        parameters = {key: value * (SMALL if key in sizes else 1.0) for key, value in parameters.items()}
+    if effect.name == "spring":
+        parameters["stiffness_nm_per_rad"] *= SMALL
+    return replace(effect, parameters=parameters)
+
+
+SINGLES = tuple(
+    EffectCase(f"single-{number:02d}-{effect.name}-J{effect.axis + 1}", 2001 + number, (effect,))
+    for number, effect in enumerate(chain.from_iterable(SINGLE_EFFECTS))
+)
+CLEAN = tuple(EffectCase(f"clean-{number:02d}", 2001 + number, ()) for number in range(28))
+"""The same cells without their effect: the clean floor of each seed, and the count of false effects."""
+SMALLS = tuple(
+    EffectCase(f"small-{number:02d}-{pair[0].name}-J{pair[0].axis + 1}", 2001 + 2 * number, (_smaller(pair[0]),))
+    for number, pair in enumerate(SINGLE_EFFECTS)
+)
+
+
+def _pair(number: int, kind: str, first: UndeclaredEffect, second: UndeclaredEffect) -> EffectCase:
+    return EffectCase(f"{kind}-{number:02d}-{first.name}-{second.name}", 2101 + number, (first, second))
+
+
+APART = tuple(
+    _pair(number, "apart", SINGLE_EFFECTS[one][a], SINGLE_EFFECTS[other][b])
+    for number, (one, a, other, b) in enumerate(
+        (
+            (0, 0, 3, 0),
+            (1, 0, 10, 1),
+            (2, 0, 9, 0),
+            (3, 1, 13, 0),
+            (4, 0, 8, 1),
+            (5, 1, 11, 0),
+            (7, 0, 0, 1),
+            (9, 1, 1, 0),
+            (12, 0, 3, 0),
+            (11, 1, 8, 0),
+        )
+    )
+)
+"""Two effects on different axes."""
+TOGETHER = tuple(
+    _pair(number, "together", first, second)
+    for number, (first, second) in enumerate(
+        (
+            (
+                _effect("stribeck", 2, rise_nm=4.0, speed_rad_s=0.25),
+                _effect("spring", 2, stiffness_nm_per_rad=12.0, rest_rad=0.2),
+            ),
+            (
+                _effect("load-friction", 3, coefficient=0.12),
+                _effect("position-friction", 3, amplitude_nm=2.0, phase_rad=0.4),
+            ),
+            (_effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0), _effect("load-friction", 2, coefficient=0.08)),
+            (
+                _effect("nonlinear-viscous", 1, torque_at_1_rad_s_nm=4.0, exponent=1 / 3),
+                _effect("lag", 1, time_constant_s=0.006),
+            ),
+            (
+                _effect("cogging", 4, amplitude_nm=1.2, order=1.0, phase_rad=0.5),
+                _effect("stribeck", 4, rise_nm=1.2, speed_rad_s=0.2),
+            ),
+            (_effect("saturation", 2, half_current_a=9.0), _effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0)),
+            (
+                _effect("warm-up", 1, cold_fraction=0.6, time_constant_s=60.0),
+                _effect("spring", 1, stiffness_nm_per_rad=8.0, rest_rad=0.2),
+            ),
+            (
+                _effect("position-friction", 5, amplitude_nm=0.9, phase_rad=-1.0),
+                _effect("asymmetric-viscous", 5, coefficient_nm_s_rad=0.5),
+            ),
+            (
+                _effect("spring", 3, stiffness_nm_per_rad=6.0, rest_rad=1.0),
+                _effect("load-friction", 3, coefficient=0.12),
+            ),
+            (_effect("lag", 3, time_constant_s=0.006), _effect("asymmetric-viscous", 3, coefficient_nm_s_rad=1.5)),
+        )
+    )
+)
+"""Two effects on the same axis."""
+ALL = (*SINGLES, *CLEAN, *SMALLS, *APART, *TOGETHER)
