@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ident.effects.abscissa import Abscissa
-from ident.effects.effect import Effect
+from ident.effects.effect import Effect, Side
 from ident.effects.periodic import Periodic
 from ident.effects.placed import PlacedEffect
 from ident.effects.smooth import Smooth
@@ -18,6 +18,7 @@ WORDS = {
     "cogging": "torque ripple that repeats with the motor's turn",
     "saturation": "a motor that gives less torque per ampere at large current",
     "lag": "a current that is seen later than the position",
+    "time-skew": "positions and currents that were not sampled at the same time",
     "warm-up": "friction that changes while the robot warms up",
     "presliding": "friction that builds up only some way after each reversal",
     "backlash": "free play in the gear",
@@ -37,6 +38,8 @@ def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
         placed: effect and axis.
         axes: their names.
     """
+    if placed.effect.side is Side.ALL_MOTORS:
+        return f"{placed.effect.name} on all axes"
     other = other_axis(placed.effect)
     pair = "" if other is None else f" with {axes[other]}"
     return f"{placed.effect.name} on {axes[placed.axis]}{pair}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from daq.configuration.cell import Cell
 from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
+from daq.effect_words import placed_name
 from daq.errors import LogRepeated, LogsDiffer, ModelContradicted, RolesExchanged, UsageError
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
@@ -303,7 +304,7 @@ def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEf
                 # Without a run that was held out, the moves that were left out in turn must do.
                 error_before_percent=step.accepted.error_before_percent if error_before is None else error_before,
                 error_after_percent=step.accepted.error_after_percent if error_after is None else error_after,
-                ambiguity=step.accepted.ambiguity,
+                ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in step.accepted.ambiguity),
             )
         )
         before = step.after

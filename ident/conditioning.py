@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,7 @@ class Decimator:
         return out.reshape(*shape[:-1], count)
 
 
+@lru_cache(maxsize=64)
 def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
     """The decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off, transition as wide as the cut-off."""
     factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))

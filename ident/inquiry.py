@@ -15,6 +15,7 @@ from ident.effects.torque import at_joints, effect_torque, is_placeable
 from ident.estimate import Estimate
 from ident.linearisation import linearise
 from ident.model import Model
+from ident.noise_floor import noise_floors
 from ident.observation import Observation
 from ident.residual import Folds, cut
 from ident.rows import decimate_rows
@@ -59,6 +60,7 @@ class Inquiry:
         runs: what the model predicts of each run, at full rate.
         rows: the same at the observation's rows.
         folds: the problem around the estimate.
+        floors_a: noise of each motor's current in a row that no model of motion explains; None where not known.
         cache: columns of motion and time alone, which stay the same from turn to turn.
     """
 
@@ -68,6 +70,7 @@ class Inquiry:
     runs: tuple[Signals, ...]
     rows: tuple[Signals, ...]
     folds: Folds
+    floors_a: tuple[float | None, ...]
     cache: ColumnCache = field(default_factory=dict)
 
     @property
@@ -96,8 +99,8 @@ class Inquiry:
         ends = np.cumsum([torque.shape[1] for torque in torques])
         candidates = [slice(int(end) - torque.shape[1], int(end)) for end, torque in zip(ends, torques, strict=True)]
         whole = np.concatenate(torques, axis=1)
-        motors = (self.model.drive_train.to_motor @ whole.reshape(len(whole), -1)).reshape(whole.shape)
-        return put_to_test(self.folds, self.folds.problem.whitened(motors), candidates)
+        columns = self.folds.problem.whitened(whole, self.model.drive_train.to_motor)
+        return put_to_test(self.folds, columns, candidates)
 
     def test(self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False) -> tuple[Tested, ...]:
         """Families on an axis; those of which the model lacks nothing are left out."""
@@ -146,7 +149,17 @@ def inquire(
         gains_fixed=estimate.gains_fixed,
     )
     rows = tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True))
-    return Inquiry(model, datasets, observation, runs, rows, cut(problem, whole=whole), {} if cache is None else cache)
+    floors = noise_floors(datasets, observation.conditioning)
+    return Inquiry(
+        model=model,
+        datasets=datasets,
+        observation=observation,
+        runs=runs,
+        rows=rows,
+        folds=cut(problem, whole=whole),
+        floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
+        cache={} if cache is None else cache,
+    )
 
 
 def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:

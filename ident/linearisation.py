@@ -62,12 +62,21 @@ class Linearisation:
             source=self.source[order],
         )
 
-    def whitened(self, torque_nm: FloatArray) -> FloatArray:
-        """Motor-side torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra)."""
-        columns = np.empty((len(self.motor), torque_nm.shape[1]))
-        for motor in range(len(self.gamma)):
-            rows = self.motor == motor
-            columns[rows] = torque_nm[motor][:, self.source[rows]].T * (self.gamma[motor] / self.noise[motor])
+    def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
+        """Joint torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra).
+
+        Args:
+            torque_nm: per unit of each column.
+            to_motor: T (DriveTrain.to_motor).
+        """
+        columns = np.zeros((len(self.motor), torque_nm.shape[1]))
+        felt = [bool(np.any(torque)) for torque in torque_nm]
+        for motor, row in enumerate(to_motor):
+            rows = np.flatnonzero(self.motor == motor)
+            for joint in np.flatnonzero(row):
+                if felt[joint]:
+                    weight = row[joint] * self.gamma[motor] / self.noise[motor]
+                    columns[rows] += weight * torque_nm[joint][:, self.source[rows]].T
         return columns
 
 

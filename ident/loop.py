@@ -14,6 +14,7 @@ from ident.effects import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.placed import PlacedEffect
 from ident.effects.torque import effect_torque
+from ident.errors import NotConverged, RankDeficient
 from ident.estimate import Estimate
 from ident.identify import Identification, estimate_with
 from ident.inquiry import ColumnCache, inquire
@@ -117,12 +118,13 @@ def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = 
 def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidence:
     """The same data with effects in the model, everything refitted, gains included.
 
-    Load and current are the model's predictions, so the columns are built twice: with the estimate before, and with
-    the estimate that they led to.
+    Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
+    with the estimate that they led to.
     """
     current, began_s = before, session_began_s(before.datasets)
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
-    for _ in range(2):
+    passes = 1 if all(placed.effect.abscissa.is_kinematic for placed in effects) else 2
+    for _ in range(passes):
         runs = [signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets]
         whole = before.bare
         for placed in effects:
@@ -178,8 +180,14 @@ def close_the_loop(
             break
         accepted = replace(accepted, effect=refined(inquiry, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
-        current = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
-        current = _without_idle(current, rng, gates)
+        try:
+            joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
+        except (NotConverged, RankDeficient) as error:
+            # What the linearised problem told apart, the whole one does not.
+            progress(f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}")
+            steps.append(Step(findings, structures, limits_nm, None, current))
+            break
+        current = _without_idle(joined, rng, gates)
         steps.append(Step(findings, structures, limits_nm, accepted, current))
     return tuple(steps)
 
@@ -192,7 +200,7 @@ def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> 
             continue
         rest = with_effects(current, tuple(other for other in current.effects if other != placed))
         inquiry = inquire(rest.model, rest.trained, rest.training, rest.estimate)
-        (finding, *_) = judge(inquiry.folds, inquiry.test(((placed.effect,),), placed.axis), rng, gates) or (None,)
+        (finding, *_) = judge(inquiry, inquiry.test(((placed.effect,),), placed.axis), rng, gates) or (None,)
         if finding is None or not finding.passed:
             current = rest
     return current

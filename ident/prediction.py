@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration
 from ident.dataset import Dataset
-from ident.effects import EFFECTS
+from ident.effects import EFFECTS, UNNAMED
 from ident.effects.effect import Effect
 from ident.effects.placed import PlacedEffect
 from ident.effects.torque import at_joints
@@ -116,7 +116,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
 
 
 def _rebuilt(accepted: AcceptedEffect) -> Effect:
-    families = {family[0].name: family[0] for family in EFFECTS}
+    families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
     known = families[accepted.name]

@@ -36,7 +36,8 @@ class Signals:
         session_s: since the first run of the session began, shape (k,); as time_s where no clock tells.
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
         motor_position_rad: of the motors, R q.
-        inertia_kg_m2: torque at joint i per unit of acceleration of joint j, of links and payload, shape (n, n, k).
+        inertia_kg_m2: torque at joint i per unit of acceleration of joint j, of links and payload, with the
+            rotor's where it cannot be told from theirs (Ia regrouped), shape (n, n, k).
         load_torque_nm: what links and payload ask of each joint, friction and drive chain left out.
         geared_torque_nm: what goes through the gear of each joint: its load and its friction.
         motor_torque_nm: what each motor must give, in joint units (g v), friction included, effects left out.
@@ -96,14 +97,15 @@ def declared_signals(
     load, total, geared = [], [], []
     for first in range(0, len(data.time_s), CHUNK_SAMPLES):
         columns = model.regressor(data.motion(slice(first, first + CHUNK_SAMPLES)))
-        load.append(np.einsum("jck,c->jk", columns, standard * inertial))
-        total.append(np.einsum("jck,c->jk", columns, standard))
-        geared.append(load[-1] + np.einsum("jck,c->jk", columns[:, friction], standard[friction]))
+        torques = np.matmul(np.stack((inertial, np.ones_like(inertial), inertial | friction)) * standard, columns)
+        load.append(torques[:, 0])
+        total.append(torques[:, 1])
+        geared.append(torques[:, 2])
     motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
     return Signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
-        session_s=data.time_s - data.time_s[0] + max(0.0, (data.started_s or 0.0) - (session_began_s or 0.0)),
+        session_s=data.time_s - data.time_s[0] + _into_the_session_s(data, session_began_s),
         position_rad=data.position_rad,
         velocity_rad_s=data.velocity_rad_s,
         acceleration_rad_s2=data.acceleration_rad_s2,
@@ -122,17 +124,24 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
     return min(told) if told and len(told) == len(datasets) else None
 
 
+def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:
+    """When a run began, in its session; a clock's reading alone tells nothing."""
+    if data.started_s is None or session_began_s is None:
+        return 0.0
+    return max(0.0, data.started_s - session_began_s)
+
+
 def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
     """Mass matrix of links and payload, shape (n, n, k), drawn between few postures because it changes slowly."""
     samples, count = len(data.time_s), len(data.position_rad)
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
     position = np.ascontiguousarray(data.position_rad[:, postures])
     still = np.zeros_like(position)
-    weight = np.einsum("jck,c->jk", model.regressor(Motion(position, still, still)), load)
+    weight = load @ model.regressor(Motion(position, still, still))
     mass = np.empty((count, count, samples))
     for joint, unit in enumerate(np.eye(count)):
         moved = Motion(position, still, np.repeat(unit[:, None], len(postures), axis=1))
-        column = np.einsum("jck,c->jk", model.regressor(moved), load) - weight
+        column = load @ model.regressor(moved) - weight
         for row, along in enumerate(column):
             mass[row, joint] = np.interp(np.arange(samples), postures, along)
     return mass

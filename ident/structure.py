@@ -35,7 +35,7 @@ VARIABLES = (
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
 MUCH_MORE = 0.15
 MOVES_A_COEFFICIENT = 5
-FEWEST_COEFFICIENTS = INTERVALS + 3
+FEWEST_COEFFICIENTS = INTERVALS + 1
 TAIL = 0.005
 """Of the samples at either end of a variable's range: there a spline would rest on a handful of them."""
 
@@ -54,7 +54,7 @@ def find_structure(
     if inquiry.folds.moves < MOVES_A_COEFFICIENT * FEWEST_COEFFICIENTS:
         return ()  # a term of many coefficients would fit the few moves that there are
     tested = [found for axis in axes for found in inquiry.test(_families(inquiry, axis), axis, at_rows=True)]
-    return judge(inquiry.folds, tested, rng, gates)
+    return judge(inquiry, tested, rng, gates)
 
 
 def is_inadequate(named: Finding, structure: Finding) -> bool:
@@ -69,7 +69,8 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
 def detection_limits_nm(inquiry: Inquiry, gates: Gates) -> FloatArray:
     """Torque (root mean square over the moving rows) that an effect must have at each motor to be found, shape (n,).
 
-    It is what opens the gates on the size of an effect; on a short recording noise asks for more.
+    It is what opens the gates on the size of an effect whose shape the dictionary or a spline can follow; on a short
+    recording noise asks for more.
     """
     problem = inquiry.folds.problem
     noise_a = np.array(

@@ -15,6 +15,8 @@ FloatArray = NDArray[np.float64]
 
 SAID_ALREADY = 1e-6
 """Share of a column that must be left when all declared directions are taken out of it."""
+UNSEEN = 1e-9
+"""Share of a direction, squared, below which the folds that a fit may use do not show it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,10 +146,9 @@ def _left_out(
         coupling = whole - jacobian[k].sum(axis=0)
         schur = whole_gram - gram[k].sum(axis=0) - coupling.T @ step
         drive = whole_score - score[k].sum(axis=0) - step.T @ folds.scores[k]
-        try:
-            fitted = np.linalg.solve(schur, drive)
-        except np.linalg.LinAlgError:
-            fitted = np.zeros(len(drive))  # what the other folds do not show at all is left as it is
+        # What the other folds do not show at all is left as it is: in its own unit, the shortest of all solutions.
+        unit = np.sqrt(np.diag(whole_gram))
+        fitted = np.linalg.lstsq(schur / np.outer(unit, unit), drive / unit, rcond=UNSEEN)[0] / unit
         training_fall[k] = float(drive @ fitted)
         # r − (Φ − J step) fitted, squared motor by motor.
         inside = _projected_gram(gram[k], jacobian[k], step, folds.part_hessian[k])

@@ -8,10 +8,11 @@ from daq.calibration_file import as_document
 from daq.effect_words import placed_name
 from daq.fit import Fit
 from daq.report.effect_coefficients import coefficients
-from daq.report.residual_summary import summary
-from ident.before_after import Account, BeforeAfter, Errors, GainChange, LeftOutRuns
+from daq.report.residual_summary import summary, time_skew
+from ident.before_after import Account, BeforeAfter, Errors, GainChange
 from ident.calibration import Calibration
 from ident.effects.placed import PlacedEffect
+from ident.left_out_runs import LeftOutRuns
 from ident.loop import Step
 from ident.relative_error import RelativeError
 from ident.search import Finding
@@ -54,9 +55,15 @@ def residual_document(fitted: Fit, account: Account, calibration: Calibration) -
             "relative_error_percent": _error(account.floor),
             "holdout_error_percent": _error(account.holdout_floor),
         },
+        "time_skew": _time_skew(fitted),
         **_before_after(fitted, account.total),
         "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
     }
+
+
+def _time_skew(fitted: Fit) -> dict[str, float] | None:
+    skew = time_skew(fitted)
+    return None if skew is None else {"seconds": skew[0], "std": skew[1]}
 
 
 def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
@@ -144,8 +151,10 @@ def _finding(fitted: Fit, finding: Finding) -> dict[str, Any]:
         "settings": {name: float(value) for name, value in finding.effect.settings.items()},
         "variable": finding.effect.abscissa.value,
         "coefficients": [
-            {"name": column.name, "value": float(value), "unit": column.unit}
-            for column, value in zip(finding.effect.coefficients, finding.coefficients, strict=True)
+            {"name": column.name, "value": float(value), "std": float(std), "unit": column.unit}
+            for column, value, std in zip(
+                finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True
+            )
         ],
         "probability": finding.probability,
         "folds_better": finding.folds_better,

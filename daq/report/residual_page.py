@@ -51,11 +51,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
             *_effects(fitted, account, start),
             section("Torques", picture(draw_torques(None, final, fitted.cell), "Measured and predicted joint torques")),
             _gains(fitted, account),
-            *(
-                _turn(fitted, number, step)
-                for number, step in enumerate(fitted.steps, start=1)
-                if step.findings or step.structures
-            ),
+            *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
             section("What these data can and cannot tell", listed(_limits(fitted))),
             _origin(calibration),
         ),
@@ -169,14 +165,15 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         if step.accepted is None
         else f"Added: {_finding_name(step.accepted, axes)}."
     )
-    return section(
-        f"Turn {number}: what was tried",
-        paragraph(outcome),
+    ranking = (
         picture(
             plot_ranking(None, bars, title=f"Turn {number}: the best candidates"),
             "Candidates by what they take off the error of moves that their fit did not see.",
-        ),
+        )
+        if bars
+        else paragraph("No candidate could be tried.")
     )
+    return section(f"Turn {number}: what was tried", paragraph(outcome), ranking)
 
 
 def _finding_name(finding: Finding, axes: tuple[str, ...]) -> str:

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from daq.effect_words import in_words, is_unnamed
 from daq.fit import Fit
 from ident.before_after import Account, BeforeAfter, Errors, GainChange
+from ident.effects.effect import Side
 from ident.effects.placed import PlacedEffect
+from ident.effects.time_skew import TimeSkew
 from ident.loop import MAX_EFFECTS
 from ident.relative_error import RelativeError
 
@@ -33,13 +35,40 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
         if placed in kept
     )
     if not found:
-        return (f"No structure found: the declared model explains these runs. {_silence(fitted)}",)
+        error, where = least_seen(account.total.after)
+        return (
+            f"No structure found: the error {where} is {error.total:.1f} %{_of_all(account)}.",
+            _silence(fitted),
+            *_skew_sentence(fitted),
+        )
     (before, _), (after, where) = least_seen(account.total.before), least_seen(account.total.after)
     return (
         *found,
-        f"All axes together: the error {where} {fell(before.total, after.total)}.",
+        f"All axes together: the error {where} {fell(before.total, after.total)}{_of_all(account)}.",
         *(() if fitted.final.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
         _silence(fitted),
+        *_skew_sentence(fitted),
+    )
+
+
+def time_skew(fitted: Fit) -> tuple[float, float] | None:
+    """How much later currents were sampled than positions, on all axes alike, and its σ [s]; None where unknown.
+
+    Of the last turn, where no accepted effect stands for it any more.
+    """
+    skews = [finding for finding in fitted.steps[-1].findings if finding.effect == TimeSkew()]
+    return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
+
+
+def _skew_sentence(fitted: Fit) -> tuple[str, ...]:
+    skew = time_skew(fitted)
+    if skew is None:
+        return ()
+    seconds, std = skew
+    beside = " beside the effects found" if fitted.steps[-1].after.effects else ""
+    return (
+        f"Currents were sampled {1e3 * abs(seconds):.2f} ± {1e3 * std:.2f} ms {'after' if seconds > 0 else 'before'} "
+        f"the positions on all axes alike{beside}.",
     )
 
 
@@ -87,16 +116,28 @@ def _effect_sentence(
     axes = fitted.cell.axis_names
     name = axes[placed.axis]
     (before, _), (after, where) = least_seen(turn.before), least_seen(turn.after)
-    floors = account.floor if turn.after.holdout is None else account.holdout_floor
-    floor = math.nan if floors is None else floors.axes[placed.axis]
+    floor = _floor(account).axes[placed.axis]
     told = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
         excess = f" ({100.0 * share_of_excess:.0f} % of what the model leaves beyond noise)"
+    if placed.effect.side is Side.ALL_MOTORS:
+        before_all, after_all = (least_seen(errors)[0].total for errors in (turn.before, turn.after))
+        return f"The recording has {in_words(placed.effect, axes)}: the error {where} {fell(before_all, after_all)}."
     return (
         f"{name} has {in_words(placed.effect, axes)}{excess}: the error of {name} {where} "
         f"{fell(before.axes[placed.axis], after.axes[placed.axis])} ({told})."
     )
+
+
+def _floor(account: Account) -> RelativeError:
+    """Of the rows that `least_seen` speaks of."""
+    return account.floor if account.holdout_floor is None else account.holdout_floor
+
+
+def _of_all(account: Account) -> str:
+    floor = _floor(account).total
+    return f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
 
 
 def _gains_sentence(axes: Sequence[str], changes: Sequence[GainChange]) -> str:
@@ -121,7 +162,10 @@ def _silence(fitted: Fit) -> str:
         f"{limit:.2g} {axis.unit.force} on {axis.name}"
         for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
     )
-    return f"Any other effect of more than this (root mean square in motion) would have been found: {limits}."
+    return (
+        "Any other effect that these signals show would have been found above this torque (root mean square in "
+        f"motion): {limits}."
+    )
 
 
 def _together(errors: Errors) -> RelativeError | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ident.effects.abscissa import Abscissa
 from ident.effects.asymmetric_viscous import AsymmetricViscous
 from ident.effects.backlash import Backlash
 from ident.effects.cogging import Cogging
@@ -16,11 +17,14 @@ from ident.effects.inertial_coupling import InertialCoupling
 from ident.effects.lag import Lag
 from ident.effects.load_friction import LoadFriction
 from ident.effects.nonlinear_viscous import NonlinearViscous
+from ident.effects.periodic import Periodic
 from ident.effects.position_friction import PositionFriction
 from ident.effects.presliding import Presliding
 from ident.effects.saturation import Saturation
+from ident.effects.smooth import Smooth
 from ident.effects.spring import Spring
 from ident.effects.stribeck import Stribeck
+from ident.effects.time_skew import TimeSkew
 from ident.effects.warm_up import WarmUp
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
@@ -37,6 +41,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(Cogging(order) for order in ORDERS),
     (Saturation(),),
     (Lag(),),
+    (TimeSkew(),),
     tuple(WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)),
     tuple(Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
     tuple(Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
@@ -47,3 +52,6 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(Compensator(order) for order in (1, 2)),
 )
 """A family a row; within it, the candidates of its searched parameters. Adding an effect is a file and a line here."""
+
+UNNAMED: tuple[Effect, ...] = (Periodic(), *(Smooth(variable) for variable in Abscissa))
+"""Terms that fit anything: what a calibration holds where structure was found that no name explains."""

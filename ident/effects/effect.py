@@ -20,13 +20,14 @@ class Side(Enum):
 
     JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it turns. TWO_JOINTS: on
     the joint and on another one, whose number is the setting `other_axis`. ALL_JOINTS: on every joint, through the
-    links.
+    links. ALL_MOTORS: on every motor alike; it has no axis of its own and is placed on the first.
     """
 
     JOINT = "joint"
     MOTOR = "motor"
     TWO_JOINTS = "two joints"
     ALL_JOINTS = "all joints"
+    ALL_MOTORS = "all motors"
 
 
 class Property(Enum):

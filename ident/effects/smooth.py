@@ -15,19 +15,22 @@ from ident.signals import Signals
 
 FloatArray = NDArray[np.float64]
 
-INTERVALS = 4
+INTERVALS = 6
 """Of the variable's range; cubic B-splines over them have three more coefficients."""
 MOTOR_VARIABLES = frozenset({Abscissa.CURRENT, Abscissa.TORQUE_RATE})
 FOLDED = frozenset({Abscissa.VELOCITY, Abscissa.OTHER_VELOCITY})
 """Variables of which the size is taken: dry friction has its jump at zero, which no smooth function of v follows."""
+LINEAR_IN_MODEL = frozenset({(Abscissa.VELOCITY, 1), (Abscissa.LOAD, 0), (Abscissa.CURRENT, 0)})
+"""Variable and `signed` of p · x that is declared: viscous friction, and what a change of the gain is."""
 
 
 @dataclass(frozen=True, slots=True)
 class Smooth:
-    """τ = p · Σ c_k B_k(x)
+    """τ = p · Σ c_k S_k(x)
 
-    B_k are the cubic B-splines over a uniform division of the range of x (de Boor, A Practical Guide to Splines), and p
-    is 1, or sign(q̇) where `signed`. Of a velocity x is the size, and p its own sign.
+    S_k are combinations of the cubic B-splines over a uniform division of the range of x (de Boor, A Practical Guide to
+    Splines), and p is 1, or sign(q̇) where `signed`. Of a velocity x is the size, and p its own sign. What the model
+    declares is not among them: p itself (offset, dry friction), and p · x of LINEAR_IN_MODEL.
 
     Attributes:
         variable: x.
@@ -63,14 +66,26 @@ class Smooth:
     @property
     def coefficients(self) -> tuple[Column, ...]:
         """Linear parameters."""
-        return tuple(Column(f"part {number}", "Nm") for number in range(1, INTERVALS + 4))
+        return tuple(Column(f"part {number}", "Nm") for number in range(1, self._mixture().shape[1] + 1))
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit of each coefficient, shape (INTERVALS + 3, k)."""
+        """Torque per unit of each coefficient, shape (p, k)."""
         x = values(self.variable, signals, axis, self.other_axis - 1 if self.other_axis else None)
         sign = np.sign(x if self.variable in FOLDED else signals.velocity_rad_s[axis])
         basis = cubic_basis(np.abs(x) if self.variable in FOLDED else x, self.lower, self.upper)
+        basis = self._mixture().T @ basis
         return np.asarray(basis * sign if self.signed else basis)
+
+    def _mixture(self) -> FloatArray:
+        """Weights of the B-splines in each S_k, shape (INTERVALS + 3, p), orthogonal to those of what is declared.
+
+        The B-splines' weights of a constant are all one, those of x itself rise evenly (Greville).
+        """
+        if self.variable is Abscissa.OTHER_VELOCITY and self.signed:
+            return np.eye(INTERVALS + 3)  # dry friction of another joint is not declared on this one
+        powers = 2 if (self.variable, self.signed) in LINEAR_IN_MODEL else 1
+        declared = np.vander(np.arange(INTERVALS + 3.0), powers)
+        return np.asarray(np.linalg.qr(declared, mode="complete")[0][:, powers:])
 
 
 def cubic_basis(x: FloatArray, lower: float, upper: float) -> FloatArray:

@@ -24,6 +24,8 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
         return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
     if effect.side is Side.ALL_JOINTS:
         return columns
+    if effect.side is Side.ALL_MOTORS:
+        return np.asarray(np.einsum("ij,ipk->jpk", drive_train.direction, columns))
     joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is Side.TWO_JOINTS else [axis]
     torque = np.zeros((len(drive_train.ratio), *columns.shape[-2:]))
     torque[joints] = columns
@@ -32,6 +34,8 @@ def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: Drive
 
 def is_placeable(effect: Effect, axis: int, axes: int) -> bool:
     """Whether an effect can act on an axis of so many; a pair of joints is named by the lower one."""
+    if effect.side is Side.ALL_MOTORS:
+        return axis == 0
     return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= axes
 
 

@@ -53,6 +53,7 @@ def _finding(placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedE
         effect=placed.effect,
         axis=placed.axis,
         coefficients=np.ones(len(placed.effect.coefficients)),
+        deviations=np.ones(len(placed.effect.coefficients)),
         probability=0.001,
         folds_better=1.0,
         explained=0.4,
@@ -208,7 +209,7 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
     text = Closed(hostile, closed.account).page()
     assert "<script" not in text
     page = Reader(text)
-    assert all(element.attributes.get("src", "data:").startswith("data:") for element in page.elements)  # type: ignore[union-attr]
+    assert all((element.attributes.get("src") or "data:").startswith("data:") for element in page.elements)
     assert f"Residual of cell {HOSTILE}" in page.texts
 
 
@@ -256,11 +257,13 @@ def test_silence_is_told_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
     silent = replace(closed.fitted, steps=(replace(last, after=start),))
-    (sentence,) = summary(silent, account(start, silent.steps))
-    assert sentence.startswith("No structure found")
-    assert "1.2 Nm on J2" in sentence
-    text = Closed(silent, account(start, silent.steps)).page()
+    outcome, limits = summary(silent, account(start, silent.steps))
+    assert outcome.startswith("No structure found")
+    assert "1.2 Nm on J2" in limits
+    nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
+    text = Closed(nothing_tried, account(start, silent.steps)).page()
     assert "No structure found" in Reader(text).text
+    assert "No candidate could be tried." in Reader(text).text
 
 
 def test_what_rises_is_not_said_to_fall() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ident.loop import Evidence
 from ident.run import Run
-from tests.ident.recordings import MOUNTED, Truth, record, tx40_truth
+from tests.ident.recordings import MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
 
 
 @pytest.fixture(scope="session")
@@ -30,3 +31,25 @@ def noisy_runs(truth: Truth) -> tuple[Run, ...]:
         record(truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
         for index in range(4)
     )
+
+
+@pytest.fixture(scope="session")
+def small_truth() -> Truth:
+    """The arm of three axes."""
+    return three_axes_truth()
+
+
+@pytest.fixture(scope="session")
+def small_runs(small_truth: Truth) -> tuple[Run, ...]:
+    """Four runs of it, every other one loaded, at a relative error of about seven per cent."""
+    rng = np.random.default_rng(3)
+    return tuple(
+        record(small_truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
+        for index in range(4)
+    )
+
+
+@pytest.fixture(scope="session")
+def small(small_truth: Truth, small_runs: tuple[Run, ...]) -> Evidence:
+    """Identified, and nothing undeclared in them."""
+    return gathered(small_truth, small_runs)

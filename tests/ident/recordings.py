@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
 from ident.conditioning import Conditioning
-from ident.dataset import differentiate
+from ident.dataset import Dataset, differentiate
 from ident.drive_train import DriveTrain
+from ident.estimators.maximum_likelihood import ml
 from ident.identify import identify
+from ident.inquiry import ColumnCache, Inquiry, inquire
 from ident.link import LINK_PARAMETERS
 from ident.loop import Evidence, gather
 from ident.model import Model
 from ident.payload import Payload
 from ident.robot import robot_from_urdf
+from ident.rows import decimate_rows
 from ident.run import Run
-from tests.ident.arms import TX40
+from tests.ident.arms import THREE_AXES, TX40
 
 FloatArray = NDArray[np.float64]
 
@@ -43,10 +47,7 @@ class Truth:
 
 def tx40_truth(seed: int = 0) -> Truth:
     """The TX-40-like arm with friction of the paper's size."""
-    model = Model(robot_from_urdf(TX40.urdf), DriveTrain(RATIO))
-    rng = np.random.default_rng(seed)
     masses = (10.0, 3.7, 4.1, 3.4, 1.0, 0.2)
-    parameters = np.zeros(len(model.columns))
     friction = (
         (0.35, 7.0, 5.5),
         (0.35, 4.4, 7.7),
@@ -55,6 +56,32 @@ def tx40_truth(seed: int = 0) -> Truth:
         (0.05, 1.1, 2.6),
         (0.01, 0.25, 0.6),
     )
+    model = Model(robot_from_urdf(TX40.urdf), DriveTrain(RATIO))
+    parameters = _parameters(model, masses, friction, np.random.default_rng(seed))
+    parameters[-3:] = (0.0104, 0.47, 1.7)
+    return Truth(model, parameters, GAINS)
+
+
+def three_axes_truth() -> Truth:
+    """An arm of three axes without coupling.
+
+    Its rotors are light: what is seen of Ia2 is regrouped with the inertia of the links, which elasticity and backlash
+    speak of, and would make them look smaller than they are.
+    """
+    model = Model(robot_from_urdf(THREE_AXES.urdf), DriveTrain(np.diag([40.0, 50.0, -45.0])))
+    friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (0.02, 1.6, 6.3))
+    parameters = _parameters(model, (10.0, 5.0, 3.0), friction, np.random.default_rng(2))
+    return Truth(model, parameters, np.array([33.9, 32.4, -24.2]))
+
+
+def _parameters(
+    model: Model,
+    masses: tuple[float, ...],
+    friction: tuple[tuple[float, float, float], ...],
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Links of these masses around random centres; Ia, fv and fs of each joint."""
+    parameters = np.zeros(len(model.columns))
     for joint, (mass, drive) in enumerate(zip(masses, friction, strict=True)):
         centre = rng.uniform(-0.1, 0.1, 3)
         inertia = mass * (np.eye(3) * (0.05**2 + centre @ centre) - np.outer(centre, centre))
@@ -63,8 +90,7 @@ def tx40_truth(seed: int = 0) -> Truth:
         parameters[14 * joint + 9] = mass
         parameters[14 * joint + 10 : 14 * joint + 13] = drive
         parameters[14 * joint + 13] = rng.uniform(-0.3, 0.3)
-    parameters[-3:] = (0.0104, 0.47, 1.7)
-    return Truth(model, parameters, GAINS)
+    return parameters
 
 
 def positions(rng: np.random.Generator, seconds: float, rate_hz: float, limits: FloatArray) -> FloatArray:
@@ -112,4 +138,33 @@ def record(
 
 def gathered(truth: Truth, runs: tuple[Run, ...], holdout: tuple[Run, ...] = ()) -> Evidence:
     """Identified by ``ml``, with its rows."""
-    return gather(identify(truth.model, runs, CONDITIONING, holdout=holdout), runs, holdout)
+    conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * len(truth.gains))
+    return gather(identify(truth.model, runs, conditioning, holdout=holdout), runs, holdout)
+
+
+def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArray]) -> Evidence:
+    """Recordings in which the joints need more torque than the declared model says, fitted again without holding it.
+
+    Args:
+        clean: without hold-out runs.
+        truth: of whom the torque asks its current.
+        torque_nm: of all joints along a run, shape (n, k).
+    """
+    rows = [decimate_rows(data, clean.conditioning, torque_nm(data)) for data in clean.datasets]
+    return with_current(clean, truth.model.drive_train.to_motor @ np.concatenate(rows, axis=1) / truth.gains[:, None])
+
+
+def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
+    """The same with more current on the decimated rows, shape (n, r), fitted again."""
+    training = replace(clean.bare, current=clean.bare.current + added_a)
+    return replace(clean, bare=training, training=training, estimate=ml(training.system()))
+
+
+def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
+    """Torque of one joint, shape (k,), as that of all, shape (n, k)."""
+    return np.asarray(np.eye(count)[axis][:, None] * torque_nm)
+
+
+def inquiry_of(evidence: Evidence, cache: ColumnCache | None = None) -> Inquiry:
+    """The residual of the runs of the fit."""
+    return inquire(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.before_after import Account, account, assess, before_after, declared, floor_on, left_out_runs
+from ident.before_after import Account, account, assess, before_after, declared, floor_on
 from ident.current_error import CurrentError, error_left_out, error_on
 from ident.effects.placed import PlacedEffect
 from ident.effects.saturation import Saturation
 from ident.effects.spring import Spring
 from ident.identify import identify
+from ident.left_out_runs import left_out_runs
 from ident.linearisation import linearise
 from ident.loop import Evidence, Step, gather, with_effects
 from ident.noise_floor import NoiseFloor

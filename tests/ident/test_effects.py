@@ -2,69 +2,232 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from ident.drive_train import DriveTrain
 from ident.effects import EFFECTS
-from ident.effects.effect import Effect, Property
+from ident.effects.abscissa import Abscissa, values
+from ident.effects.asymmetric_viscous import AsymmetricViscous
+from ident.effects.cogging import Cogging
+from ident.effects.coupling import Coupling
+from ident.effects.effect import Effect, Property, Side
+from ident.effects.elasticity import Elasticity
+from ident.effects.hinge import Hinge
+from ident.effects.load_friction import LoadFriction
+from ident.effects.periodic import Periodic
+from ident.effects.saturation import Saturation
+from ident.effects.smooth import INTERVALS, Smooth
+from ident.effects.spring import Spring
+from ident.effects.stribeck import Stribeck
+from ident.effects.time_skew import TimeSkew
+from ident.effects.torque import at_joints, is_placeable
 from ident.signals import Signals
+from ident.structure import VARIABLES
 
-MEMBERS = [
-    pytest.param(effect, id=f"{effect.name}-{index}") for family in EFFECTS for index, effect in enumerate(family)
-]
+FloatArray = NDArray[np.float64]
+
+JOINTS, SAMPLES = 11, 400
 
 
-def _signals(seed: int) -> Signals:
+def random_signals(seed: int) -> Signals:
+    """Of eleven joints that no mechanics binds together."""
     rng = np.random.default_rng(seed)
-    arrays = rng.normal(size=(6, 3, 400))
-    torque = np.cumsum(arrays[5], axis=1)
+    position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
+    torque = np.cumsum(motor, axis=1)
+    time_s = np.arange(SAMPLES) / 100.0
     return Signals(
-        rate_hz=1000.0,
-        time_s=np.arange(400) / 1000.0,
-        position_rad=arrays[0],
-        velocity_rad_s=arrays[1],
-        acceleration_rad_s2=arrays[2],
-        motor_position_rad=30.0 * arrays[0],
-        load_torque_nm=arrays[3],
+        rate_hz=100.0,
+        time_s=time_s,
+        session_s=5.0 + time_s,
+        position_rad=2.0 * position,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
+        motor_position_rad=30.0 * position,
+        inertia_kg_m2=rng.normal(size=(JOINTS, JOINTS, SAMPLES)),
+        load_torque_nm=load,
+        geared_torque_nm=geared,
         motor_torque_nm=torque,
         current_a=torque / 20.0,
     )
 
 
-def _transformed(signals: Signals, claim: Property) -> tuple[Signals, float]:
-    """The change of motion that the claim speaks of, and the factor that its columns must then show."""
-    if claim in (Property.ODD_IN_VELOCITY, Property.EVEN_IN_VELOCITY):
-        factor = -1.0 if claim is Property.ODD_IN_VELOCITY else 1.0
-        return replace(signals, velocity_rad_s=-signals.velocity_rad_s), factor
-    if claim is Property.INDEPENDENT_OF_VELOCITY:
-        return replace(signals, velocity_rad_s=3.0 + signals.velocity_rad_s**2), 1.0
-    if claim is Property.PERIODIC_IN_MOTOR_ANGLE:
-        return replace(signals, motor_position_rad=signals.motor_position_rad + 2.0 * np.pi), 1.0
-    if claim is Property.ODD_IN_CURRENT:
-        return replace(signals, motor_torque_nm=-signals.motor_torque_nm, current_a=-signals.current_a), -1.0
-    return replace(signals, motor_torque_nm=signals.motor_torque_nm + 7.0), 1.0
+def _scaled(s: Signals, factor: float) -> Signals:
+    return replace(
+        s,
+        time_s=factor * s.time_s,
+        session_s=factor * s.session_s,
+        position_rad=factor * s.position_rad,
+        velocity_rad_s=factor * s.velocity_rad_s,
+        motor_position_rad=factor * s.motor_position_rad,
+        load_torque_nm=factor * s.load_torque_nm,
+        motor_torque_nm=factor * s.motor_torque_nm,
+        current_a=factor * s.current_a,
+    )
+
+
+def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
+    x = np.abs(values(variable, random_signals(5), 0, other_axis - 1 if other_axis else None))
+    return Smooth(variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis)
+
+
+GENERIC: tuple[tuple[Effect, ...], ...] = (
+    *(tuple(_over_its_range(variable, signed) for signed in signs) for variable, signs in VARIABLES),
+    tuple(_over_its_range(Abscissa.OTHER_VELOCITY, signed, other_axis=4) for signed in (0, 1)),
+    (Periodic(0), Periodic(1)),
+)
+MEMBERS = [
+    pytest.param(effect, id=f"{effect.name}-{index}")
+    for family in (*EFFECTS, *GENERIC)
+    for index, effect in enumerate(family)
+]
+
+
+def _same(one: FloatArray, other: FloatArray) -> bool:
+    # A motor angle of a hundred radians and the square of a rate each cost some digits.
+    return np.allclose(one, other, rtol=1e-8, atol=1e-10 * float(np.max(np.abs(other))) + 1e-12)
+
+
+def _is_odd(columns: Callable[[Signals], FloatArray], signals: Signals, reversed_: Signals) -> bool:
+    return _same(columns(reversed_), -columns(signals)) and bool(np.any(columns(signals)))
+
+
+def _is_zero_where(columns: Callable[[Signals], FloatArray], signals: Signals, held: Signals) -> bool:
+    """Held over the middle half; a second difference reaches two samples beyond."""
+    middle = columns(held)[..., SAMPLES // 4 + 2 : -SAMPLES // 4 - 2]
+    return not np.any(middle) and bool(np.any(columns(signals)))
+
+
+def _held(value: FloatArray) -> FloatArray:
+    held = value.copy()
+    held[:, SAMPLES // 4 : -SAMPLES // 4] = 1.5
+    return held
+
+
+def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
+    """Whether a property can be seen in an effect's columns; what it is said of must have a say in them."""
+    s = random_signals(seed)
+    v, angle = s.velocity_rad_s, s.motor_position_rad
+
+    def columns(signals: Signals) -> FloatArray:
+        return effect.columns(signals, axis)
+
+    match claim:
+        case Property.ODD_IN_VELOCITY:
+            holds = _is_odd(columns, s, replace(s, velocity_rad_s=-v))
+        case Property.EVEN_IN_VELOCITY:
+            has_a_say = not _same(columns(replace(s, velocity_rad_s=2.0 * v)), columns(s))
+            holds = has_a_say and _same(columns(replace(s, velocity_rad_s=-v)), columns(s))
+        case Property.INDEPENDENT_OF_VELOCITY:
+            holds = _same(columns(replace(s, velocity_rad_s=3.0 + v**2)), columns(s))
+        case Property.PERIODIC_IN_MOTOR_ANGLE:
+            has_a_say = not _same(columns(replace(s, motor_position_rad=angle + 0.3)), columns(s))
+            holds = has_a_say and _same(columns(replace(s, motor_position_rad=angle + 2.0 * np.pi)), columns(s))
+        case Property.ODD_IN_CURRENT:
+            holds = _is_odd(columns, s, replace(s, motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a))
+        case Property.ODD_IN_LOAD:
+            turned = replace(s, load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm)
+            holds = _is_odd(columns, s, turned)
+        case Property.RATE_OF_TORQUE:
+            holds = _is_zero_where(columns, s, replace(s, motor_torque_nm=_held(s.motor_torque_nm)))
+        case Property.RATE_OF_LOAD:
+            holds = _is_zero_where(columns, s, replace(s, load_torque_nm=_held(s.load_torque_nm)))
+        case Property.SMOOTH:
+            # A uniform cubic spline's slope is less than one an interval, and no variable here is more than a hundred
+            # times its range; a change by a small part of itself turns no sign.
+            change = columns(_scaled(s, 1.0 + 1e-8)) - columns(s)
+            holds = bool(np.any(change)) and float(np.max(np.abs(change))) <= 1e-8 * 100.0 * INTERVALS
+    return holds
 
 
 @pytest.mark.parametrize("effect", MEMBERS)
 def test_claims_hold(effect: Effect) -> None:
     for seed in range(3):
-        signals = _signals(seed)
-        changed, factor = _transformed(signals, effect.holds)
-        for axis in range(3):
-            expected = factor * effect.columns(signals, axis)
-            assert effect.columns(changed, axis) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert _claim_holds(effect, effect.holds, 0, seed)
+
+
+WRONG: tuple[tuple[Effect, Property], ...] = (
+    (AsymmetricViscous(), Property.ODD_IN_VELOCITY),
+    (Spring(), Property.ODD_IN_VELOCITY),
+    (Stribeck(0.1), Property.EVEN_IN_VELOCITY),
+    (Spring(), Property.EVEN_IN_VELOCITY),
+    (LoadFriction(0), Property.INDEPENDENT_OF_VELOCITY),
+    (Coupling(2, -1), Property.INDEPENDENT_OF_VELOCITY),
+    (Hinge(0.5, 1), Property.PERIODIC_IN_MOTOR_ANGLE),
+    (Saturation(), Property.PERIODIC_IN_MOTOR_ANGLE),
+    (Cogging(2), Property.ODD_IN_CURRENT),
+    (LoadFriction(0), Property.ODD_IN_LOAD),
+    (Elasticity(), Property.RATE_OF_TORQUE),
+    (Saturation(), Property.RATE_OF_TORQUE),
+    (LoadFriction(0), Property.RATE_OF_LOAD),
+    (Spring(), Property.RATE_OF_LOAD),
+    (Cogging(10**9), Property.SMOOTH),
+)
+
+
+@pytest.mark.parametrize(("effect", "claim"), WRONG, ids=lambda value: getattr(value, "name", None))
+def test_a_wrong_claim_is_refuted(effect: Effect, claim: Property) -> None:
+    assert not _claim_holds(effect, claim, 0, 0)
+
+
+def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
+    assert {claim for _, claim in WRONG} == set(Property)
+    assert {effect.holds for family in (*EFFECTS, *GENERIC) for effect in family} == set(Property)
 
 
 @pytest.mark.parametrize("effect", MEMBERS)
-def test_columns_are_as_many_as_coefficients_and_belong_to_the_axis(effect: Effect) -> None:
-    signals = _signals(5)
-    columns = effect.columns(signals, 1)
-    assert columns.shape == (len(effect.coefficients), 400)
+def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
+    signals, strange = random_signals(5), random_signals(6)
+    columns = effect.columns(signals, 0)
+    joints = {Side.TWO_JOINTS: (2,), Side.ALL_JOINTS: (JOINTS,), Side.ALL_MOTORS: (JOINTS,)}.get(effect.side, ())
+    assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
     assert np.all(np.isfinite(columns))
-    assert float(np.ptp(columns)) > 0
-    assert not np.allclose(columns, effect.columns(signals, 2))
+    assert np.all(np.ptp(columns, axis=-1) > 0)
+
+    def changed(axes: list[int]) -> Signals:
+        arrays = {}
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "motor_position_rad", "load_torque_nm",
+                     "geared_torque_nm", "motor_torque_nm", "current_a"):  # fmt: skip
+            array = getattr(signals, name).copy()
+            array[axes] = getattr(strange, name)[axes]
+            arrays[name] = array
+        return replace(signals, **arrays)
+
+    own = [0, int(effect.settings["other_axis"]) - 1] if effect.settings.get("other_axis") else [0]
+    own = list(range(JOINTS)) if effect.side is Side.ALL_MOTORS else own
+    assert np.array_equal(effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns)
+    # What depends on the clock alone is the same on all axes.
+    of_the_clock = effect.holds is Property.SMOOTH and effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
+    if not of_the_clock or effect.settings["signed"]:
+        assert not np.allclose(effect.columns(changed(own), 0), columns)
+
+
+def test_columns_act_where_the_effect_says() -> None:
+    ratio = np.diag([30.0, 40.0, 50.0])
+    ratio[2, 1] = 25.0
+    train, rng = DriveTrain(ratio), np.random.default_rng(1)
+    one, two, all_ = rng.normal(size=(2, 7)), rng.normal(size=(2, 2, 7)), rng.normal(size=(3, 1, 7))
+    at_joint = at_joints(Cogging(1), 2, one, train)
+    # Motor 3 turns with joints 2 and 3, the second at half the ratio.
+    assert at_joint == pytest.approx(np.stack((0.0 * one, 0.5 * one, one)))
+    assert at_joints(Spring(), 1, one, train) == pytest.approx(np.stack((0.0 * one, one, 0.0 * one)))
+    assert at_joints(Coupling(3, 1), 0, two, train) == pytest.approx(np.stack((two[0], 0.0 * one, two[1])))
+    assert np.array_equal(at_joints(Elasticity(), 1, all_, train), all_)
+    of_motors = np.stack((all_[0], all_[1] + 0.5 * all_[2], all_[2]))
+    assert at_joints(TimeSkew(), 0, all_, train) == pytest.approx(of_motors)
+
+
+def test_a_pair_is_named_by_its_lower_axis() -> None:
+    placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, 3)]
+    assert placed == [0, 1]
+    assert not is_placeable(Coupling(4, 1), 0, 3)
+    assert is_placeable(Spring(), 2, 3)
+    # What all motors share is tried once.
+    assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, 3)] == [0]
 
 
 def test_families_hold_one_name_and_names_are_unique() -> None:

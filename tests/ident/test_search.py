@@ -1,19 +1,15 @@
-"""The search: it names what was planted, stays silent on clean data, and its folds do not leak."""
+"""The search: it names what was planted by other formulas than its own, and stays silent on clean data."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.linearisation import linearise
 from ident.loop import Evidence, close_the_loop
-from ident.residual import cut
 from ident.run import Run
-from ident.search import find
 from tests.ident.recordings import GAINS, Truth, gathered
 
 FloatArray = NDArray[np.float64]
@@ -56,35 +52,15 @@ def test_low_speed_friction_is_named_and_the_unused_run_gets_better(truth: Truth
     assert np.max(np.abs(steps[-1].after.estimate.gains / GAINS - 1.0)) < 0.02
 
 
-def test_a_spring_is_told_from_gravity(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    runs = tuple(_with_torque(run, 2, 4.0 * run.position_rad[:, 2]) for run in noisy_runs)
-    steps = close_the_loop(_identified(truth, runs), np.random.default_rng(0))
+def test_a_spring_is_told_from_gravity(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
+    """And from a hinge that begins where the joint hardly comes: that says the same with two settings more."""
+    torque = [4.0 * run.position_rad[:, 2] / small_truth.gains[2] for run in small_runs]
+    runs = tuple(
+        replace(run, current_a=run.current_a + np.outer(added, (0.0, 0.0, 1.0)))
+        for run, added in zip(small_runs, torque, strict=True)
+    )
+    steps = close_the_loop(_identified(small_truth, runs), np.random.default_rng(0))
     accepted = [step.accepted for step in steps if step.accepted]
     assert [(finding.effect.name, finding.axis) for finding in accepted] == [("spring", 2)]
     index = [column.name for column in steps[-1].after.training.columns].index("spring stiffness 3")
     assert steps[-1].after.estimate.parameters[index] == pytest.approx(4.0, rel=0.1)
-
-
-def test_the_same_seed_gives_the_same_verdict(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    start = _identified(truth, noisy_runs)
-    trained = start.trained
-    first, second = (
-        find(start.model, trained, start.training, start.estimate, np.random.default_rng(4)) for _ in range(2)
-    )
-    assert [(f.effect, f.axis, f.probability) for f in first] == [(f.effect, f.axis, f.probability) for f in second]
-
-
-def test_a_left_out_fold_has_no_say_in_its_own_prediction(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    start = _identified(truth, noisy_runs)
-    estimate = start.estimate
-    problem = linearise(start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
-    folds = cut(problem)
-    parts = [folds.problem.cluster[rows] for rows in folds.slices]
-    assert sum(map(len, parts)) == len(problem.cluster)
-    assert not any(set(one) & set(other) for one, other in combinations(parts, 2))
-    # A change of what fold 0 measured must show in full: its prediction came from the others alone.
-    rows = problem.cluster % folds.count == 0
-    bent = cut(replace(problem, residual=problem.residual + 3.0 * rows))
-    change = bent.residual - folds.residual
-    assert change[folds.slices[0]] == pytest.approx(3.0)
-    assert np.max(np.abs(change[folds.slices[1].start :])) > 1e-3

@@ -181,7 +181,9 @@ class DirectStream:
             SimpleNamespace(
                 axes=axes,
                 node_ids=tuple(axis.node_id for axis in axes),
-                guarded=nullcontext,
+                guard=lambda: None,
+                unguard=lambda: None,
+                undisturbed=nullcontext,
                 find_silent=lambda _axes: None,
             ),
         )
@@ -202,6 +204,9 @@ class DirectStream:
     def send(self, messages: Sequence[can.Message]) -> None:
         """Frames for the next SYNC."""
         self._outgoing.extend(messages)
+
+    def read_on(self, seconds: float) -> None:
+        """Nothing comes behind the last cycle."""
 
     def drop_outgoing(self) -> None:
         """Forget the frames that wait for the next SYNC."""
