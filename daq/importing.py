@@ -117,6 +117,7 @@ def import_csv(
             opened = True
             for sample in _samples(counts, raw, rate_hz):
                 log.write(sample)
+            log.conclude(valid=True)
     except BaseException:
         if opened:
             log.part.unlink(missing_ok=True)

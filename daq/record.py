@@ -29,7 +29,7 @@ from drivers.errors import MotionRefused
 from drivers.event import CellEvent, EventKind
 from drivers.motion import execute
 from drivers.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
-from drivers.network import CanopenNetwork
+from drivers.network import CanopenNetwork, Undisturbed
 from drivers.pacing import FollowedSync, LockstepSync, Pacing, TimedSync
 from drivers.producer import DriveProducer, KernelProducer, SyncProducer
 from drivers.sample import Sample
@@ -46,6 +46,8 @@ SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
 """Without a SYNC of its producer's, whichever is longer, after which this program sends it, to stop the axes."""
 ALLOWANCE_S = 10.0
 """Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
+LATE_LOSSES_S = 0.25
+"""After the last sample: the interface's own counters are looked at five times a second (drivers/capture.py)."""
 SPACE_CHECK_S = 0.1
 """Of recorded time, between two looks at the room on the disk."""
 ROUNDING = 1.001
@@ -75,15 +77,20 @@ class Recorded:
     warnings: tuple[str, ...] = ()
 
 
-def network_of(cell: Cell) -> CanopenNetwork:
+def network_of(cell: Cell, undisturbed: Undisturbed = nullcontext) -> CanopenNetwork:
     """The amplifiers of a cell; use it as a context manager.
+
+    Args:
+        cell: its file.
+        undisturbed: keeps signals from the stop of the axes.
 
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
     pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
     # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
-    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=max(GUARD_MS[pacing], 3 * period_us // 1000))
+    guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
+    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, undisturbed=undisturbed)
 
 
 def record(
@@ -99,6 +106,7 @@ def record(
     speed: float = 1.0,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
+    undisturbed: Undisturbed = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
@@ -115,6 +123,7 @@ def record(
         speed: share of its planned speed that the plan's moves have been given (`daq.plan.slowed`), for the log.
         clocks: wall and monotonic time.
         free: room on the disk of a folder.
+        undisturbed: keeps signals from the stop of the axes.
         progress: told the moves done and their number.
 
     Raises:
@@ -128,7 +137,7 @@ def record(
     clocks = clocks or Clocks()
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
-    with network_of(cell) as network, _sync_producer(cell, network) as producer:
+    with network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
         network.prepare()
         warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
@@ -180,6 +189,7 @@ def record(
                     keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * run.rate_hz)))
                 except DiskSpaceShort as error:
                     short = error
+            stream.read_on(LATE_LOSSES_S)
             valid, reason = _verdict(stream.statistics)
             if short is not None:
                 valid, reason = False, f"stopped after {done} of {len(moves)} moves: {short.found}"

@@ -25,7 +25,7 @@ SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
 MSG_OWN, MSG_LOCAL = 0x800, 0x4
 """What linux/can/raw.h makes of MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
 BACKLOG_RECORDS = 1 << 20
-"""A hundred seconds of a full bus in 48 MiB."""
+"""A hundred seconds of a full bus in 56 MiB."""
 BURST = 128
 """Frames between two looks at the parent."""
 IDLE_MS = 20

@@ -31,6 +31,8 @@ class EventKind(Enum):
     MOVE_END = "move end"
     STOP = "stop"
     STOP_UNCONFIRMED = "stop unconfirmed"
+    ENDED = "ended"
+    """Early, before the moves were made; the text says by what."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,10 @@ SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 SDO_REQUEST = 0x600
 _EMCY, _SDO_ANSWER, _HEARTBEAT = 0x080, 0x580, 0x700
+_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
+"""What a drive is told (CiA 301, predefined connection set)."""
+PUMP_S = 1.0
+"""Of handling what has come already, however fast more comes."""
 # linux/can/error.h: classes of an error frame, and what its second byte says of the controller.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
 _OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
@@ -61,6 +65,8 @@ def command_name(identifier: int) -> str:
         return "a SYNC (080h)"
     if identifier == _NMT_COB_ID:
         return "an NMT command (000h)"
+    if identifier < SDO_REQUEST:
+        return f"a set-point of node {identifier & 0x7F} ({identifier:03X}h)"
     return f"an SDO request to node {identifier - SDO_REQUEST} ({identifier:03X}h)"
 
 
@@ -72,7 +78,9 @@ class Link:
         heard_ns: when it did, by the clock.
         answered: nodes that sent any SDO answer.
         silent: nodes that did not answer when they were last asked, and were not heard since.
-        foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request) came that we did not send.
+        foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request, set-point of one of
+            `axis_ids`) came that we did not send.
+        axis_ids: nodes that take set-points from nobody but us.
         sync_producer: who sends SYNC because we told it to (drivers/producer.py); None while only we do.
     """
 
@@ -91,6 +99,7 @@ class Link:
         self.answered: set[int] = set()
         self.foreign: dict[int, int] = {}
         self.silent: set[int] = set()
+        self.axis_ids: frozenset[int] = frozenset()
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0
@@ -113,7 +122,7 @@ class Link:
         """Close the bus; nothing happens when it is closed already."""
         if self._bus is not None:
             self._bus.shutdown()
-        self._bus = None
+        self._bus = self._beat = None
 
     @property
     def bus(self) -> can.BusABC:
@@ -136,7 +145,7 @@ class Link:
             send_burst(self.bus, messages)
 
     def pump(self, timeout_s: float) -> None:
-        """Handle one frame, waiting for it at most ``timeout_s``, or with 0 all that have already come.
+        """Handle one frame, waiting for it at most ``timeout_s``, or with 0 all that have already come, for PUMP_S.
 
         Raises:
             BusError: the bus has gone, or is off.
@@ -144,9 +153,10 @@ class Link:
         self.beat()
         with bus_errors(self.address):
             message = self.bus.recv(timeout_s)
+            end_ns = self.clock() + round(PUMP_S * 1e9) if timeout_s == 0 else 0
             while message is not None:
                 self.dispatch(message)
-                message = self.bus.recv(0.0) if timeout_s == 0 else None
+                message = self.bus.recv(0.0) if self.clock() < end_ns else None
 
     def wait(self, seconds: float) -> None:
         """Handle frames for a time.
@@ -192,7 +202,8 @@ class Link:
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id):
+        set_point = service in _RPDOS and node_id in self.axis_ids
+        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or set_point:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
             return True

@@ -84,7 +84,7 @@ def execute(
         StateRefused: an axis did not become OPERATION ENABLED, or could not be stopped.
         MotionTimeout: a move did not end in its bound.
         DataFrozen: an axis is told to move, and its position and current stay what they are.
-        DriveFault, HeartbeatLost, SampleLost, BusError: see the stream.
+        DriveFault, HeartbeatLost, SampleLost, BusError, NodeMisplaced: see the stream.
     """
     if permission is None:
         raise MotionRefused("no permission: nothing moves unless somebody says so (MotionPermission)")
@@ -97,17 +97,24 @@ def execute(
     if not moves:
         return
     walk = _Walk(network, stream, bounds, first)
-    with network.guarded():
-        try:
-            yield from walk.enable(permission.granted_by)
-            for number, move in enumerate(moves):
-                yield from walk.move(number, move)
-            problems = yield from walk.stop()
-        except BaseException as error:
-            # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
-            for problem in _drain(walk.stop()):
-                error.add_note(f"while stopping: {problem}")
-            raise
+    network.guard()
+    try:
+        yield from walk.enable(permission.granted_by)
+        for number, move in enumerate(moves):
+            yield from walk.move(number, move)
+        problems = yield from walk.stop()
+        if not problems:  # amplifiers that were not seen to stand go on watching us
+            network.unguard()
+    except BaseException as error:
+        # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
+        with network.undisturbed():
+            walk.ended_by(error)
+            problems = _drain(walk.stop())
+            if not problems:
+                network.unguard()
+        for problem in problems:
+            error.add_note(f"while stopping: {problem}")
+        raise
     if problems:
         for problem in problems[1:]:
             problems[0].add_note(f"while stopping: {problem}")
@@ -122,6 +129,9 @@ def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError
         except StopIteration as end:
             problems: list[DriverError] = end.value
             return problems
+        except BaseException as cut:
+            cut.add_note("while stopping: the stop was cut short")
+            raise
 
 
 class _Walk:
@@ -254,25 +264,36 @@ class _Walk:
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
+    def ended_by(self, error: BaseException) -> None:
+        """Say why the moves are not made."""
+        self._emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
+
     def stop(self) -> Generator[Sample, None, list[DriverError]]:
         """Quick stop and power off for all axes; returns what could not be confirmed."""
         self._stream.drop_outgoing()  # a set-point that nobody has seen yet must not start a move now
         self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        problems: list[DriverError] = []
+        unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
+            # What the last cycle left is counted before SDO answers are looked for among it.
+            self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
         except DriverError as error:
-            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            return [error]
-        problems: list[DriverError] = []
+            # It may be one of several buses, or a node in a wrong place: those that can be reached are asked by SDO.
+            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            problems.append(error)
         try:
             silent = self._network.find_silent([self._network.axes[axis] for axis in unconfirmed])
         except DriverError as error:
             self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            return [error]
+            return problems or [error]
         if silent is not None:
             problems.append(silent)
+        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis] not in silent.node_ids]
+        if heard:
+            self._network.begin_stop([self._network.axes[axis] for axis in heard])
         for axis in unconfirmed:
-            if silent is not None and self._nodes[axis] in silent.node_ids:
+            if axis not in heard:
                 text = f"node {self._nodes[axis]} does not answer: it is not known to stand"
                 self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
                 continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from types import TracebackType
@@ -79,6 +79,8 @@ class Bounds:
     disable_s: float = 2.0
 
 
+Undisturbed = Callable[[], AbstractContextManager[None]]
+"""Makes blocks that no signal interrupts for a while: in them the axes are stopped and given back."""
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
 
@@ -104,6 +106,7 @@ class CanopenNetwork:
         bounds, policy: how long to wait.
         clock: monotonic time [ns].
         opener: makes the bus of an address, or the one that several make.
+        undisturbed: keeps signals from stopping the axes and giving them back.
     """
 
     def __init__(
@@ -117,13 +120,16 @@ class CanopenNetwork:
         policy: SdoPolicy = DEFAULT_POLICY,
         clock: Clock = time.monotonic_ns,
         opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
+        undisturbed: Undisturbed = nullcontext,
     ) -> None:
         self.axes = axes
+        self.undisturbed = undisturbed
         self.heartbeat_ms = heartbeat_ms
         self.guard_ms = guard_ms
         self.bounds = bounds
         self.link = Link(address, policy, clock, opener)
         self.node_ids = tuple(axis.node_id for axis in axes)
+        self.link.axis_ids = frozenset(self.node_ids)
         # The highest id is the last that anybody gives to a drive.
         self.recorder_id = next(n for n in range(127, 0, -1) if n not in self.node_ids)
         self._originals: dict[int, _Original] = {}
@@ -138,7 +144,11 @@ class CanopenNetwork:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            problems = self._give_back() if self._originals else []
+            with self.undisturbed():
+                problems = self._give_back() if self._originals else []
+        except BaseException as cut:
+            cut.add_note("while closing the network: it was cut short, and not every axis has its settings back")
+            raise
         finally:
             self.link.close()
         if error is not None:
@@ -221,22 +231,21 @@ class CanopenNetwork:
             seen = ", ".join(command_name(identifier) for identifier in sorted(self.link.foreign))
             raise BusBusy(str(self.link.address), seen)
 
-    @contextmanager
-    def guarded(self) -> Iterator[None]:
-        """Let the amplifiers watch us: within it they quick stop by themselves when we fall silent.
-
-        It ends before the network closes, so that what is slow after a run is not taken for the recorder's end.
-        """
+    def guard(self) -> None:
+        """Let the amplifiers watch us from now on: they quick stop by themselves when we fall silent."""
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
-        try:
-            yield
-        finally:
-            for node_id, original in self._originals.items():
-                if original.guard is not None and node_id not in self.link.silent:
-                    # What fails here is tried again, and told, when the network closes.
-                    with suppress(DriverError):
-                        disarm(self.link.objects(node_id), original.guard)
-            self.link.stop_heartbeat()
+
+    def unguard(self) -> None:
+        """End that once all axes are known to stand, so that what is slow after a run is not taken for our end.
+
+        Without it the guard ends when the network closes, axis by axis, after each was disabled.
+        """
+        for node_id, original in self._originals.items():
+            if original.guard is not None and node_id not in self.link.silent:
+                # What fails here is tried again, and told, when the network closes.
+                with suppress(DriverError):
+                    disarm(self.link.objects(node_id), original.guard)
+        self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
         """What the amplifiers of the prepared network lack to stop by themselves when the recorder is killed."""
@@ -389,6 +398,15 @@ class CanopenNetwork:
             if decode(statusword) is State.FAULT:
                 raise StateRefused(axis.node_id, "fault reset", str(State.FAULT), statusword)
 
+    def begin_stop(self, axes: Sequence[Axis]) -> None:
+        """Say quick stop by SDO to all these axes before `disable` waits for the first; it tells what fails here."""
+        for axis in axes:
+            access = self.link.objects(axis.node_id)
+            with suppress(DriverError):
+                state = decode(access.read(STATUSWORD))
+                if state not in POWERLESS:
+                    access.write(CONTROLWORD, next_command(state, Goal.QUICK_STOP))
+
     def disable(self, axis: Axis) -> None:
         """Quick stop one axis by SDO, then take its power, and confirm both by its statusword.
 
@@ -418,16 +436,24 @@ class CanopenNetwork:
         """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever the one before did."""
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._originals]
-        try:
-            # One bound for all: asked in turn, six dead nodes would keep a person waiting for a minute and more.
-            silent = self.find_silent(axes)
-        except DriverError as problem:
-            self._originals.clear()
-            return [problem]
+        silent: NodeMissing | None = None
+        for attempt in ("first", "last"):
+            try:
+                # One bound for all: asked in turn, six dead nodes would keep a person waiting for a minute and more.
+                silent = self.find_silent(axes)
+                break
+            except DriverError as problem:
+                # One of several buses that fails is told of once, and then the others go on.
+                if not problems or str(problem) != str(problems[0]):
+                    problems.append(problem)
+                if attempt == "last":
+                    self._originals.clear()
+                    return problems
         if silent is not None:
             silent.add_note("it is not known to stand, and its settings were not restored")
             problems.append(silent)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
+        self.begin_stop(axes)
         self._try(problems, [partial(self.disable, axis) for axis in axes])
         since_ns = self.link.clock()
         pre_operational = NmtCommand.ENTER_PRE_OPERATIONAL

@@ -64,8 +64,8 @@ class FollowedSync:
         period_ns: of the producer [ns].
         producer: its name, for messages.
         in_kernel: the producer is this machine's kernel; a SYNC from the wire is then somebody else's.
-        timeout_s: silence of the bus after which the producer is taken for dead; the stream then sends SYNC itself,
-            because the axes are stopped by frames that act on SYNC.
+        timeout_s: without a SYNC, whatever else is on the bus, after which the producer is taken for dead; the stream
+            then sends SYNC itself, because the axes are stopped by frames that act on SYNC.
         seen: told the monotonic time of each SYNC [ns], and how many periods after the one before it came.
         start_ns: wall time of the first SYNC [ns since 1970].
         clock: monotonic; what has passed by it since the first SYNC is added to start_ns [ns].

@@ -15,6 +15,7 @@ import sys
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import can
@@ -158,7 +159,7 @@ class SocketcanBus(can.BusABC):
         self.remarks = remarks
         self._channel = channel
         self._received: deque[can.Message] = deque()
-        self._rest = b""
+        self._chunks: deque[bytes] = deque()
         self._ready = False
         self._end: str | None = None
         self._socket = handle
@@ -197,9 +198,10 @@ class SocketcanBus(can.BusABC):
         deadline: float | None = None
         while True:
             try:
-                self._socket.send(frame)
+                self._socket.send(frame, socket.MSG_DONTWAIT)
             except OSError as error:
-                if error.errno != errno.ENOBUFS:
+                # A full queue of the interface, and a full buffer of the socket: the kernel would wait for ever.
+                if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
                 # The interface's queue holds ten frames by default; a burst of set-points is longer.
                 now = time.monotonic()
@@ -228,42 +230,50 @@ class SocketcanBus(can.BusABC):
         if self._end is not None:
             raise can.CanOperationError(self._end)
         try:
-            chunk = self._take(timeout_s)
+            # What an interrupted call took and did not make frames of comes first.
+            if sum(map(len, self._chunks)) < RECORD.size and not self._take(timeout_s):
+                return
         except (OSError, ValueError) as error:
             raise can.CanOperationError(str(error)) from error
-        if chunk is None:
-            return
-        if not chunk:
+        if not self._chunks[-1]:
             self._end = f"the capture process ended by itself ({self._wait()}); frames since then are lost"
             raise can.CanOperationError(self._end)
-        self._parse(self._rest + chunk)
+        self._parse()
         if self._end is not None and not self._received:
             raise can.CanOperationError(self._end)
 
-    def _take(self, timeout_s: float | None) -> bytes | None:
+    def _take(self, timeout_s: float | None) -> bool:
+        """Append what the capture process has sent to the chunks; tells whether there was anything."""
+        # Within one call into C, so that no signal handler's exception comes between receiving and keeping.
+        receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
         try:
             # Beside a busy thread each system call may cost the wait for the interpreter: not one too many.
-            return self._pair.recv(_PAIR_BYTES, socket.MSG_DONTWAIT)
+            self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
         except BlockingIOError:
             if timeout_s == 0 or not select.select((self._pair,), (), (), timeout_s)[0]:
-                return None
-        return self._pair.recv(_PAIR_BYTES)
+                return False
+            self._chunks.extend(receive((0,)))
+        return True
 
-    def _parse(self, chunk: bytes) -> None:
+    def _parse(self) -> None:
+        """Make frames of the chunks; an exception on the way, such as Ctrl-C, leaves them for the next time."""
+        chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
-        self._rest = chunk[whole:]
+        rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
         lost = [self.losses.kernel, self.losses.interface, self.losses.backlog]
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
                 # Of what we sent ourselves only SYNC is of interest: when it really went out.
                 if not own or can_id == 0x080:
-                    self._received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
+                    received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
             elif kind == Kind.READY:
-                self._ready = True
+                ready = True
             elif kind == Kind.END:
-                self._end = _reason(can_id)
-        self.losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
+                end = _reason(can_id)
+        losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
+        # Nothing is called from here on: all of it, or none.
+        self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
 
     def _message(
         self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool

@@ -10,12 +10,15 @@ from __future__ import annotations
 import re
 import select
 import socket
+import time
 from collections import deque
 from collections.abc import Sequence
 
 import can
 
 CONNECT_TIMEOUT_S = 5.0
+SEND_S = 2.0
+"""How long a server may take nothing; what was sent of a frame by then cannot be taken back."""
 _RECEIVE_BYTES = 1 << 16
 _FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]+) ([0-9]+\.?[0-9]*) ([0-9A-Fa-f]*)|([^>]*)) >")
 
@@ -41,6 +44,7 @@ class SocketcandBus(can.BusABC):
         self._channel = channel
         self._received: deque[can.Message] = deque()
         self._buffer = b""
+        self._stuck: str | None = None
         self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -75,11 +79,25 @@ class SocketcandBus(can.BusABC):
         self.send_burst((msg,))
 
     def send_burst(self, messages: Sequence[can.Message]) -> None:
-        """Send frames in one system call."""
+        """Send frames, in one system call where the server takes them."""
+        if self._stuck is not None:
+            raise can.CanOperationError(self._stuck)
         try:
-            self._socket.sendall(b"".join(map(send_line, messages)))
+            self._send_all(memoryview(b"".join(map(send_line, messages))))
         except OSError as error:
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+
+    def _send_all(self, data: memoryview) -> None:
+        end_s: float | None = None
+        while data:
+            try:
+                data = data[self._socket.send(data, socket.MSG_DONTWAIT) :]
+            except BlockingIOError:
+                end_s = time.monotonic() + SEND_S if end_s is None else end_s
+                left_s = end_s - time.monotonic()
+                if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
+                    self._stuck = f"{self.channel_info}: the server takes nothing for {SEND_S:g} s"
+                    raise can.CanOperationError(self._stuck) from None
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.

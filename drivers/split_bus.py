@@ -3,7 +3,7 @@
 A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven bits of their COB-ID
 (CiA 301, predefined connection set), NMT by its second byte. What concerns everybody goes to all: SYNC, NMT to all, and
 the heartbeat of the recorder, whose id is no node's. Received frames come in the order of their time stamps, which
-every interface takes from clocks of this one computer.
+every interface takes from clocks of this one computer: monotonic where all have one, else by the wall clock.
 
 A bus that fails is told of once, as a BusError with its name; then the others go on without it, so that the axes on
 them can be stopped and given back. Its own nodes are silent from then on.
@@ -21,7 +21,7 @@ import can
 
 from drivers.bus import BusAddress, open_bus, send_burst
 from drivers.errors import BusError, NodeMisplaced
-from drivers.socketcan import Losses, losses_of, remarks_of
+from drivers.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 
 ALTERNATION_S = 0.0005
 """Of waiting at one bus while another may receive, where one of them has no file descriptor to wait at."""
@@ -231,7 +231,13 @@ class SplitBus(can.BusABC):
 
     def _oldest(self) -> int | None:
         """The bus of the oldest of the frames that wait, one a bus; None where there is none."""
-        heads = [(message.timestamp, index) for index, message in enumerate(self._waiting) if message is not None]
+        waiting = [(message, index) for index, message in enumerate(self._waiting) if message is not None]
+        # The wall clock can be set between two frames, and a float of its seconds has steps of 200 ns.
+        heads: list[tuple[float, int]] = [
+            (m.monotonic_ns, index) for m, index in waiting if isinstance(m, CapturedMessage)
+        ]
+        if len(heads) < len(waiting):
+            heads = [(message.timestamp, index) for message, index in waiting]
         if not heads:
             return None
         if len(heads) > 1 and self._run >= LARGEST_RUN:

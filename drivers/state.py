@@ -34,8 +34,8 @@ class State(Enum):
         return self.name.replace("_", " ")
 
 
-POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.UNKNOWN)
-"""States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does."""
+POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT)
+"""States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does, in UNKNOWN it may."""
 
 STATE_BITS = 0x6F
 """The bits of the statusword that tell the state."""

@@ -14,7 +14,7 @@ from struct import Struct
 import can
 
 from drivers.bus import bus_errors
-from drivers.errors import BusError, CellSilent, PdoLengthWrong, SampleLost
+from drivers.errors import BusError, CellSilent, NodeMisplaced, PdoLengthWrong, SampleLost
 from drivers.event import CellEvent, EventKind, EventSink, discard
 from drivers.link import SYNC_COB_ID
 from drivers.mapping import Direction, feedback_entries, layout, pack, records
@@ -29,7 +29,9 @@ SHORTENED, STRAGGLING = 16, 4
 """Parts of a lockstep cycle's bound: for a cell that was silent before, and for axes when others have answered."""
 
 LARGEST_LAG_NS = 1_000_000_000
-"""Of the reader behind a followed SYNC; what it sees of the axes is then older than what a person would bear."""
+"""Of the reader behind the bus; what it sees of the axes is then older than what a person would bear."""
+FRAMES_PER_S = 50_000
+"""More than two buses of 1 Mbit/s carry: among so many frames a producer that is alive has been heard."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +112,11 @@ class SyncStream:
         CellSilent: the same, and no axis answered.
         PdoLengthWrong: an axis answers twice in a row with a PDO that is not as long as its mapping.
         LimitActive: a limit of a drive acts for too long.
-        BusBusy: another master sends SYNC or NMT commands.
+        BusBusy: another master sends SYNC, NMT commands or set-points of an axis.
         HeartbeatLost: a node is silent for more than two of its periods.
-        BusError: the bus has gone, the followed SYNC does not come any more, or it is read more than a second late.
+        BusError: the bus, one of its parts or the capture process has gone, the followed SYNC does not come any more,
+            or the bus is read more than a second late.
+        NodeMisplaced: a node is heard on another of the cell's buses than its own.
     """
 
     def __init__(
@@ -147,6 +151,8 @@ class SyncStream:
         self._opened: can.Message | None = None
         self._rate = SyncRate(pacing.period_ns)
         self._behind = False
+        self._overdue = 0
+        self._waited = self._over = False
         self._base = self._losses = Losses()
         self._time_ns = pacing.start_ns
         self._watch = Watch(network, on_event)
@@ -210,14 +216,16 @@ class SyncStream:
 
         Raises:
             BusError: the bus has gone.
+            NodeMisplaced: as `next`.
         """
+        self._over = False
         try:
             with bus_errors(self._link.address):
                 if self._cycles == 0:
                     self._begin()
                 pacing = self.pacing
                 self._collect(self._follow_sync(pacing) if isinstance(pacing, FollowedSync) else self._send_sync())
-        except BusError as error:
+        except (BusError, NodeMisplaced) as error:
             self._on_event(CellEvent(self._time_ns, None, EventKind.BUS_LOST, 0, str(error)))
             raise
         return self._finish_cycle()
@@ -225,27 +233,55 @@ class SyncStream:
     def _begin(self) -> None:
         """What came before the first SYNC is nobody's, and what was lost before it is not missed."""
         bus, begun_ns = self._link.bus, self.pacing.clock()
-        while self._opened is None and (message := bus.recv(0.0)) is not None:
+        for message in self._waiting():
             fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
             if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
                 self._opened = message  # a reader that is no faster than the bus would look for an end for ever
-            else:
-                self._between_cycles(message)
+                break
+            self._between_cycles(message)
         self._base = losses_of(bus)
         for remark in remarks_of(bus):
             self._on_event(CellEvent(self._time_ns, None, EventKind.CAPTURE, 0, remark))
 
+    def _waiting(self) -> Iterator[can.Message]:
+        """The frames that have come already; who is at them for too long sees no axis any more."""
+        clock, recv = self.pacing.clock, self._link.bus.recv
+        begun_ns = clock()
+        while (message := recv(0.0)) is not None:
+            yield message
+            if (behind_ns := clock() - begun_ns) > LARGEST_LAG_NS:
+                self._fall_behind(behind_ns)
+                return
+
+    def _fall_behind(self, behind_ns: int) -> None:
+        """A fault, once: whether anything is lost the counters say."""
+        if not self._behind:
+            self._behind = True
+            reason = f"read {behind_ns * 1e-9:.1f} s late: nobody watches axes that move so"
+            self._watch.faults.append(BusError(str(self._link.address), reason))
+
+    def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
+        """The next frame until a time by the clock, or that had come by then: a late reader is no dead producer."""
+        self._link.beat()
+        while (left_ns := end_ns - pacing.clock()) > 0:
+            message = self._link.bus.recv(left_ns * 1e-9)
+            if message is not None:
+                return message
+        self._overdue += 1
+        return self._link.bus.recv(0.0) if self._overdue <= FRAMES_PER_S * pacing.timeout_s else None
+
     def _follow_sync(self, pacing: FollowedSync) -> int:
-        """Send what waits, and find the next SYNC among the frames; returns its time, by the monotonic clock."""
-        bus = self._link.bus
+        """Send what waits, and find the next SYNC among the frames; returns until when the one after it must come."""
         self._link.beat()
         if self._outgoing:
             # As early in the period as can be: all of it should be there before the next SYNC.
             outgoing, self._outgoing = self._outgoing, []
             self._link.send(outgoing)
         sync, self._opened = self._opened, None
+        # Where answers of the last cycle were missing, the wait for them was a wait for this SYNC already.
+        end_ns = pacing.clock() + round(pacing.timeout_s * 1e9) // (2 if self._waited else 1)
         while sync is None:
-            message = bus.recv(pacing.timeout_s)
+            message = self._until_sync(pacing, end_ns)
             if message is None:
                 return self._lose_sync(pacing)
             if _is_sync(message):
@@ -265,15 +301,15 @@ class SyncStream:
                 self._link.note_foreign(SYNC_COB_ID)
         if pacing.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
             self._link.note_foreign(SYNC_COB_ID)
-        if not self._behind and (behind_ns := pacing.clock() - at_ns) > LARGEST_LAG_NS:
-            self._behind = True
-            reason = f"read {behind_ns * 1e-9:.1f} s late: nothing is lost, but nobody watches axes that move so"
-            self._watch.faults.append(BusError(str(self._link.address), reason))
+        now_ns = pacing.clock()
+        if now_ns - at_ns > LARGEST_LAG_NS:
+            self._fall_behind(now_ns - at_ns)
         pacing.seen(at_ns, periods)
         self._last_sync_ns = at_ns
         self._time_ns = pacing.start_ns + at_ns - self._first_sync_ns
         self._cycles += 1
-        return at_ns
+        self._overdue, self._waited = 0, False
+        return now_ns + round(pacing.timeout_s * 1e9)
 
     def _lose_sync(self, pacing: FollowedSync) -> int:
         """The producer is dead: tell it once, and send SYNC from now on, because the axes must be stopped."""
@@ -291,8 +327,8 @@ class SyncStream:
         """Send what waits and the SYNC; returns until when its answers may come, by the clock."""
         pacing, bus = self.pacing, self._link.bus
         self._link.beat()
-        while (message := bus.recv(0.0)) is not None:
-            self._between_cycles(message)
+        for before in self._waiting():
+            self._between_cycles(before)
         now = pacing.clock()
         if self._cycles == 0:
             self._first_sync_ns = self._next_sync_ns = self._answered_ns = now
@@ -309,6 +345,8 @@ class SyncStream:
                 now = pacing.clock()
             slipped = (now - self._next_sync_ns) // pacing.period_ns
             self._skipped += slipped
+            if slipped * pacing.period_ns > LARGEST_LAG_NS:
+                self._fall_behind(slipped * pacing.period_ns)
             self._time_ns = pacing.start_ns + now - self._first_sync_ns
             deadline_ns = self._next_sync_ns = self._next_sync_ns + (slipped + 1) * pacing.period_ns
         outgoing, self._outgoing = self._outgoing, []
@@ -321,7 +359,8 @@ class SyncStream:
         recv, clock = self._link.bus.recv, self.pacing.clock
         if isinstance(self.pacing, FollowedSync):
             # By the order on the bus alone: whatever the clock says, what has come already is read first.
-            message = recv(self.pacing.timeout_s)
+            message = self._until_sync(self.pacing, deadline_ns)
+            self._waited = message is None
             if message is not None and _is_sync(message):
                 self._opened = message
                 return None
@@ -338,6 +377,8 @@ class SyncStream:
     def _note_own_sync(self, message: CapturedMessage) -> None:
         """The SYNC of this cycle as the kernel saw it; what is made up keeps its time."""
         if isinstance(self.pacing, TimedSync):
+            if (behind_ns := self.pacing.clock() - message.monotonic_ns) > LARGEST_LAG_NS:
+                self._fall_behind(behind_ns)
             if self._cycles == 1:
                 self._first_sync_ns = message.monotonic_ns
             self._time_ns = self.pacing.start_ns + message.monotonic_ns - self._first_sync_ns
@@ -398,6 +439,30 @@ class SyncStream:
         elif self._short[identifier] == self._cycles - 1:
             self._watch.faults.append(PdoLengthWrong(node_id, identifier, slot.length, found))
         self._short[identifier] = self._cycles
+
+    def read_on(self, seconds: float) -> None:
+        """After the last cycle: count what it left on the bus, and what this machine tells late of its losses.
+
+        Sends nothing. Answers after the first such call, or after the next SYNC of a producer that is followed, are
+        nobody's: others may have sent SYNC by then, to stop axes by SDO.
+
+        Raises:
+            BusError: the bus has gone, and so has what it would have told.
+            NodeMisplaced: as `next`.
+        """
+        clock, followed = self.pacing.clock, isinstance(self.pacing, FollowedSync)
+        over = self._over or self._opened is not None
+        end_ns = clock() + round(seconds * 1e9)
+        with bus_errors(self._link.address):
+            while (left_ns := end_ns - clock()) > 0:
+                if (late := self._link.bus.recv(left_ns * 1e-9)) is None:
+                    continue
+                over = over or (followed and _is_sync(late))
+                if not (over and late.arbitration_id in self._slots):
+                    self._between_cycles(late)
+        self._over = True
+        self._note_losses()
+        self._watch.note_events(self._time_ns)
 
     def _between_cycles(self, message: can.Message) -> None:
         """A frame that is read before the next SYNC, and so answers none that is still open."""

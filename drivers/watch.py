@@ -52,7 +52,7 @@ class Watch:
             missing: bit i is set when axis i did not answer this cycle.
         """
         if self._link.has_events:
-            self._note_events(time_ns)  # first: an EMCY says why, the statusword only that
+            self.note_events(time_ns)  # first: an EMCY says why, the statusword only that
         if self._unheard or statuswords != self._statuswords:
             self._note_statuswords(time_ns, statuswords, missing)
         if self._limited_since_ns:
@@ -105,7 +105,8 @@ class Watch:
                 self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
                 self.faults.append(LimitActive(self._network.node_ids[axis], LIMIT_S, word))
 
-    def _note_events(self, time_ns: int) -> None:
+    def note_events(self, time_ns: int) -> None:
+        """What the nodes said of themselves since the last cycle, at a time of the samples."""
         for event in self._link.take_events(time_ns, self._network.node_ids):
             self._on_event(event)
             if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:

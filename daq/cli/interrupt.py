@@ -6,8 +6,10 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
+
+from drivers.network import Undisturbed
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 10.0
@@ -17,21 +19,22 @@ GRACE_S = 10.0
 @contextmanager
 def interruptible(
     clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
-) -> Iterator[None]:
+) -> Iterator[Undisturbed]:
     """Turn some signals within the block into KeyboardInterrupt; pass over those that follow too soon.
 
     By default SIGTERM and SIGHUP end a process at once, and the axes would go on; a shell script starts what it puts
     into the background (&) deaf to SIGINT, and only a handler of its own makes it hear again. What follows the first
     signal is the stop of the axes: a second one, of an impatient person, must not cut that short. Later ones count
-    again, so that nobody is left without a way out. In another thread than the main one nothing changes: Python handles
-    no signals there.
+    again, so that nobody is left without a way out. A stop that a fault began is protected as long by whoever makes it,
+    with what is yielded; a signal that comes meanwhile is dropped, for it asks for what is being done. In another
+    thread than the main one nothing changes: Python handles no signals there.
 
     Args:
         clock: monotonic time [s].
         signals: those that interrupt.
     """
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield nullcontext
         return
 
     deaf_until_s = float("-inf")
@@ -42,9 +45,18 @@ def interruptible(
             deaf_until_s = clock() + GRACE_S
             raise KeyboardInterrupt
 
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        nonlocal deaf_until_s
+        earlier_s, deaf_until_s = deaf_until_s, max(deaf_until_s, clock() + GRACE_S)
+        try:
+            yield
+        finally:
+            deaf_until_s = earlier_s
+
     before = [(number, signal.signal(number, interrupt)) for number in signals]
     try:
-        yield
+        yield undisturbed
     finally:
         for number, handler in before:
             signal.signal(number, handler)

@@ -16,7 +16,7 @@ from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell, MotionPolicy, Pacing
 from daq.configuration.cell_bus import bus_loads
 from daq.configuration.cell_file import load_cell
-from daq.errors import ExitCode, OutputExists, UsageError
+from daq.errors import DiskSpaceShort, ExitCode, OutputExists, OutputFailed, UsageError
 from daq.plan import slowed
 from daq.plan_file import load_plan
 from daq.record import record
@@ -51,7 +51,7 @@ def record_verb(
     for line in load_lines(declared):
         typer.echo(line, err=True)
     try:
-        with interruptible(), progress_bar("recording") as told:
+        with interruptible() as undisturbed, progress_bar("recording") as told:
             done = record(
                 cell,
                 declared,
@@ -62,6 +62,7 @@ def record_verb(
                 granted_by=granted(declared, who, enable_motion),
                 run_id=str(uuid.uuid4()),
                 speed=speed,
+                undisturbed=undisturbed,
                 progress=lambda count, total: told(count, total, "moves"),
             )
     except KeyboardInterrupt as interrupt:
@@ -131,8 +132,14 @@ def _way_on(part: Path) -> str:
 
 def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:
     """What became of the axes and of the recording, in one line."""
-    # What the stop could not confirm is noted on the interrupt on its way up.
-    problems = "; ".join(getattr(interrupt, "__notes__", ()))
+    # What the stop could not confirm is noted on the interrupt on its way up; one that came while a stop was being made
+    # for another reason has cut that short.
+    first = interrupt.__context__
+    while first is not None and not isinstance(first, DriverError | OutputFailed | DiskSpaceShort | KeyboardInterrupt):
+        first = first.__context__
+    told = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
+    told += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
+    problems = "; ".join(told)
     axes = f"NOT ALL AXES ARE KNOWN TO STAND, press the emergency stop ({problems})" if problems else "axes stopped"
     if made is None:
         return f"interrupted: {axes}; nothing was recorded"

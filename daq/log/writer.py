@@ -65,8 +65,8 @@ class LogContent:
 class _Verdict:
     """What the recorder says at the end, see `LogWriter.conclude`."""
 
-    valid: bool = True
-    reason: str = ""
+    valid: bool = False
+    reason: str = "not concluded"
     partial: bool = False
     wall_minus_monotonic_ns: int | None = None
 
@@ -186,7 +186,7 @@ class LogWriter:
     def conclude(
         self, valid: bool, reason: str = "", *, partial: bool = False, wall_minus_monotonic_ns: int | None = None
     ) -> None:
-        """Say how the run went; it is valid and whole unless told otherwise.
+        """Say how the run went; a log of which nobody says so is not valid.
 
         Args:
             valid, reason: whether the run may be used, and why not.

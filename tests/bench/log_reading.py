@@ -50,6 +50,7 @@ def write_log(path: Path, seconds: int) -> Path:
                 cycle = second * RATE_HZ + k
                 stamp_ns = START_NS + cycle * 1_000_000
                 log.write(Sample(cycle, stamp_ns, tuple(position[k]), tuple(current[k]), (0x1237,) * AXES))
+        log.conclude(valid=True)
     return path
 
 

@@ -211,3 +211,10 @@ def test_the_size_of_a_block_changes_nothing_but_the_blocks(
     saved = np.concatenate([b.position_counts for b in cut.until_damage()])[:, 1]
     assert cut.damage is not None
     np.testing.assert_array_equal(saved, np.arange(900))
+
+
+def test_a_log_of_which_nobody_said_how_it_went_is_not_valid(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: 0) as log:
+        log.write(samples([[1]])[0])
+    told = read_log(tmp_path / "a.mcap").statistics
+    assert (told.valid, told.reason) == (False, "not concluded")

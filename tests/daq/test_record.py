@@ -18,9 +18,12 @@ from daq.conversion import load_run
 from daq.errors import ExitCode, RunInvalid
 from daq.log.reader import read_log
 from daq.plan_file import load_plan
-from daq.record import Clocks, Recorded, record
-from drivers.errors import SampleLost
-from drivers.network import CanopenNetwork
+from daq.record import LATE_LOSSES_S, Clocks, Recorded, record
+from daq.salvage import salvage
+from drivers.errors import NodeMisplaced, SampleLost
+from drivers.event import EventKind
+from drivers.network import CanopenNetwork, Undisturbed
+from drivers.socketcan import Losses
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
 WALL_NS = 1_700_000_000_000_000_000
@@ -49,7 +52,7 @@ class Rig:
         self.network, self.bus = cell(6)
         self.bus.nodes[ELBOW - 1].position = ELBOW_COUNTS
 
-        def network_of(_cell: Cell) -> CanopenNetwork:
+        def network_of(_cell: Cell, _undisturbed: Undisturbed) -> CanopenNetwork:
             return self.network
 
         patch.setattr("daq.record.network_of", network_of)
@@ -207,3 +210,76 @@ def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     assert set(np.diff(log.samples.time_ns)) == {PERIOD_NS}
     assert main(["info", str(lockstep.out), "--json"]) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
+
+
+def test_what_is_told_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interface's own counters are looked at five times a second, so they may tell after the last cycle."""
+    bus, recv = lockstep.bus, lockstep.bus.recv
+    ended_ns: list[int] = []
+
+    def late(timeout: float | None = None) -> can.Message | None:
+        if timeout == pytest.approx(LATE_LOSSES_S) and not ended_ns:
+            ended_ns.append(bus.clock.now_ns)
+        if ended_ns and bus.clock.now_ns - ended_ns[0] > 200_000_000:
+            bus.losses = Losses(interface=2)  # type: ignore[attr-defined]
+        return recv(timeout)
+
+    monkeypatch.setattr(bus, "recv", late)
+    done = lockstep.run()
+    assert (done.log.valid, done.log.reason) == (False, "2 frames dropped by the interface")
+    assert any(event.kind is EventKind.FRAMES_DROPPED for event in read_log(lockstep.out).events)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, NodeMisplaced(1, "A", "B")], ids=["Ctrl-C", "misplaced"])
+def test_a_recording_that_ended_early_is_not_salvaged_as_a_valid_one(
+    lockstep: Rig, error: BaseException, tmp_path: Path
+) -> None:
+    def end(cycle: int) -> None:
+        if cycle == 150:
+            raise error
+
+    lockstep.bus.on_cycle = end
+    with pytest.raises((KeyboardInterrupt, NodeMisplaced)):
+        lockstep.run()
+    saved = salvage(lockstep.out.with_name("a.mcap.part"), tmp_path / "saved.mcap")
+    assert not saved.statistics.valid
+    assert "ended (" in saved.statistics.reason
+
+
+def test_an_answer_that_comes_twice_to_the_last_sync_of_all_is_counted(lockstep: Rig) -> None:
+    """Behind it SDO answers are looked for on the same bus: the amplifiers end watching us."""
+    for node in lockstep.bus.nodes:
+        node.objects[0x1016, 0], node.objects[0x1016, 1], node.objects[0x6007, 0] = (1, 1), (0, 4), (1, 2)
+
+    doubled: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        nodes = lockstep.bus.nodes
+        stopped = all(node.statusword & 0x6F == 0x40 and node.powered_cycles for node in nodes)
+        if message.arbitration_id != 0x186 or not stopped:
+            return (message,)
+        doubled.append(lockstep.bus.cycle)
+        return (message, message)
+
+    lockstep.bus.tamper = tamper
+    done = lockstep.run()
+    assert doubled[-1] == lockstep.bus.cycle
+    assert (done.log.valid, done.log.reason) == (False, f"{len(doubled)} answers twice")
+
+
+def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
+    timed: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That takes SYNCs too, whose answers belong to no sample."""
+    network, bus = timed.network, timed.bus
+    unguard = network.unguard
+
+    def late_answers() -> None:
+        unguard()
+        for node in bus.nodes:
+            for answer in node.on_sync(bus.cycle):
+                bus.inject(answer)
+
+    monkeypatch.setattr(network, "unguard", late_answers)
+    done = timed.run()
+    assert (done.log.valid, done.log.reason) == (True, "")

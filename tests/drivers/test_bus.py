@@ -14,6 +14,7 @@ from drivers.errors import BusError
 from drivers.hub import HOST, Hub
 from drivers.link import Link
 from drivers.sdo import SdoPolicy
+from drivers.socketcand import SocketcandBus
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends, same
 from tests.drivers.scripted import FakeClock
 
@@ -126,6 +127,23 @@ def test_the_hub_hangs_up_on_what_is_no_socketcand() -> None:
         while chunk := client.recv(256):
             heard += chunk
         assert heard == b"< hi >"
+
+
+def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.socketcand.SEND_S", 0.02)
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    frame = can.Message(arbitration_id=1, is_extended_id=False, data=bytes(8))
+    with theirs:
+        with pytest.raises(can.CanOperationError, match=r"takes nothing for 0\.02 s"):
+            for _ in range(100_000):
+                end.send_burst((frame,) * 100)
+        with pytest.raises(can.CanOperationError, match="takes nothing"):  # half a frame may have gone out
+            end.send(frame)
+    end.shutdown()
 
 
 def test_remote_frames_are_refused_where_the_protocol_has_none() -> None:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager, nullcontext
 
 import can
 import pytest
 
 from drivers.axis import Axis
-from drivers.errors import DriveFault, HeartbeatLost, MotionRefused, MotionTimeout, SampleLost, StateRefused
+from drivers.errors import (
+    BusError,
+    DriveFault,
+    DriverError,
+    HeartbeatLost,
+    MotionRefused,
+    MotionTimeout,
+    NodeMisplaced,
+    SampleLost,
+    StateRefused,
+)
 from drivers.event import CellEvent, EventKind
 from drivers.motion import MotionBounds, execute
 from drivers.move import Move, synchronised_move
@@ -317,3 +327,134 @@ def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> Non
     assert any("while stopping" in note for note in error.value.__notes__)
     assert events[-1].kind is EventKind.STOP_UNCONFIRMED
     bus.on_cycle = lambda cycle: None
+
+
+def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
+    _, _, bus, events = moving
+    bus.nodes[1].ignores_setpoint = True
+    with pytest.raises(MotionTimeout):
+        run(moving, FAR)
+    kinds = [event.kind for event in events]
+    (ended,) = [event for event in events if event.kind is EventKind.ENDED]
+    assert ended.text.startswith("MotionTimeout: move 0: axis 2 did not")
+    assert kinds.index(EventKind.ENDED) < kinds.index(EventKind.STOP)
+
+
+def test_moves_that_were_made_end_for_no_reason(moving: Moving) -> None:
+    run(moving, FAR)
+    assert EventKind.ENDED not in [event.kind for event in moving[3]]
+
+
+def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:
+    """What would interrupt it is asked to wait from its first frame to its last."""
+    network, _, bus, events = moving
+    inside: list[bool] = []
+
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        assert EventKind.STOP not in [event.kind for event in events]
+        inside.append(True)
+        yield
+        assert powerless(bus)
+        inside.clear()
+
+    def act(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            assert inside
+
+    network.undisturbed = undisturbed
+    bus.on_cycle = act
+    with pytest.raises(DriveFault):
+        run(moving, FAR)
+    bus.on_cycle = lambda _cycle: None
+    network.undisturbed = nullcontext
+
+
+def test_a_stop_that_is_cut_short_says_so(moving: Moving) -> None:
+    _, _, bus, events = moving
+
+    def act(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise KeyboardInterrupt
+
+    bus.on_cycle = act
+    with pytest.raises(KeyboardInterrupt) as cut:
+        run(moving, FAR)
+    assert cut.value.__notes__ == ["while stopping: the stop was cut short"]
+    assert isinstance(cut.value.__context__, DriveFault)
+
+
+def test_amplifiers_that_were_not_seen_to_stand_go_on_watching_us(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, _, bus, events = moving
+
+    def refuse(axis: Axis) -> None:
+        raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "OPERATION ENABLED", 0x27)
+
+    def deaf(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.nodes[0].statusword = bus.nodes[0].statusword & ~0x6F | 0x27
+
+    bus.on_cycle = deaf
+    ended: list[str] = []
+    with monkeypatch.context() as patched:
+        patched.setattr(network, "disable", refuse)
+        patched.setattr(network.link, "stop_heartbeat", lambda: ended.append("heartbeat"))
+        with pytest.raises(DriveFault):
+            run(moving, FAR)
+    assert not ended
+    bus.on_cycle = lambda _cycle: None
+
+
+def test_what_is_stopped_by_sdo_is_told_so_before_one_is_waited_for(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, _, bus, events = moving
+    disable, told = network.disable, []
+
+    def note(axis: Axis) -> None:
+        told.append([node.statusword & 0x6F for node in bus.nodes])
+        disable(axis)
+
+    def deaf(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events] and not told:
+            for node in bus.nodes:
+                node.statusword = node.statusword & ~0x6F | 0x27
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = deaf
+    monkeypatch.setattr(network, "disable", note)
+    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    assert told[0] == [0x07, 0x07]
+    assert powerless(bus)
+
+
+@pytest.mark.parametrize("error", [BusError("bus B", "bus-off"), NodeMisplaced(9, "A", "B")], ids=["bus", "misplaced"])
+def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_stopped(
+    moving: Moving, error: DriverError
+) -> None:
+    """Of several buses one that fails is told of once."""
+    _, _, bus, events = moving
+
+    def fail(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise error
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = fail
+    with pytest.raises(type(error)):
+        run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    assert powerless(bus)
+    assert EventKind.BUS_LOST in [event.kind for event in events]
+    assert EventKind.STOP_UNCONFIRMED in [event.kind for event in events]

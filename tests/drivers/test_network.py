@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import can
 import pytest
@@ -276,3 +278,49 @@ def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> 
         network.prepare()
     assert not any(node.powered_cycles for node in bus.nodes)
     assert bus.nodes[0].value(0x6060, 0) == 8  # everything was given back
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_axes_with_power(times: int) -> None:
+    network, bus = cell(2)
+    send, told = bus.send, 0
+
+    def fail(msg: can.Message, timeout: float | None = None) -> None:
+        nonlocal told
+        if 0x600 < msg.arbitration_id < 0x680 and told < times:
+            told += 1
+            raise BusError("bus B", "bus-off")  # as a split bus does, once
+        send(msg, timeout)
+
+    with pytest.raises(BusError, match="bus B: bus-off"), network:
+        network.prepare()
+        for node in bus.nodes:
+            node.statusword = 0x0227
+        bus.send = fail  # type: ignore[method-assign]
+    given_up = times > 1
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x27 if given_up else 0x40] * 2
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [1 if given_up else 8] * 2
+    assert told == (2 if given_up else 1)
+
+
+def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
+    network, bus = cell(1)
+    inside: list[bool] = []
+
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        inside.append(True)
+        yield
+
+    network.undisturbed = undisturbed
+    send = bus.send
+
+    def cut(msg: can.Message, timeout: float | None = None) -> None:
+        if inside:
+            raise KeyboardInterrupt
+        send(msg, timeout)
+
+    bus.send = cut  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt) as interrupt, network:
+        network.prepare()
+    assert ["cut short" in note for note in interrupt.value.__notes__] == [True]

@@ -8,6 +8,8 @@ import signal
 import socket
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
 
 import can
 import pytest
@@ -193,6 +195,30 @@ def test_an_interface_that_goes_is_named_after_its_last_frames() -> None:
     bus.shutdown()
 
 
+def test_an_interrupt_while_records_are_read_loses_and_misaligns_none(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, wire = pair
+    make, calls = bus._message, 0
+
+    def interrupted(*fields: Any) -> CapturedMessage:
+        nonlocal calls
+        calls += 1
+        if calls in (1, 3):
+            raise KeyboardInterrupt
+        return make(*fields)
+
+    monkeypatch.setattr(bus, "_message", interrupted)
+    for number in range(20):
+        wire.send(FRAME.pack(0x181, 1, bytes((number,)) * 8))
+    got: list[int] = []
+    while len(got) < 20:
+        with suppress(KeyboardInterrupt):
+            got.append(received(bus).data[0])
+    assert got == list(range(20))
+    assert calls > 20
+
+
 def test_ctrl_c_does_not_end_the_capture(pair: Pair) -> None:
     bus, wire = pair
     assert os.getsid(bus.capture_pid) != os.getsid(0)
@@ -258,17 +284,21 @@ def test_a_sync_of_somebody_else_is_foreign_until_we_asked_for_it() -> None:
     assert _dispatch(frame).foreign == {SYNC_COB_ID: 1}
 
 
-def test_a_full_transmit_queue_is_waited_for_and_then_named(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
+def test_a_full_transmit_queue_is_waited_for_and_then_named(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
     bus, _ = pair
     tries = 0
 
     class Full:
-        def send(self, _frame: bytes) -> int:
+        def send(self, _frame: bytes, flags: int) -> int:
+            assert flags & socket.MSG_DONTWAIT
             nonlocal tries
             tries += 1
             if tries == 3:
                 return 16
-            raise OSError(errno.ENOBUFS, "No buffer space available")
+            raise OSError(number, "full")
 
     monkeypatch.setattr(bus, "_socket", Full())
     bus.send(can.Message(arbitration_id=1, is_extended_id=False))

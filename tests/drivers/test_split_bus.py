@@ -16,7 +16,7 @@ from drivers.errors import BusError, NodeMisplaced
 from drivers.hub import Hub
 from drivers.link import Link, NmtCommand
 from drivers.sdo import SdoPolicy
-from drivers.socketcan import Losses, losses_of, remarks_of
+from drivers.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_split_bus
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends
 from tests.drivers.scripted import FakeClock
@@ -331,3 +331,20 @@ def test_losses_of_all_buses_count_and_remarks_have_their_bus(pair: Pair) -> Non
     pair.right.remarks = ("a small buffer",)
     assert losses_of(pair.bus) == Losses(kernel=7, backlog=1)
     assert remarks_of(pair.bus) == ("right (scripted:right): a small buffer",)
+
+
+@pytest.mark.parametrize("step_s", [0.0, -3600.0, 3600.0])
+def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(pair: Pair, step_s: float) -> None:
+    """Whatever the wall clock is set to between them; and seconds of it as a float cannot tell 100 ns apart."""
+    for number, wire in enumerate((pair.left, pair.right, pair.left, pair.right)):
+        at_ns = 5_000_000_000 + 100 * number
+        message = CapturedMessage(
+            timestamp=1.7e9 + at_ns * 1e-9 + step_s * number,
+            arbitration_id=0x700 + number % 2 + 1,
+            is_extended_id=False,
+            data=bytes((number,)),
+        )
+        message.kernel_ns, message.monotonic_ns, message.local = 0, at_ns, False
+        wire.coming.append(message)
+    got = [pair.bus.recv(0.0) for _ in range(4)]
+    assert [message.data[0] for message in got if message is not None] == [0, 1, 2, 3]

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.state import FAULT_RESET_SEQUENCE, Command, Goal, State, decode, next_command
+from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Command, Goal, State, decode, next_command
 
 STATES = tuple(state for state in State if state is not State.UNKNOWN)
 
@@ -79,6 +79,12 @@ def test_every_way_ends_at_its_goal(state: State, goal: Goal) -> None:
         assert way[-1] is ends[goal]
     if goal is not Goal.OPERATION_ENABLED:
         assert State.OPERATION_ENABLED not in way[1:]
+
+
+def test_a_state_that_the_standard_does_not_name_is_not_known_to_be_without_power() -> None:
+    state = decode(0x0001)
+    assert state not in POWERLESS
+    assert next_command(state, Goal.QUICK_STOP) is Command.DISABLE_VOLTAGE
 
 
 def test_a_fault_reset_ends_without_power() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import can
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.errors import BusBusy, BusError, DriveFault, HeartbeatLost, SampleLost
+from drivers.errors import BusBusy, BusError, DriveFault, DriverError, HeartbeatLost, SampleLost
 from drivers.event import CellEvent, EventKind
 from drivers.pacing import FollowedSync, LockstepSync, TimedSync
 from drivers.producer import steered_us
@@ -49,6 +50,17 @@ def lockstep() -> Iterator[Prepared]:
 @pytest.fixture
 def timed() -> Iterator[Prepared]:
     yield from prepared(timed=True)
+
+
+def faults_of(stream: SyncStream) -> Iterator[str]:
+    """What waits to be raised, taken out."""
+    while True:
+        try:
+            stream.check()
+        except DriverError as fault:
+            yield str(fault)
+        else:
+            return
 
 
 def drop(bus: ScriptedBus, cob_id: int, cycles: range) -> None:
@@ -348,8 +360,6 @@ def followed_stream() -> Iterator[Followed]:
     events: list[CellEvent] = []
     with network:
         network.prepare()
-        for node in bus.nodes:
-            node.beats = False
         network.link.sync_producer = "J1"
         producer = Producer(bus)
         pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.01, seen=producer.seen, start_ns=77, clock=bus.clock)
@@ -452,6 +462,122 @@ def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(follo
     before = bus.cycle
     assert [stream.advance().missing for _ in range(3)] == [0, 0, 0]
     assert bus.cycle == before + 3
+
+
+def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
+    """A bus is never silent for as long as a producer may be: the drives' heartbeats come in between."""
+    for stream, bus, _, events in followed_stream():
+        bus.nodes[0].store(0x1017, 0, 8)
+        bus.nodes[1].store(0x1017, 0, 8)
+        bus.nodes[1].next_beat_ns = bus.clock.now_ns + 4_000_000
+        next(stream)
+        stream.network.link.start_heartbeat(127, 5)
+        begun_ns, sent = bus.clock.now_ns, len(bus.sent)
+        assert stream.advance().missing == 0
+        assert bus.clock.now_ns - begun_ns <= 12_000_000
+        assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
+        assert 0x77F in [frame.arbitration_id for frame in bus.sent[sent:]]  # and ours goes on
+
+
+def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(followed: Followed) -> None:
+    stream, bus, producer, events = followed
+    next(stream)
+    bus.tamper = lambda m: () if m.arbitration_id == 0x182 else (m,)
+    producer.pulse()
+    bus.tamper = lambda message: (message,)
+    begun_ns = bus.clock.now_ns
+    assert stream.advance().missing == 2
+    assert stream.advance().missing == 0
+    assert bus.clock.now_ns - begun_ns <= 17_000_000
+    assert EventKind.SYNC_LOST in [event.kind for event in events]
+
+
+def test_a_flood_of_other_frames_is_no_sign_of_a_producer(followed: Followed) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    receive = bus.recv
+
+    def flood(timeout: float | None = None) -> can.Message | None:
+        if not any(event.kind is EventKind.SYNC_LOST for event in events):
+            bus.clock.now_ns += 20_000
+            return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+        return receive(timeout)
+
+    bus.recv = flood  # type: ignore[method-assign]
+    stream.advance()
+    bus.recv = receive  # type: ignore[method-assign]
+    with pytest.raises(BusError, match="no SYNC from J1"):
+        stream.check()
+
+
+def test_a_bus_that_never_falls_silent_does_not_keep_the_sync_for_ever(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    next(stream)
+    receive, before = bus.recv, bus.cycle
+
+    def flood(timeout: float | None = None) -> can.Message | None:
+        if bus.cycle > before:
+            return receive(timeout)
+        bus.clock.now_ns += 20_000_000
+        return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+
+    bus.recv = flood  # type: ignore[method-assign]
+    stream.advance()
+    bus.recv = receive  # type: ignore[method-assign]
+    with pytest.raises(BusError, match=r"read 1\.0 s late"):
+        stream.check()
+
+
+def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    next(stream)
+    told: list[str] = []
+    for late_ns in (900_000_000, 1_100_000_000):
+        bus.clock.now_ns += late_ns
+        stream.advance()
+        told.append("; ".join(faults_of(stream)))  # nobody read the heartbeats either
+    assert ["read 1.1 s late" in each for each in told] == [False, True]
+
+
+def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x27F, is_extended_id=False, data=bytes(6)))  # of a node that is no axis
+    own = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6), is_rx=False)
+    bus.inject(own)
+    next(stream)
+    stream.check()
+    bus.inject(can.Message(arbitration_id=0x402, is_extended_id=False, data=bytes(6)))
+    next(stream)
+    assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x402]
+    with pytest.raises(BusBusy, match=r"a set-point of node 2 \(402h\)"):
+        next(stream)
+    assert stream.statistics.surplus == 0
+
+
+def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.losses = Losses()  # type: ignore[attr-defined]
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
+    next(stream)
+    next(stream)
+    before, sent, begun_ns = stream.statistics, len(bus.sent), bus.clock.now_ns
+    bus.losses = Losses(interface=3)  # type: ignore[attr-defined]
+    stream.read_on(0.25)
+    assert bus.clock.now_ns - begun_ns == 250_000_000
+    assert len(bus.sent) == sent
+    assert stream.statistics == replace(before, duplicate=1, interface_dropped=3)
+    assert EventKind.FRAMES_DROPPED in [event.kind for event in events]
+
+
+def test_cycles_of_a_producer_that_goes_on_are_nobodys(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))  # doubled, before the next SYNC
+    for _ in range(5):
+        producer.pulse()
+    stream.read_on(0.05)
+    assert stream.statistics == StreamStatistics(cycles=1, frames=2, duplicate=1)
 
 
 def test_a_second_producer_is_another_master(followed: Followed) -> None:
