@@ -21,6 +21,7 @@ from daq.errors import (
     PositionImplausible,
     RunInvalid,
 )
+from daq.log.losses import LossyLogs, tells_losses_alone
 from daq.log.readback import Readback
 from daq.log.reader import Log, SampleBlock, read_log
 from drivers.event import CellEvent, EventKind
@@ -102,10 +103,11 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
     )
 
 
-def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell that it carries, or with another description of it.
 
-    Warns of what was saved of an unfinished recording, and of a first run at less than the plan's speed.
+    Warns of what was saved of an unfinished recording, of losses that were accepted, and of a first run at less than
+    the plan's speed.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.
@@ -123,7 +125,7 @@ def load_run(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
             100.0 * speed,
         )
     known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
-    run = run_from_log(log, known)
+    run = run_from_log(log, known, lossy)
     if cell is not None and run.payload is not None:
         run = replace(run, payload=_weighed_again(run.payload, cell))
     return run, known
@@ -137,7 +139,7 @@ def _weighed_again(payload: Payload, cell: Cell) -> Payload:
     return payload
 
 
-def run_from_log(log: Log, cell: Cell) -> Run:
+def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
     """Convert a log to SI.
 
     Raises:
@@ -149,12 +151,20 @@ def run_from_log(log: Log, cell: Cell) -> Run:
         LogIncomplete: cell and log do not belong together.
     """
     name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
-    if not log.statistics.valid:
+    told = tells_losses_alone(log.statistics.reason)
+    accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and told
+    if accepted:
+        _LOG.warning(
+            "%s has lost %s: its samples are left out, and nothing of it is written back",
+            log.path,
+            log.statistics.reason,
+        )
+    elif not log.statistics.valid:
         raise RunInvalid(
             str(log.path),
             found=f"a run that its recorder marked invalid ({log.statistics.reason or 'no reason given'})",
             expected="a valid run",
-            remedy="record it again",
+            remedy="record it again" + ("; or, to look at it all the same, --accept-losses" if told else ""),
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)
@@ -172,7 +182,7 @@ def run_from_log(log: Log, cell: Cell) -> Run:
         digest=log.digest,
         valid=valid,
         started_s=float(samples.time_ns[0]) * 1e-9,
-        partial=log.partial,
+        partial=log.partial or accepted,
     )
 
 

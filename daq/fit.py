@@ -16,6 +16,7 @@ from daq.configuration.cell_model import model_of
 from daq.conversion import load_run
 from daq.effect_words import placed_name
 from daq.errors import LogRepeated, LogsDiffer, ModelContradicted, RolesExchanged, UsageError
+from daq.log.losses import LossyLogs
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.comparison import Comparison, compare
@@ -39,6 +40,7 @@ class Fit:
         identification: the estimate without effects.
         steps: turns of the loop, empty where nobody looked for effects.
         paper: the paper's total least squares on the same equations, None with fixed gains.
+        lossy: what was done with logs that tell of losses.
     """
 
     cell: Cell
@@ -48,6 +50,7 @@ class Fit:
     identification: Identification
     steps: tuple[Step, ...]
     paper: Estimate | None
+    lossy: LossyLogs = LossyLogs.REFUSED
 
     @property
     def final(self) -> Identification | Evidence:
@@ -56,19 +59,20 @@ class Fit:
 
     def evidence(self) -> Evidence:
         """The rows behind the identification, without effects; the logs are read again."""
-        used, unseen = ((load_run(log, self.cell)[0] for log in logs) for logs in (self.logs, self.holdout))
+        used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
         return gather(self.identification, used, unseen)
 
 
 class Reading:
     """Logs of one cell, read one after the other, and what was met on the way."""
 
-    def __init__(self, logs: Sequence[Path], cell: Cell | None) -> None:
+    def __init__(self, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> None:
         self._given = cell
+        self._lossy = lossy
         self._first: tuple[Path, Run] | None = None
         self._seen: dict[str, Path] = {}
         self.sources: list[Source] = []
-        run, self.cell = load_run(logs[0], cell)
+        run, self.cell = load_run(logs[0], cell, lossy)
         self._first = (logs[0], run)
 
     def runs(self, logs: Sequence[Path], role: str) -> Iterator[Run]:
@@ -83,7 +87,7 @@ class Reading:
                 run, cell = self._first[1], self.cell
                 self._first = None
             else:
-                run, cell = load_run(log, self._given)
+                run, cell = load_run(log, self._given, self._lossy)
             if cell.digest != self.cell.digest:
                 raise LogsDiffer(
                     str(log),
@@ -112,6 +116,7 @@ def fit(
     method: Method | None = None,
     gains_fixed: bool = False,
     cell: Cell | None = None,
+    lossy: LossyLogs = LossyLogs.REFUSED,
 ) -> Fit:
     """Identify gains and parameters.
 
@@ -121,20 +126,26 @@ def fit(
         method: estimator; ``ml``, or with fixed gains the classical IDIM-WLS, when None.
         gains_fixed: hold the gains at their nameplate values.
         cell: another description of the cell than the one in the logs.
+        lossy: what to do with logs that tell of losses.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
     try:
-        return _fit(logs, holdout, method, gains_fixed, cell)
+        return _fit(logs, holdout, method, gains_fixed, cell, lossy)
     except PayloadUnseen as error:
-        raise PayloadUnseen(error.std_percent, error.runs, _culprit(logs, cell)) from error
+        raise PayloadUnseen(error.std_percent, error.runs, _culprit(logs, cell, lossy)) from error
 
 
 def _fit(
-    logs: Sequence[Path], holdout: Sequence[Path], method: Method | None, gains_fixed: bool, cell: Cell | None
+    logs: Sequence[Path],
+    holdout: Sequence[Path],
+    method: Method | None,
+    gains_fixed: bool,
+    cell: Cell | None,
+    lossy: LossyLogs,
 ) -> Fit:
-    reading = Reading(logs, cell)
+    reading = Reading(logs, cell, lossy)
     declared = reading.cell
     nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
     result = identify(
@@ -149,7 +160,7 @@ def _fit(
         check_signs(result.estimate, nameplate)
     check_explained(result.training_error, declared.axis_names)
     paper = None if gains_fixed else tls(result.system)
-    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper)
+    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper, lossy)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
@@ -172,17 +183,17 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     found = fitted.identification
     return compare(
         found.model,
-        lambda: (load_run(log, fitted.cell)[0] for log in fitted.logs),
+        lambda: (load_run(log, fitted.cell, fitted.lossy)[0] for log in fitted.logs),
         found.conditioning,
         progress,
     )
 
 
-def _culprit(logs: Sequence[Path], cell: Cell | None) -> str:
+def _culprit(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
     """Which log contradicts the others about the payload: without it they agree."""
     for log in logs:
         try:
-            rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell)
+            rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell, lossy)
         except IdentificationError:
             continue
         gains = rest.identification.estimate

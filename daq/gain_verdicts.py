@@ -72,7 +72,7 @@ def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ..
     found = fitted.identification
     mountings = [payload.mounting for payload in found.system.payloads]
     for log in fitted.logs:
-        run, _ = load_run(log, fitted.cell)
+        run, _ = load_run(log, fitted.cell, fitted.lossy)
         data = differentiate(run, found.model.drive_train, found.conditioning)
         mounted = None if run.payload is None else mountings.index(run.payload.mounting)
         yield recorded(found.model.drive_train, data, found.conditioning), (mounted,)

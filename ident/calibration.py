@@ -82,7 +82,8 @@ class Source:
         name: of the log.
         sha256: its digest.
         role: in the fit.
-        partial: it is what was saved of a recording that was never finished; nothing of it may reach a controller.
+        partial: it is what was saved of a recording that was never finished, or one with losses; nothing of
+            it may reach a controller.
     """
 
     name: str

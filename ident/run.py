@@ -27,7 +27,7 @@ class Run:
         digest: of the log it was read from (sha256, hex).
         valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
         started_s: when the run began, on a clock that the runs of one session share [s]; None where no one knows.
-        partial: it is what was saved of a recording that was never finished.
+        partial: it is what was saved of a recording that was never finished, or one whose losses somebody accepted.
     """
 
     name: str

@@ -23,6 +23,7 @@ from daq.configuration.cell_file import load_cell
 from daq.errors import OutputFailed, UsageError
 from daq.fit import Fit, check_explained, compare_estimators, fit
 from daq.gain_verdicts import needed_verdicts
+from daq.log.losses import LossyLogs
 from daq.report.comparison import comparison_document, comparison_tables
 from daq.report.current_signal import actual_current_note
 from daq.report.excitation import advice, cannot_tell, verdict_document
@@ -51,6 +52,13 @@ HoldoutOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
 PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is made.")]
 CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
+AcceptLossesOption = Annotated[
+    bool,
+    typer.Option(
+        "--accept-losses",
+        help="Use logs that are invalid for lost frames, without those samples; `apply` refuses the result.",
+    ),
+]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
 KnownOption = Annotated[
     Known,
@@ -88,6 +96,7 @@ def fit_verb(
     out: OutOption = None,
     pictures: PicturesOption = None,
     cell: CellOption = None,
+    accept_losses: AcceptLossesOption = False,
     json: JsonOption = False,
 ) -> None:
     """Identify all drive gains and dynamic parameters from runs without load and with a weighed payload."""
@@ -101,7 +110,8 @@ def fit_verb(
         described = None if cell is None else load_cell(cell)
         fixed = gains is Gains.FIXED
         if known is Known.MASS:
-            fitted = fit(logs, holdout=holdout or (), method=method, gains_fixed=fixed, cell=described)
+            lossy = LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED
+            fitted = fit(logs, holdout=holdout or (), method=method, gains_fixed=fixed, cell=described, lossy=lossy)
             found = CaseFit(fitted, (), None)
         else:
             chosen = method or (Method.WLS if fixed else Method.ML)

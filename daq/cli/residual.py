@@ -13,6 +13,7 @@ from rich.table import Table
 
 from daq.cli.fit import (
     CALIBRATION,
+    AcceptLossesOption,
     CellOption,
     Gains,
     GainsOption,
@@ -30,6 +31,7 @@ from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell_file import load_cell
 from daq.effect_words import placed_name
 from daq.fit import Fit, calibration_of, close_loop, fit
+from daq.log.losses import LossyLogs
 from daq.report.fit import start_of
 from daq.report.gain_table import gain_table, partial_note, with_deviation
 from daq.report.residual_document import residual_document
@@ -63,6 +65,7 @@ def residual_verb(
         typer.Option("--leave-out-runs", help="Also refit without each run in turn, and predict that run: slow."),
     ] = False,
     cell: CellOption = None,
+    accept_losses: AcceptLossesOption = False,
     json: JsonOption = False,
 ) -> None:
     """Find the effect that the residual asks for, add it to the model, refit everything, and look again."""
@@ -75,6 +78,7 @@ def residual_verb(
             method=Method.ML,
             gains_fixed=gains is Gains.FIXED,
             cell=None if cell is None else load_cell(cell),
+            lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
         )
         closed = close_loop(fitted, seed, told)
         calibration = calibration_of(closed, datetime.now(UTC))

@@ -40,9 +40,11 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 
 
 def partial_note(calibration: Calibration) -> str | None:
-    """What to say of a calibration that rests on a log that never finished."""
+    """What to say of a calibration that rests on a log that never finished, or lost frames."""
     partial = [source.name for source in calibration.sources if source.partial]
-    return f"PARTIAL data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
+    return (
+        f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
+    )
 
 
 def with_deviation(value: float, std: float) -> str:

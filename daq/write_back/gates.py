@@ -232,7 +232,7 @@ def _source_refusals(calibration: Calibration) -> list[Refusal]:
         Refusal(
             Gate.PARTIAL,
             f"log {source.name}",
-            "what was salvaged of a recording that was never finished",
+            "what was salvaged of a recording that was never finished, or one with losses",
             "a recording that its recorder stands for to the end",
             "record it again and fit",
         )

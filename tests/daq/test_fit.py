@@ -15,6 +15,7 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.errors import LogRepeated, LogsDiffer, ModelContradicted
 from daq.fit import check_explained, fit
+from daq.log.losses import LossyLogs
 from daq.resources import shipped_configurations
 from ident.errors import PayloadUnseen
 from ident.estimate import Method
@@ -30,7 +31,7 @@ class Shelf:
     cell: Cell
     runs: dict[str, Run]
 
-    def load(self, path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
         return self.runs[path.name], cell or self.cell
 
 
@@ -75,7 +76,7 @@ def test_a_recording_counts_once(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+    def load(path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
         run, described = shelf.load(path, cell)
         return run, replace(described, digest="0" * 64) if path.name == "run1" else described
 
