@@ -109,8 +109,10 @@ class Inquiry:
             (number, effect)
             for number, family in enumerate(families)
             for effect in family
-            if is_placeable(effect, axis, self.axes)
+            if is_placeable(effect, axis, self.model.robot)
         ]
+        if not placed:
+            return ()
         trials = self.trials([torque(effect, axis) for _, effect in placed])
         members: dict[int, list[tuple[Effect, Trial]]] = {}
         for (number, effect), trial in zip(placed, trials, strict=True):

@@ -13,7 +13,7 @@ from ident.dataset import Dataset, differentiate
 from ident.effects import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.placed import PlacedEffect
-from ident.effects.torque import effect_torque
+from ident.effects.torque import acts_on, effect_torque
 from ident.errors import NotConverged, RankDeficient
 from ident.estimate import Estimate
 from ident.identify import Identification, estimate_with
@@ -22,10 +22,10 @@ from ident.model import Column, Model
 from ident.observation import Observation, observe
 from ident.relative_error import RelativeError
 from ident.run import Run
-from ident.search import Finding, Gates, choose, find, judge
+from ident.search import Finding, Gates, Place, choose, find, judge, place_of
 from ident.setting import refined
 from ident.signals import session_began_s, signals
-from ident.structure import detection_limits_nm, find_structure, is_inadequate
+from ident.structure import FEWEST_MOVES, detection_limits_nm, find_structure, is_inadequate
 
 FloatArray = NDArray[np.float64]
 
@@ -91,6 +91,7 @@ class Step:
         limits_nm: torque (root mean square) that an effect must have at each motor to be found, shape (n,).
         accepted: the finding, or the structure that no name was found for, that joined the model; None ends the loop.
         after: the model with it.
+        ended: what, beside silence, ended the search here; empty where it was silence.
     """
 
     findings: tuple[Finding, ...]
@@ -98,6 +99,7 @@ class Step:
     limits_nm: FloatArray
     accepted: Finding | None
     after: Evidence
+    ended: str = ""
 
 
 def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
@@ -121,7 +123,8 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     Load and current are the model's predictions, so columns of them are built twice: with the estimate before, and
     with the estimate that they led to.
     """
-    current, began_s = before, session_began_s(before.datasets)
+    # Of the fit's runs: a hold-out must not move what is fitted.
+    current, began_s = before, session_began_s(before.trained)
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
     passes = 1 if all(placed.effect.abscissa.is_kinematic for placed in effects) else 2
     for _ in range(passes):
@@ -161,42 +164,51 @@ def close_the_loop(
     steps: list[Step] = []
     current = start
     cache: ColumnCache = {}
+    refused: dict[Place, str] = {}
     for _ in range(MAX_EFFECTS):
         known = len(current.effects)
         progress("looking for an effect that the model lacks" + (f" beside the {known} found" if known else ""))
         inquiry = inquire(current.model, start.trained, current.training, current.estimate, cache)
         findings = find(inquiry, rng, gates, families)
-        accepted = choose(findings)
+        taken = frozenset((*refused, *(place_of(placed.effect, placed.axis) for placed in current.effects)))
+        accepted = choose(findings, taken)
         axes = range(inquiry.axes) if accepted is None else (accepted.axis,)
         if accepted is None:
             progress("looking for structure that no named effect explains")
         structures = find_structure(inquiry, axes, rng, gates)
-        best = choose(structures)
+        best = choose(structures, taken)
         if accepted is None or (best is not None and is_inadequate(accepted, best)):
             accepted = best
         limits_nm = detection_limits_nm(inquiry, gates)
         if accepted is None:
-            steps.append(Step(findings, structures, limits_nm, None, current))
+            few = inquiry.folds.moves < FEWEST_MOVES
+            words = [f"{inquiry.folds.moves} moves are too few (of {FEWEST_MOVES}) to ask for what has no name"] * few
+            steps.append(Step(findings, structures, limits_nm, None, current, "; ".join((*refused.values(), *words))))
             break
+        place = place_of(accepted.effect, accepted.axis)
         accepted = replace(accepted, effect=refined(inquiry, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         try:
             joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
-        except (NotConverged, RankDeficient) as error:
+        except (NotConverged, RankDeficient, np.linalg.LinAlgError) as error:
             # What the linearised problem told apart, the whole one does not.
-            progress(f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}")
-            steps.append(Step(findings, structures, limits_nm, None, current))
-            break
+            refused[place] = f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}"
+            progress(refused[place])
+            continue
         current = _without_idle(joined, rng, gates)
         steps.append(Step(findings, structures, limits_nm, accepted, current))
+    if not steps:
+        steps.append(Step(findings, structures, limits_nm, None, current, "; ".join(refused.values())))
     return tuple(steps)
 
 
 def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> Evidence:
-    """Take out what the effect that joined last has made idle: earlier ones on its axis must pass the gates anew."""
+    """Take out what the effect that joined last has made idle: earlier ones on its joints must pass the gates anew."""
     *earlier, last = current.effects
+    train = current.model.drive_train
+    felt = acts_on(last.effect, last.axis, train)
     for placed in earlier:
-        if placed.axis != last.axis:
+        if not felt & acts_on(placed.effect, placed.axis, train):
             continue
         rest = with_effects(current, tuple(other for other in current.effects if other != placed))
         inquiry = inquire(rest.model, rest.trained, rest.training, rest.estimate)

@@ -29,11 +29,12 @@ from ident.inquiry import Inquiry, Tested
 from ident.trial import Trial
 
 FloatArray = NDArray[np.float64]
+Place = tuple[str, int, tuple[int, ...]]
 
 AS_GOOD = 0.99
 """Of the best one's fall on left-out moves."""
-CLEARLY = 1.0
-"""Standard errors of a paired comparison over folds."""
+CLEARLY = 0.95
+"""Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +121,16 @@ def find(
     return judge(inquiry, tested, rng, gates or Gates())
 
 
-def choose(findings: Sequence[Finding]) -> Finding | None:
+def choose(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
     """The best that passed; of those as good on the same axis, the one with the fewest parameters.
 
     A hinge that begins where the joint never comes is a spring, and is called one.
+
+    Args:
+        findings: ranked.
+        taken: what is in the model already, or cannot be added; an effect joins an axis once.
     """
-    passed = [finding for finding in findings if finding.passed]
+    passed = [finding for finding in findings if finding.passed and place_of(finding.effect, finding.axis) not in taken]
     if not passed:
         return None
     best = passed[0]
@@ -135,6 +140,11 @@ def choose(findings: Sequence[Finding]) -> Finding | None:
         if finding.axis == best.axis and finding.held_out_fall >= AS_GOOD * best.held_out_fall
     ]
     return min(alike, key=lambda finding: _parameters(finding.effect))
+
+
+def place_of(effect: Effect, axis: int) -> Place:
+    """What makes two effects the same whatever their real settings are: two orders of a ripple are two effects."""
+    return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 
 def judge(inquiry: Inquiry, tested: Sequence[Tested], rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
@@ -160,7 +170,7 @@ def is_better(one: Finding, other: Finding) -> bool:
     """Whether a paired comparison over folds tells that one explains more than another."""
     gain = other.fold_errors - one.fold_errors
     error = float(np.std(gain, ddof=1)) * float(np.sqrt(len(gain)))
-    return float(gain.sum()) > CLEARLY * error
+    return float(gain.sum()) > float(special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
 
 
 def _parameters(effect: Effect) -> int:
@@ -220,7 +230,7 @@ def _share_of_excess(inquiry: Inquiry, motor: int, fallen: float, own: float) ->
     if floor_a is None:
         return None
     excess = own - float(np.sum(problem.motor == motor)) * (floor_a / problem.noise[motor]) ** 2
-    return min(fallen / excess, 1.0) if excess > fallen else 1.0
+    return None if excess <= 0.0 else min(fallen / excess, 1.0)
 
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:

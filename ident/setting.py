@@ -12,6 +12,8 @@ from ident.inquiry import Inquiry
 
 STEPS = 6
 """Of the golden section: the bracket between two neighbours becomes an eighteenth."""
+DECLARED = {"exponent": (0.8, 1.25)}
+"""Settings between which an effect is nearly one that is declared: friction with exponent one is viscous."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
@@ -39,8 +41,17 @@ def refined(inquiry: Inquiry, effect: Effect, axis: int, families: Iterable[Sequ
         )
         place = grid.index(value)
         if grid[0] > 0 and 0 < place < len(grid) - 1:
-            return _golden(inquiry, effect, axis, name, grid[place - 1], grid[place + 1])
+            lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
+            return _golden(inquiry, effect, axis, name, lower, upper)
     return effect
+
+
+def _one_side(name: str, value: float, lower: float, upper: float) -> tuple[float, float]:
+    """The part of a bracket on whose side of DECLARED the value lies."""
+    if name not in DECLARED:
+        return lower, upper
+    below, above = DECLARED[name]
+    return (lower, min(upper, below)) if value < below else (max(lower, above), upper)
 
 
 def _golden(inquiry: Inquiry, effect: Effect, axis: int, name: str, lower: float, upper: float) -> Effect:
@@ -61,7 +72,8 @@ def _golden(inquiry: Inquiry, effect: Effect, axis: int, name: str, lower: float
             a, inner, at_inner = inner, outer, at_outer
             outer = a + GOLDEN * (b - a)
             at_outer = fall(outer)
-    return _with(effect, name, float(f"{np.exp((a + b) / 2.0):.4g}"))
+    best = float(f"{np.exp((a + b) / 2.0):.4g}")
+    return _with(effect, name, best) if fall(np.log(best)) > fall(np.log(effect.settings[name])) else effect
 
 
 def _with(effect: Effect, name: str, value: float) -> Effect:

@@ -34,8 +34,8 @@ VARIABLES = (
 )
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
 MUCH_MORE = 0.15
-MOVES_A_COEFFICIENT = 5
-FEWEST_COEFFICIENTS = INTERVALS + 1
+FEWEST_MOVES = 5 * (INTERVALS + 1)
+"""Five for each coefficient of a term."""
 TAIL = 0.005
 """Of the samples at either end of a variable's range: there a spline would rest on a handful of them."""
 
@@ -51,7 +51,7 @@ def find_structure(
         rng: of the bootstrap.
         gates: what a term must show.
     """
-    if inquiry.folds.moves < MOVES_A_COEFFICIENT * FEWEST_COEFFICIENTS:
+    if inquiry.folds.moves < FEWEST_MOVES:
         return ()  # a term of many coefficients would fit the few moves that there are
     tested = [found for axis in axes for found in inquiry.test(_families(inquiry, axis), axis, at_rows=True)]
     return judge(inquiry, tested, rng, gates)
@@ -68,6 +68,9 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
 
 def detection_limits_nm(inquiry: Inquiry, gates: Gates) -> FloatArray:
     """Torque (root mean square over the moving rows) that an effect must have at each motor to be found, shape (n,).
+
+    It is torque that the declared model cannot mimic: of an effect that looks much like gravity or viscous friction
+    most is taken up by those.
 
     It is what opens the gates on the size of an effect whose shape the dictionary or a spline can follow; on a short
     recording noise asks for more.

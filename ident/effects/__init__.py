@@ -28,7 +28,7 @@ from ident.effects.time_skew import TimeSkew
 from ident.effects.warm_up import WarmUp
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-PAIRED = range(2, 11)
+PAIRED = range(2, 13)
 """The higher number of a pair of joints; those that a robot does not have are left out of its search."""
 
 EFFECTS: tuple[tuple[Effect, ...], ...] = (

@@ -48,12 +48,15 @@ class Effect(Protocol):
     """An entry of the dictionary: a frozen dataclass whose fields are its searched (non-linear) parameters.
 
     Attributes:
-        side: where it acts.
         holds: what it claims about its columns.
     """
 
-    side: ClassVar[Side]
     holds: ClassVar[Property]
+
+    @property
+    def side(self) -> Side:
+        """Where it acts."""
+        ...
 
     @property
     def name(self) -> str:

@@ -39,7 +39,6 @@ class Smooth:
         other_axis: number of the other axis, from 1, where x speaks of one; else 0.
     """
 
-    side: ClassVar[Side] = Side.JOINT
     holds: ClassVar[Property] = Property.SMOOTH
 
     variable: Abscissa
@@ -47,6 +46,11 @@ class Smooth:
     upper: float = 1.0
     signed: int = 0
     other_axis: int = 0
+
+    @property
+    def side(self) -> Side:
+        """On the motor, where the variable is the motor's."""
+        return Side.MOTOR if self.variable in MOTOR_VARIABLES else Side.JOINT
 
     @property
     def name(self) -> str:

@@ -20,18 +20,21 @@ from ident.effects.elasticity import Elasticity
 from ident.effects.hinge import Hinge
 from ident.effects.load_friction import LoadFriction
 from ident.effects.periodic import Periodic
+from ident.effects.position_friction import PositionFriction
 from ident.effects.saturation import Saturation
 from ident.effects.smooth import INTERVALS, Smooth
 from ident.effects.spring import Spring
 from ident.effects.stribeck import Stribeck
 from ident.effects.time_skew import TimeSkew
 from ident.effects.torque import at_joints, is_placeable
+from ident.robot import robot_from_urdf
 from ident.signals import Signals
 from ident.structure import VARIABLES
+from tests.ident.arms import GANTRY, THREE_AXES
 
 FloatArray = NDArray[np.float64]
 
-JOINTS, SAMPLES = 11, 400
+JOINTS, SAMPLES = 13, 400
 
 
 def random_signals(seed: int) -> Signals:
@@ -221,13 +224,17 @@ def test_columns_act_where_the_effect_says() -> None:
     assert at_joints(TimeSkew(), 0, all_, train) == pytest.approx(of_motors)
 
 
-def test_a_pair_is_named_by_its_lower_axis() -> None:
-    placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, 3)]
+def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None:
+    three, gantry = robot_from_urdf(THREE_AXES.urdf), robot_from_urdf(GANTRY.urdf)
+    placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
     assert placed == [0, 1]
-    assert not is_placeable(Coupling(4, 1), 0, 3)
-    assert is_placeable(Spring(), 2, 3)
+    assert not is_placeable(Coupling(4, 1), 0, three)
+    assert is_placeable(Spring(), 2, three)
     # What all motors share is tried once.
-    assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, 3)] == [0]
+    assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)] == [0]
+    assert is_placeable(PositionFriction(), 0, three)
+    assert not is_placeable(PositionFriction(), 0, gantry)
+    assert is_placeable(Spring(), 0, gantry)
 
 
 def test_families_hold_one_name_and_names_are_unique() -> None:

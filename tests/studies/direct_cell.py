@@ -35,6 +35,8 @@ from drivers.profile import ObjectEntry
 from drivers.sample import Sample
 from drivers.sdo import ObjectAccess
 from drivers.simulated.amplifier import AmplifierSet
+from drivers.simulated.effects import build_effect
+from drivers.simulated.effects.lag import Lag
 from drivers.simulated.node import NmtCommand, Node
 from drivers.simulated.plant import Plant
 from drivers.simulated.readings import Readings, take
@@ -163,7 +165,9 @@ class DirectStream:
         self._cycle = 0
         self._plant = Plant(spec)
         self._plant.time_s = began_s
-        self._amplifiers = AmplifierSet(spec, tuned(spec, self._plant), ())
+        built = (build_effect(effect, n) for effect in spec.effects)
+        lags = tuple(effect for effect in built if isinstance(effect, Lag))
+        self._amplifiers = AmplifierSet(spec, tuned(spec, self._plant), lags)
         self._amplifiers.prime(self._plant.motor_rad)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self._readings = take(self._amplifiers, self._rated_a)

@@ -80,7 +80,7 @@ SINGLE_EFFECTS = (
         _effect("cogging", 6, amplitude_nm=0.8, order=2.0, phase_rad=-0.7),
     ),
     (_effect("saturation", 2, half_current_a=9.0), _effect("saturation", 3, half_current_a=8.0)),
-    (_effect("lag", 1, time_constant_s=0.015), _effect("lag", 3, time_constant_s=0.015)),
+    (_effect("lag", 1, time_constant_s=0.008), _effect("lag", 3, time_constant_s=0.008)),
     (
         _effect("coupling", 4, other_axis=5.0, coulomb_nm=0.9, viscous_nm_s_rad=0.4),
         _effect("coupling", 3, other_axis=2.0, coulomb_nm=2.0, viscous_nm_s_rad=1.0),
@@ -169,7 +169,7 @@ TOGETHER = tuple(
             (_effect("asymmetric-viscous", 2, coefficient_nm_s_rad=2.0), _effect("load-friction", 2, coefficient=0.08)),
             (
                 _effect("nonlinear-viscous", 1, torque_at_1_rad_s_nm=4.0, exponent=1 / 3),
-                _effect("lag", 1, time_constant_s=0.015),
+                _effect("lag", 1, time_constant_s=0.008),
             ),
             (
                 _effect("cogging", 4, amplitude_nm=1.2, order=1.0, phase_rad=0.5),
@@ -188,7 +188,7 @@ TOGETHER = tuple(
                 _effect("spring", 3, stiffness_nm_per_rad=6.0, rest_rad=1.0),
                 _effect("load-friction", 3, coefficient=0.12),
             ),
-            (_effect("lag", 3, time_constant_s=0.015), _effect("asymmetric-viscous", 3, coefficient_nm_s_rad=1.5)),
+            (_effect("lag", 3, time_constant_s=0.008), _effect("asymmetric-viscous", 3, coefficient_nm_s_rad=1.5)),
         )
     )
 )
