@@ -50,6 +50,9 @@ def record_verb(
     part = _free(out)
     for line in load_lines(declared):
         typer.echo(line, err=True)
+    allowed_by = granted(declared, who, enable_motion)
+    if allowed_by is not None and not enable_motion:
+        typer.echo(f"motion is allowed by {allowed_by} (its file says so): the axes move now", err=True)
     try:
         with interruptible() as undisturbed, progress_bar("recording") as told:
             done = record(
@@ -59,7 +62,7 @@ def record_verb(
                 out,
                 payload=mounted(declared, payload),
                 operator=who,
-                granted_by=granted(declared, who, enable_motion),
+                granted_by=allowed_by,
                 run_id=str(uuid.uuid4()),
                 speed=speed,
                 undisturbed=undisturbed,

@@ -19,7 +19,7 @@ def salvage_verb(
 ) -> None:
     """Save what stands before the damage of a log into a new one that is labelled partial.
 
-    A fit takes a partial log and says so; what it finds is never written to a controller.
+    A fit takes a partial log that is valid and says so; what it finds is never written to a controller.
     """
     with progress_bar("salvaging") as told:
         saved = salvage(log, out, lambda samples: told(samples, 0, "samples"))
