@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -36,9 +37,9 @@ class ParameterEntry(StrictModel):
 
 
 class RelativeErrorEntry(StrictModel):
-    """Relative errors in percent."""
+    """Relative errors in percent; null for an axis that did not move."""
 
-    axes: tuple[float, ...]
+    axes: tuple[float | None, ...]
     total: float
 
 
@@ -83,6 +84,8 @@ class CalibrationDocument(StrictModel):
     configuration_sha256: str
     created: str
     software: str
+    session_began_s: float | None = None
+    """Files of earlier versions do not have it."""
 
 
 def _parameter(entry: ParameterEntry) -> Parameter:
@@ -90,7 +93,7 @@ def _parameter(entry: ParameterEntry) -> Parameter:
 
 
 def _error(entry: RelativeErrorEntry) -> RelativeError:
-    return RelativeError(tuple(entry.axes), entry.total)
+    return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
 
 
 def calibration_of(entries: CalibrationDocument) -> Calibration:
@@ -121,4 +124,5 @@ def calibration_of(entries: CalibrationDocument) -> Calibration:
         configuration_sha256=entries.configuration_sha256,
         created=entries.created,
         software=entries.software,
+        session_began_s=entries.session_began_s,
     )

@@ -20,6 +20,8 @@ from daq.log.losses import LossyLogs
 from daq.version import software
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.comparison import Comparison, compare
+from ident.effects.effect import Side
+from ident.effects.placed import PlacedEffect
 from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimate import Estimate, Method
 from ident.estimators.total_least_squares import tls
@@ -27,6 +29,8 @@ from ident.identify import Identification, estimate_with, identify
 from ident.loop import Evidence, Step, close_the_loop, gather
 from ident.relative_error import RelativeError
 from ident.run import Run
+from ident.search import Finding
+from ident.signals import session_began_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,37 +295,47 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         configuration_sha256=fitted.cell.digest,
         created=created.isoformat(timespec="seconds"),
         software=software(),
+        session_began_s=session_began_s(final.trained) if isinstance(final, Evidence) else None,
     )
 
 
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
-    accepted = []
     kept = fitted.steps[-1].after.effects if fitted.steps else ()
-    before: Identification | Evidence = fitted.identification
-    for step in fitted.steps:
-        if step.accepted is None:
-            continue
-        placed = step.after.effects[-1]
-        if placed not in kept:
-            continue  # a later one has made it idle
-        names = {column.name for column in placed.columns}
-        error_before, error_after = _axis_error(before, placed.axis), _axis_error(step.after, placed.axis)
-        accepted.append(
-            AcceptedEffect(
-                name=placed.effect.name,
-                axis=fitted.cell.axes[placed.axis].name,
-                settings={name: float(value) for name, value in placed.effect.settings.items()},
-                coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
-                # Without a run that was held out, the moves that were left out in turn must do.
-                error_before_percent=step.accepted.error_before_percent if error_before is None else error_before,
-                error_after_percent=step.accepted.error_after_percent if error_after is None else error_after,
-                ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in step.accepted.ambiguity),
-            )
-        )
-        before = step.after
-    return tuple(accepted)
+    return tuple(_accepted(fitted, placed, parameters) for placed in kept)
 
 
-def _axis_error(identification: Identification | Evidence, axis: int) -> float | None:
-    error: RelativeError | None = identification.holdout_error
-    return None if error is None else error.axes[axis]
+def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
+    before, step, finding = _joined(fitted, placed)
+    names = {column.name for column in placed.columns}
+    error_before, error_after = _unused_error(before, placed), _unused_error(step.after, placed)
+    if error_before is None or error_after is None:
+        # Without a run that was held out, the moves that were left out in turn must do.
+        error_before, error_after = finding.error_before_percent, finding.error_after_percent
+    return AcceptedEffect(
+        name=placed.effect.name,
+        axis=fitted.cell.axes[placed.axis].name,
+        settings={name: float(value) for name, value in placed.effect.settings.items()},
+        coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
+        error_before_percent=error_before,
+        error_after_percent=error_after,
+        ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in finding.ambiguity),
+    )
+
+
+def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[Identification | Evidence, Step, Finding]:
+    """The last turn that added an effect, with the model before it: an idle one may have gone and come back."""
+    models: list[Identification | Evidence] = [fitted.identification, *(step.after for step in fitted.steps)]
+    for before, step in zip(reversed(models[:-1]), reversed(fitted.steps), strict=True):
+        had = before.effects if isinstance(before, Evidence) else ()
+        if step.accepted is not None and placed in step.after.effects and placed not in had:
+            return before, step, step.accepted
+    raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
+
+
+def _unused_error(model: Identification | Evidence, placed: PlacedEffect) -> float | None:
+    """On the runs held out [%]: of the axis, or in total for what acts on all motors; None where they say nothing."""
+    error: RelativeError | None = model.holdout_error
+    if error is None:
+        return None
+    figure = error.total if placed.effect.side is Side.ALL_MOTORS else error.axes[placed.axis]
+    return figure if np.isfinite(figure) else None

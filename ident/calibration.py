@@ -59,9 +59,9 @@ class AcceptedEffect:
         axis: name of the axis.
         settings: the searched (non-linear) parameters by name, units in the names.
         coefficients: the linear parameters, identified.
-        error_before_percent, error_after_percent: of the axis, without and with the effect, on data that the fit did
-            not use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or without any ‖e‖/‖v‖ of the motor's current
-            on moves left out in turn.
+        error_before_percent, error_after_percent: of the axis, or in total for an effect on all motors, without and
+            with the effect, on data that the fit did not use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or
+            where these say nothing of it ‖e‖/‖v‖ of the motor that feels it most, on moves left out in turn.
         ambiguity: families whose held-out score cannot be told from this one's.
     """
 
@@ -103,7 +103,8 @@ class Calibration:
         parameters: base parameters of the robot, then the unknown parameters of each payload mounting.
         effects: accepted effects.
         relative_error_percent: on the data of the fit.
-        holdout_error_percent: on a run that was used for nothing else, None where there was none.
+        holdout_error_percent: on a run that was used for nothing else, None where there was none; NaN for an axis that
+            did not move in it.
         condition: of the weighted observation matrix.
         rows: of the observation after masks and decimation.
         filter: cut-offs, orders, decimation and standstill speeds, by name.
@@ -111,6 +112,7 @@ class Calibration:
         configuration_sha256: of the cell configuration that the logs carry.
         created: ISO 8601 time, given by the caller.
         software: name and version that made it.
+        session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where not all told.
     """
 
     cell: str
@@ -127,3 +129,4 @@ class Calibration:
     configuration_sha256: str
     created: str
     software: str
+    session_began_s: float | None = None

@@ -41,7 +41,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     gains = _gains(calibration, model)
     standard = standard_parameters(calibration, model)
     standard[model.flange] += _payload(calibration, data)
-    run = declared_signals(model, data, standard, gains)
+    run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
     for accepted in calibration.effects:
         placed, coefficients = placed_effect(accepted, calibration)

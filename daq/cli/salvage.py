@@ -30,9 +30,10 @@ def salvage_verb(
                     "missing": statistics.missing, "valid": statistics.valid, "reason": statistics.reason,
                     "left_out_bytes": saved.left_out_bytes, "damage": saved.damage})  # fmt: skip
         return
+    use = "a fit takes it and says so, and nothing fitted with it is written to a controller"
     typer.echo(
-        f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL: a fit takes it and "
-        "says so, and nothing fitted with it is written to a controller"
+        f"{printable(str(out))}: {statistics.samples} samples, {saved.duration_s:g} s, PARTIAL"
+        + (f": {use}" if statistics.valid else "")
     )
     if saved.left_out_bytes:
         typer.echo(f"left out: {saved.left_out_bytes} bytes, from {printable(saved.damage)}")

@@ -95,7 +95,11 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         paragraph(
             f"Effect {placed_name(placed, axes)}"
             + (f" ({settings})." if settings else ".")
-            + (f" These data cannot tell it from: {ambiguous}." if ambiguous else " No other one does as well.")
+            + (
+                f" These data cannot tell it from: {ambiguous}."
+                if ambiguous
+                else " Every other one does clearly worse."
+            )
             + replaced
         ),
         table(

@@ -162,9 +162,10 @@ def _silence(fitted: Fit) -> str:
         f"{limit:.2g} {axis.unit.force} on {axis.name}"
         for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
     )
+    ended = f"The search ended early: {last.ended}. " if last.ended else ""
     return (
-        "Any other effect that these signals show would have been found above this torque (root mean square in "
-        f"motion): {limits}."
+        f"{ended}An effect that the declared model cannot mimic would have been found above this torque (root mean "
+        f"square in motion): {limits}."
     )
 
 

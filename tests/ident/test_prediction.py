@@ -17,6 +17,7 @@ from ident.effects.load_friction import LoadFriction
 from ident.effects.placed import PlacedEffect
 from ident.effects.spring import Spring
 from ident.effects.stribeck import Stribeck
+from ident.effects.warm_up import WarmUp
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.estimate import Method
 from ident.identify import identify
@@ -26,6 +27,7 @@ from ident.prediction import measured_torque, placed_effect, predict_current, pr
 from ident.relative_error import RelativeError
 from ident.rows import decimate_rows, row_masks
 from ident.run import Run
+from ident.signals import session_began_s
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth
 
 FloatArray = NDArray[np.float64]
@@ -64,7 +66,8 @@ def _of(identification: Evidence) -> Calibration:
         coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
         setting = {name: float(value) for name, value in placed.effect.settings.items()}
         effects.append(AcceptedEffect(placed.effect.name, AXES[placed.axis], setting, coefficients, 1.0, 1.0))
-    return replace(_calibration(estimate.gains, parameters), effects=tuple(effects))
+    began_s = session_began_s(identification.trained)
+    return replace(_calibration(estimate.gains, parameters), effects=tuple(effects), session_began_s=began_s)
 
 
 def _largest_difference(identification: Evidence) -> float:
@@ -104,6 +107,13 @@ def test_so_does_that_of_effects(identified: Evidence, effects: tuple[PlacedEffe
     without = replace(_of(after), effects=())
     with pytest.raises(ModelError, match=effects[0].effect.name):
         standard_parameters(without, identified.model)
+
+
+def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    runs = tuple(replace(run, started_s=1.7e9 + 60.0 * number) for number, run in enumerate(noisy_runs[:2]))
+    found = identify(truth.model, runs, CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
+    after = with_effects(gather(found, runs), (PlacedEffect(WarmUp(40.0, 1), 1),))
+    assert _largest_difference(after) < 1e-9
 
 
 def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evidence) -> None:
