@@ -29,6 +29,7 @@ from ident.structure import FEWEST_MOVES, detection_limits_nm, find_structure, i
 
 FloatArray = NDArray[np.float64]
 
+UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12
 """More than this on one robot means that the declared model is wrong, not that it lacks an effect."""
 
@@ -190,7 +191,7 @@ def close_the_loop(
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         try:
             joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
-        except (NotConverged, RankDeficient, np.linalg.LinAlgError) as error:
+        except UNFITTED as error:
             # What the linearised problem told apart, the whole one does not.
             refused[place] = f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}"
             progress(refused[place])
@@ -210,7 +211,10 @@ def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> 
     for placed in earlier:
         if not felt & acts_on(placed.effect, placed.axis, train):
             continue
-        rest = with_effects(current, tuple(other for other in current.effects if other != placed))
+        try:
+            rest = with_effects(current, tuple(other for other in current.effects if other != placed))
+        except UNFITTED:
+            continue  # what the data cannot be fitted without is not idle
         inquiry = inquire(rest.model, rest.trained, rest.training, rest.estimate)
         (finding, *_) = judge(inquiry, inquiry.test(((placed.effect,),), placed.axis), rng, gates) or (None,)
         if finding is None or not finding.passed:
