@@ -102,6 +102,32 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     )
 
 
+def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> Dataset:
+    """A motion that nobody has recorded, for `ident.prediction`: joints, speeds and accelerations as they are given.
+
+    Args:
+        motion: q, q̇ and q̈ of n joints over k samples, shape (n, k) each.
+        rate_hz: sampling rate.
+        payload: what is mounted, None without load.
+    """
+    count, samples = motion.position_rad.shape
+    everywhere = np.ones((count, samples), dtype=np.bool_)
+    return Dataset(
+        name="planned motion",
+        rate_hz=rate_hz,
+        time_s=np.arange(samples) / rate_hz,
+        position_rad=motion.position_rad,
+        velocity_rad_s=motion.velocity_rad_s,
+        acceleration_rad_s2=motion.acceleration_rad_s2,
+        current_a=np.zeros((count, samples)),
+        moving=everywhere,
+        motor_moving=everywhere,
+        valid=everywhere,
+        move=np.zeros(samples, dtype=np.int64),
+        payload=payload,
+    )
+
+
 def _moves(moving: BoolArray) -> NDArray[np.int64]:
     starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
     return np.cumsum(starts, dtype=np.int64)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
-from ident.dataset import Dataset, differentiate
+from ident.dataset import Dataset, differentiate, planned
 from ident.effects.cogging import Cogging
 from ident.effects.load_friction import LoadFriction
 from ident.effects.placed import PlacedEffect
@@ -114,6 +114,14 @@ def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy
     found = identify(truth.model, runs, CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
     after = with_effects(gather(found, runs), (PlacedEffect(WarmUp(40.0, 1), 1),))
     assert _largest_difference(after) < 1e-9
+
+
+def test_a_motion_that_nobody_recorded_needs_the_same_current(identified: Evidence) -> None:
+    after = with_effects(identified, (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1)))
+    calibration, data = _of(after), after.datasets[1]
+    asked = planned(data.motion(), data.rate_hz, data.payload)
+    expected = predict_current(calibration, after.model, data)
+    assert predict_current(calibration, after.model, asked) == pytest.approx(expected, abs=1e-12)
 
 
 def test_an_effect_of_the_load_is_predicted_with_the_final_load(identified: Evidence) -> None:
