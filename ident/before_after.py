@@ -5,7 +5,8 @@ All errors are those of `ident.current_error`, with one set of weights. They dif
 - in-sample: everything; it cannot rise when an effect joins, so it proves nothing;
 - cross-validated: all moves but those predicted (`ident.residual.cut`, one Gauss-Newton step around the estimate, gains
   included); the choice of the effects has seen them all, which makes it kind to what was chosen;
-- left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too;
+- left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
+  choice and the settings of the effects have seen it;
 - hold-out: nothing of these runs, neither fit nor choice.
 
 Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It

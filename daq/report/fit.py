@@ -76,7 +76,7 @@ def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: Pl
     rows_before = before.holdout if before.holdout is not None else before.training
     rows_after = after.holdout if after.holdout is not None else after.training
     chosen, data = rows_after.run == index, after.datasets[index]
-    seen = signals(after.model, data, after.training, after.estimate, session_began_s(after.datasets))
+    seen = signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
     along = values(placed.effect.abscissa, seen, placed.axis, other_axis(placed.effect))
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]

@@ -20,6 +20,7 @@ from daq.configuration.cell_file import load_cell
 from daq.cross_validation import CrossValidation, Failure, Mass, cross_validate
 from daq.errors import LogsDiffer
 from daq.fit import fit
+from daq.log.losses import LossyLogs
 from daq.report.paper_tables import condition_table, error_table, gain_table, mass_tables, parameter_table
 from daq.resources import shipped_configurations
 from ident.calibration import Calibration
@@ -42,7 +43,7 @@ class Shelf:
     cell: Cell
     runs: dict[str, Run]
 
-    def load(self, path: Path, cell: Cell | None = None) -> tuple[Run, Cell]:
+    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
         return self.runs[path.name], cell or self.cell
 
 

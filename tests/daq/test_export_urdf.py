@@ -54,14 +54,14 @@ def _calibration(
                 for name, value in zip(base.names, base.grouping @ standard, strict=True)
             ),
             Parameter("mx:flange-a", 0.3, 0.01, "kg m"),
-            Parameter("load-friction coefficient 3", 0.1, 0.01, "1"),
+            Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),
         ),
         effects=(
             AcceptedEffect(
                 "load-friction",
                 "J3",
                 {"speed_exponent": 0},
-                (Parameter("load-friction coefficient 3", 0.1, 0.01, "1"),),
+                (Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1"),),
                 6.1,
                 3.4,
             ),

@@ -15,6 +15,7 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.fit import Fit, fit
 from daq.gain_verdicts import gain_verdicts, needed_verdicts
+from daq.log.losses import LossyLogs
 from daq.resources import shipped_configurations
 from ident.run import Run
 from ident.verdict import GOOD_PERCENT, Verdict
@@ -31,7 +32,7 @@ def fitted() -> Iterator[Fit]:
         for name, payload in (("bare", None), ("loaded", MOUNTED))
     }
 
-    def load(path: Path, other: Cell | None = None) -> tuple[Run, Cell]:
+    def load(path: Path, other: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
         return runs[path.name], other or cell
 
     with pytest.MonkeyPatch.context() as patch:
