@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from drivers.bus import BusAddress
-from drivers.errors import BusError
+from drivers.errors import BusError, DriverError
 from drivers.link import SYNC_COB_ID
 from drivers.network import CanopenNetwork
 from drivers.profile import ObjectEntry
@@ -161,7 +161,7 @@ class DriveProducer:
     ) -> None:
         try:
             self.stop()
-        except Exception as problem:
+        except DriverError as problem:
             if error is None:
                 raise
             error.add_note(f"while stopping SYNC: {problem}")

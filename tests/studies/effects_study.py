@@ -212,11 +212,20 @@ def verdicts(rows: Sequence[Row]) -> tuple[str, ...]:
         lines += [
             f"one effect: {len(first)} of {len(single)} named first, {len(known)} named or in the ambiguity set",
             f"friction: {len(near)} of {len(friction)} within 0.3 points of their clean floor",
+            f"processor time with one effect: median {np.median([row.processor_s for row in single]):.0f} s, "
+            f"most {max(row.processor_s for row in single):.0f} s",
             f"gains: {len(small)} of {len(single)} within 1.5 % (saturation 4 %)",
         ]
     clean = [row for row in rows if row.part == "clean"]
     if clean:
-        lines.append(f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect")
+        error, gain = (
+            np.mean([row.error_before_percent for row in clean]),
+            max(row.max_gain_error_percent for row in clean),
+        )
+        lines.append(
+            f"clean: {sum(bool(row.named) for row in clean)} of {len(clean)} with a false effect; "
+            f"error {error:.2f} % in the mean, worst gain {gain:.2f} %"
+        )
     for part in ("apart", "together"):
         both = [row for row in rows if row.part == part]
         if both:
