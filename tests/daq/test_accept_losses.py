@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from daq.conversion import load_run
 from daq.errors import RunInvalid
 from daq.log.losses import MASKED, LossyLogs, tells_losses_alone
+from daq.record import _verdict
+from drivers.stream import StreamStatistics
 from tests.daq.logs import demo_content, samples, write
 
 
@@ -45,3 +47,14 @@ def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(checkou
     doubled = write(tmp_path / "doubled.mcap", demo_content(checkout), rows, verdict=(False, "3 answers twice"))
     with pytest.raises(RunInvalid):
         load_run(doubled, lossy=LossyLogs.ACCEPTED)
+
+
+def test_the_recorder_counts_them_by_these_names() -> None:
+    counted = StreamStatistics(
+        missing=1, late=2, wrong_length=3, kernel_dropped=4, interface_dropped=5, backlog_dropped=6
+    )
+    valid, reason = _verdict(counted)
+    assert not valid
+    assert tells_losses_alone(reason)
+    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == set(MASKED)
+    assert not tells_losses_alone(_verdict(StreamStatistics(missing=1, skipped_periods=1))[1])
