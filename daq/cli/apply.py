@@ -15,12 +15,13 @@ from rich.table import Table
 
 from daq.calibration_file import load
 from daq.cli.verb import JsonOption, Verb, print_json
+from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ControllerChanged, OutputFailed
 from daq.report.gain_table import with_deviation
 from daq.write_back.apply import Proposal, apply, propose, refused
 from daq.write_back.controller_write import Written
-from daq.write_back.gates import ApplyPolicy, GainChange
+from daq.write_back.gates import GainChange
 
 _DEFAULT = ApplyPolicy()
 

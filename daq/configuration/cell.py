@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.configuration.apply_policy import DEFAULT_APPLY_POLICY, ApplyPolicy
 from daq.configuration.clearance import Clearance
+from daq.configuration.history_place import HistoryPlace
 from daq.configuration.joint_unit import JointUnit
+from daq.configuration.recalibration import Recalibration
 from drivers.axis import Identity
 from drivers.profile import DriveProfile
 from ident.conditioning import Conditioning
@@ -160,6 +163,9 @@ class Cell:
         controller: None where nothing is written back.
         clearance: the room around the arm, None where nothing is said of it.
         motion: whose leave a recording needs.
+        apply: what is let through to the controller, and who may let it through.
+        history: where what became of its calibrations is kept; None for a cell that was read from a log.
+        recalibration: what a scheduled job does; None where there is none, or the cell was read from a log.
         folder: of the cell file; None for a cell that was read from a log.
         digest: sha256 of the cell file and all files it refers to, hex.
     """
@@ -178,6 +184,9 @@ class Cell:
     folder: Path | None
     digest: str
     motion: MotionPolicy = MotionPolicy.ASK
+    apply: ApplyPolicy = DEFAULT_APPLY_POLICY
+    history: HistoryPlace | None = None
+    recalibration: Recalibration | None = None
 
     @property
     def controller_path(self) -> Path | None:

@@ -22,6 +22,7 @@ from daq.configuration.cell_schema import AxisModel, CellModel, ConditioningMode
 from daq.configuration.clearance import clearance_of
 from daq.configuration.drive import drive_from_text
 from daq.configuration.drive_train import ratio_of
+from daq.configuration.history_place import history_place
 from daq.configuration.joint_unit import MILLIMETRE
 from daq.configuration.yaml_file import parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationMissing
@@ -44,7 +45,7 @@ def load_cell(path: Path) -> Cell:
     """
     sources = _sources(path)
     names = {name: str(source) for name, source in sources.items()}
-    return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path.parent, names)
+    return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path, names)
 
 
 def bundle(path: Path) -> dict[str, bytes]:
@@ -57,13 +58,13 @@ def bundle(path: Path) -> dict[str, bytes]:
 
 
 def cell_from_bundle(
-    files: Mapping[str, bytes], folder: Path | None = None, names: Mapping[str, str] | None = None
+    files: Mapping[str, bytes], file: Path | None = None, names: Mapping[str, str] | None = None
 ) -> Cell:
     """The cell that a bundle describes.
 
     Args:
         files: as `bundle` made them; other entries (a log has more attachments) are passed over.
-        folder: of the cell file, where there is one.
+        file: the cell file, where there is one.
         names: what to call the files in messages.
 
     Raises:
@@ -92,9 +93,12 @@ def cell_from_bundle(
         conditioning=_conditioning(model.conditioning),
         controller=None if model.controller is None else Controller(**model.controller.model_dump()),
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
-        folder=folder,
+        folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
         motion=model.policy.motion,
+        apply=model.policy.apply.policy,
+        history=None if file is None else history_place(model.history, file),
+        recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
     )
 
 

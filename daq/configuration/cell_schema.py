@@ -6,9 +6,12 @@ from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from daq.configuration.apply_policy import ApplyPolicyModel
 from daq.configuration.cell import RECORDER, MotionPolicy, Pacing
 from daq.configuration.clearance import ClearanceModel, WorkspaceModel
+from daq.configuration.history_place import HistoryModel
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE, JointUnit
+from daq.configuration.recalibration import RecalibrationModel
 from daq.configuration.yaml_file import StrictModel, not_in_file
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
@@ -212,6 +215,7 @@ class PolicyModel(StrictModel):
     """What may be done in this cell without asking."""
 
     motion: MotionPolicy = MotionPolicy.ASK
+    apply: ApplyPolicyModel = ApplyPolicyModel()
 
 
 class CellModel(StrictModel):
@@ -229,6 +233,8 @@ class CellModel(StrictModel):
     workspace: WorkspaceModel | None = None
     clearance: ClearanceModel | None = None
     policy: PolicyModel = PolicyModel()
+    history: HistoryModel = HistoryModel()
+    recalibration: RecalibrationModel | None = None
 
     @property
     def buses(self) -> tuple[NamedBusModel, ...]:

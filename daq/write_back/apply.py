@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from daq.configuration.apply_policy import ApplyPolicy
 from daq.errors import CalibrationRefused, ControllerUnfit
 from daq.write_back.controller_file import ControllerFile, Scalar, decode, read_bytes
 from daq.write_back.controller_write import Written, sha256, write
 from daq.write_back.gain_spelling import spell
-from daq.write_back.gates import ApplyPolicy, GainChange, Refusal, calibration_refusals, gain_refusals
+from daq.write_back.gates import GainChange, Refusal, calibration_refusals, gain_refusals
 from ident.calibration import Calibration, Gain
 
 

@@ -7,27 +7,11 @@ import re
 from dataclasses import dataclass
 from enum import Enum
 
+from daq.configuration.apply_policy import ApplyPolicy
 from ident.calibration import Calibration
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _UNFINISHED = ".part"
-
-
-@dataclass(frozen=True, slots=True)
-class ApplyPolicy:
-    """Bounds of the write-back.
-
-    Attributes:
-        max_change_percent: from the gain in the file now [%].
-        max_nameplate_percent: from the manufacturer's gain [%].
-        max_std_percent: relative standard deviation of the identified gain [%].
-        max_error_percent: relative error of the torques, on held-out data where there are any [%].
-    """
-
-    max_change_percent: float = 35.0
-    max_nameplate_percent: float = 50.0
-    max_std_percent: float = 3.0
-    max_error_percent: float = 25.0
 
 
 class Gate(Enum):

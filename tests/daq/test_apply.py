@@ -20,11 +20,12 @@ import pytest
 
 from daq.calibration_file import save
 from daq.cli.app import main
+from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
 from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit, exit_code
 from daq.write_back.apply import Proposal, apply, propose, refused
 from daq.write_back.controller_write import backups, roll_back
-from daq.write_back.gates import ApplyPolicy, Gate
+from daq.write_back.gates import Gate
 from ident.calibration import Calibration, Gain, Source
 from ident.relative_error import RelativeError
 from tests.daq.calibrations import AXES, KEYS, demo_calibration

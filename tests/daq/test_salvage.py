@@ -18,6 +18,7 @@ import yaml
 
 from daq.calibration_file import as_document, decode, encode, save
 from daq.cli.app import main
+from daq.configuration.apply_policy import ApplyPolicy
 from daq.conversion import load_run
 from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, OutputExists, UsageError
 from daq.fit import Reading
@@ -25,7 +26,7 @@ from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
 from daq.log.writer import LogWriter
 from daq.salvage import salvage
-from daq.write_back.gates import ApplyPolicy, Gate, calibration_refusals
+from daq.write_back.gates import Gate, calibration_refusals
 from drivers.event import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
