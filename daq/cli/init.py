@@ -73,8 +73,26 @@ payloads:
 """What stands over the payloads of a new cell."""
 
 
-def make_folder(folder: Path) -> tuple[Path, ...]:
+SIMULATED_BUS = """\
+bus:
+  interface: socketcand                    # the hub of `drivegain simulate demo`
+  channel: can0
+  host: 127.0.0.1
+  port: 29536
+  bitrate_bit_s: 1000000
+sync:
+  period_us: 1000
+  pacing: lockstep                         # the simulated cell answers as fast as this computer can
+"""
+"""Bus and sampling of a cell whose amplifiers `drivegain simulate demo` makes."""
+
+
+def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
     """Copy the templates into a new folder; all of them or none.
+
+    Args:
+        folder: new, or empty.
+        simulated: let the cell file say the bus of `drivegain simulate demo`.
 
     Raises:
         UsageError: the folder's name is no name of a cell.
@@ -98,6 +116,8 @@ def make_folder(folder: Path) -> tuple[Path, ...]:
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{name}.") as temporary:
             whole = Path(temporary) / name
             written = tuple(_copy(source, whole, target.format(name=name), name) for source, target in TEMPLATES)
+            if simulated:
+                _put_on_the_hub(whole / "cells" / f"{name}.yaml")
             whole.chmod(0o755)
             whole.rename(folder)
     except OSError as error:
@@ -107,9 +127,12 @@ def make_folder(folder: Path) -> tuple[Path, ...]:
 
 def init(
     folder: Annotated[Path, typer.Argument(help="Folder to make; its name becomes the cell's.")],
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="For the cell of `drivegain simulate demo`, to try the verbs on.")
+    ] = False,
 ) -> None:
     """Make a folder for a new cell, with commented templates to fill in."""
-    for path in make_folder(folder):
+    for path in make_folder(folder, simulated=simulated):
         typer.echo(path)
 
 
@@ -128,6 +151,13 @@ def _copy(source: str, folder: Path, target: str, name: str) -> Path:
         text = text.replace("pacing: lockstep", "pacing: timed   ").replace("unit: Nm(motor, a priori)", "unit: A")
         path.write_text(text, encoding="utf-8")
     return path
+
+
+def _put_on_the_hub(cell: Path) -> None:
+    text = cell.read_text(encoding="utf-8")
+    cell.write_text(
+        re.sub(r"^bus:\n.*?(?=^axes:)", SIMULATED_BUS, text, flags=re.MULTILINE | re.DOTALL), encoding="utf-8"
+    )
 
 
 INIT = Verb("init", init, "drivegain init cells/press-4")

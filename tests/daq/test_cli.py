@@ -20,6 +20,7 @@ from daq.cli.app import VERBS
 from daq.cli.output import say_written
 from daq.cli.verb import Listed
 from daq.cli.verb_group import VerbGroup
+from daq.configuration.cell import Pacing
 from daq.configuration.cell_file import load_cell
 from daq.configuration.importing import load_import
 from daq.errors import ExitCode
@@ -184,6 +185,20 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
     explained = re.findall(r"^  #   (\w+) ", text, re.MULTILINE)
     assert explained == list(axis)
     assert [path.name for path in folder.parent.iterdir()] == ["press-4"]
+
+
+def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Path) -> None:
+    for folder, option in (("real", []), ("simulated", ["--simulated"])):
+        assert main(["init", str(tmp_path / folder / "press-4"), *option]) == 0
+    real, simulated = (tmp_path / folder / "press-4/cells/press-4.yaml" for folder in ("real", "simulated"))
+    cell = load_cell(simulated)
+    assert [(bus.interface, bus.channel, bus.host, bus.port) for bus in cell.buses] == [
+        ("socketcand", "can0", "127.0.0.1", 29536)
+    ]
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing.LOCKSTEP
+    one, other = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in (real, simulated))
+    assert {key for key in one if one[key] != other[key]} == {"bus", "sync"}
 
 
 def test_init_overwrites_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
