@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ import yaml
 
 from daq.atomic_file import replace_file
 from daq.calibration_schema import CalibrationDocument, calibration_of
-from daq.configuration.yaml_file import parse_yaml, read_model
+from daq.configuration.yaml_file import MAX_BYTES, parse_yaml, read_model
 from daq.errors import CalibrationEdited, CalibrationMissing, CalibrationUnreadable, SchemaMismatch, YamlInvalid
-from ident.calibration import Calibration, Gain, Parameter
+from daq.regular_file import read_regular
+from ident.calibration import Calibration, Gain, Parameter, Source
 from ident.relative_error import RelativeError
 
 VERSION = 1
@@ -71,22 +73,18 @@ def as_document(calibration: Calibration) -> dict[str, object]:
             for effect in calibration.effects
         ],
         "relative_error_percent": _error_document(calibration.relative_error_percent),
-        "holdout_error_percent": None
-        if calibration.holdout_error_percent is None
-        else _error_document(calibration.holdout_error_percent),
+        "holdout_error_percent": _error_document(calibration.holdout_error_percent),
         "condition": calibration.condition,
         "rows": calibration.rows,
         "filter": {
             name: list(value) if isinstance(value, list) else value for name, value in calibration.filter.items()
         },
-        "sources": [
-            {"name": source.name, "sha256": source.sha256, "role": source.role, "partial": source.partial}
-            for source in calibration.sources
-        ],
+        "sources": [_source_document(source) for source in calibration.sources],
         "configuration_sha256": calibration.configuration_sha256,
         "created": calibration.created,
         "software": calibration.software,
         "session_began_s": calibration.session_began_s,
+        "nameplate_holdout_error_percent": _error_document(calibration.nameplate_holdout_error_percent),
     }
 
 
@@ -126,12 +124,21 @@ def load(path: Path) -> Calibration:
     """Read a calibration.
 
     Raises:
-        CalibrationMissing: there is no such file, or it cannot be read.
+        CalibrationMissing: there is no such file, it is none but a folder or a pipe, or it cannot be read.
         CalibrationUnreadable: no calibration of this version, or a key, type or number does not belong, with its line.
         CalibrationEdited: the content is not what `save` wrote, with the sections that were changed.
     """
+    return decode(read(path), str(path))
+
+
+def read(path: Path) -> bytes:
+    """The content of a calibration's file, for whoever needs its digest beside what it says.
+
+    Raises:
+        CalibrationMissing: see `load`.
+    """
     try:
-        content = path.read_bytes()
+        return read_regular(path, MAX_BYTES)
     except OSError as error:
         raise CalibrationMissing(
             str(path),
@@ -139,7 +146,6 @@ def load(path: Path) -> Calibration:
             expected="the file that `drivegain fit` wrote",
             remedy="check the name",
         ) from error
-    return decode(content, str(path))
 
 
 def decode(content: bytes, name: str) -> Calibration:
@@ -219,6 +225,18 @@ def _parameter_document(parameter: Parameter) -> dict[str, object]:
     }
 
 
-def _error_document(error: RelativeError) -> dict[str, object]:
+def _source_document(source: Source) -> dict[str, object]:
+    document = asdict(source)
+    # As YAML gives them back: the schema takes lists.
+    return {**document, "recording": None if source.recording is None else _listed(document["recording"])}
+
+
+def _listed(document: dict[str, object]) -> dict[str, object]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in document.items()}
+
+
+def _error_document(error: RelativeError | None) -> dict[str, object] | None:
+    if error is None:
+        return None
     # An axis that did not move has no figure; whatever else is not finite is an error, and the reader refuses it.
     return {"axes": [None if math.isnan(value) else value for value in error.axes], "total": error.total}

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from daq.configuration.yaml_file import StrictModel
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.recording import Recording
 from ident.relative_error import RelativeError
 
 _Deviation = Annotated[float, Field(ge=0.0)]
@@ -55,13 +56,28 @@ class EffectEntry(StrictModel):
     ambiguity: tuple[str, ...]
 
 
+class RecordingEntry(StrictModel):
+    """How a log came to be."""
+
+    recorded_s: float | None
+    entered_kg: float | None
+    serials: tuple[int | None, ...]
+    saturated_percent: tuple[float, ...]
+    lost_cycles: int
+    missing: tuple[int, ...]
+    controller_sha256: str | None
+
+
 class SourceEntry(StrictModel):
-    """One log; files of earlier versions do not say whether it was partial, because none could be."""
+    """One log; files of earlier versions say nothing of payload and recording, and none of them could be partial."""
 
     name: str
     sha256: str
     role: str
     partial: bool = False
+    payload: str | None = None
+    mass_kg: float | None = None
+    recording: RecordingEntry | None = None
 
 
 class CalibrationDocument(StrictModel):
@@ -85,7 +101,8 @@ class CalibrationDocument(StrictModel):
     created: str
     software: str
     session_began_s: float | None = None
-    """Files of earlier versions do not have it."""
+    nameplate_holdout_error_percent: RelativeErrorEntry | None = None
+    """Files of earlier versions do not have these two."""
 
 
 def _parameter(entry: ParameterEntry) -> Parameter:
@@ -94,6 +111,16 @@ def _parameter(entry: ParameterEntry) -> Parameter:
 
 def _error(entry: RelativeErrorEntry) -> RelativeError:
     return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
+
+
+def _perhaps(entry: RelativeErrorEntry | None) -> RelativeError | None:
+    return None if entry is None else _error(entry)
+
+
+def _source(entry: SourceEntry) -> Source:
+    told = entry.recording
+    recording = None if told is None else Recording(**told.model_dump())
+    return Source(entry.name, entry.sha256, entry.role, entry.partial, entry.payload, entry.mass_kg, recording)
 
 
 def calibration_of(entries: CalibrationDocument) -> Calibration:
@@ -116,13 +143,14 @@ def calibration_of(entries: CalibrationDocument) -> Calibration:
             for e in entries.effects
         ),
         relative_error_percent=_error(entries.relative_error_percent),
-        holdout_error_percent=None if entries.holdout_error_percent is None else _error(entries.holdout_error_percent),
+        holdout_error_percent=_perhaps(entries.holdout_error_percent),
         condition=entries.condition,
         rows=entries.rows,
         filter=dict(entries.filter),
-        sources=tuple(Source(s.name, s.sha256, s.role, s.partial) for s in entries.sources),
+        sources=tuple(_source(s) for s in entries.sources),
         configuration_sha256=entries.configuration_sha256,
         created=entries.created,
         software=entries.software,
         session_began_s=entries.session_began_s,
+        nameplate_holdout_error_percent=_perhaps(entries.nameplate_holdout_error_percent),
     )

@@ -26,6 +26,7 @@ from daq.log.readback import Readback
 from daq.log.reader import Log, SampleBlock, read_log
 from drivers.event import CellEvent, EventKind
 from ident.payload import Payload
+from ident.recording import Recording
 from ident.run import Run
 
 _LOG = logging.getLogger("drivegain")
@@ -183,6 +184,21 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         valid=valid,
         started_s=float(samples.time_ns[0]) * 1e-9,
         partial=log.partial or accepted,
+        recording=_recording(log, cell),
+    )
+
+
+def _recording(log: Log, cell: Cell) -> Recording:
+    run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
+    return Recording(
+        # An import is told no time and writes that of 1970.
+        recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
+        entered_kg=run.entered_kg,
+        serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
+        saturated_percent=tuple(float(share) for share in 100.0 * _saturated(log.samples, cell).mean(axis=0)),
+        lost_cycles=log.statistics.lost_cycles,
+        missing=log.statistics.missing,
+        controller_sha256=run.controller_sha256,
     )
 
 

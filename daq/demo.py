@@ -25,7 +25,7 @@ from daq.plan_file import save_plan
 from daq.record import Recorded, network_of, record
 from daq.report.fit import draw
 from daq.resources import shipped_configurations
-from daq.write_back.apply import Proposal, apply, propose
+from daq.write_back.apply import Proposal, apply, propose_for
 from daq.write_back.controller_write import Written
 from drivers.bus import open_bus
 from drivers.scan import FoundNode
@@ -248,7 +248,8 @@ def _record_valid(
 def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, telling: Telling) -> Recorded:
     name, payload, _ = RUNS[index]
     spec = load_simulation(settings.simulation, payload)
-    declared = {candidate.name: candidate.payload for candidate in cell.payloads}
+    declared = {candidate.name: candidate for candidate in cell.payloads}
+    mounted = None if payload is None else declared[payload]
     bus = open_bus(bus_address(cell))
     try:
         # Another noise in every run, as another day would bring; the plant is the same.
@@ -258,7 +259,8 @@ def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index:
                 cell,
                 moves,
                 settings.out / f"{name}.mcap",
-                payload=None if payload is None else declared[payload],
+                payload=None if mounted is None else mounted.payload,
+                entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
                 operator="demo",
                 granted_by="the demonstration: a simulated cell",
                 run_id=f"demo-{settings.seed}-{name}",
@@ -270,13 +272,12 @@ def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index:
 
 def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) -> tuple[Proposal, Written | None]:
     source = cell.controller_path
-    if cell.controller is None or source is None:
+    if source is None:
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
     target = out / "controller.yaml"
     shutil.copyfile(source, target)
-    keys = dict(zip(cell.axis_names, cell.controller.gains, strict=True))
-    proposal = propose(calibration, target, keys, cell=cell.name, configuration_sha256=cell.digest)
-    return proposal, None if proposal.refusals else apply(proposal, now)
+    proposal = propose_for(cell, calibration, target, now=now)
+    return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
 
 
 def _total(identification: Identification | Evidence) -> float | None:

@@ -27,7 +27,7 @@ from ident.estimate import Estimate, Method
 from ident.estimators.total_least_squares import tls
 from ident.identify import Identification, estimate_with, identify
 from ident.loop import Evidence, Step, close_the_loop, gather
-from ident.relative_error import RelativeError
+from ident.relative_error import RelativeError, of_squares
 from ident.run import Run
 from ident.search import Finding
 from ident.signals import session_began_s
@@ -109,8 +109,14 @@ class Reading:
                     remedy="name other logs",
                 )
             self._seen[content] = log
-            self.sources.append(Source(run.name, run.digest, role, run.partial))
+            self.sources.append(_source(run, role))
             yield run
+
+
+def _source(run: Run, role: str) -> Source:
+    mounted = run.payload
+    name, mass_kg = (None, None) if mounted is None else (mounted.name, mounted.known.get("m"))
+    return Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
 
 
 def fit(
@@ -206,6 +212,8 @@ def _culprit(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
     return ""
 
 
+ALL_AXES = "all axes"
+"""Where an effect is that acts on every motor alike."""
 LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
 """Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
@@ -296,7 +304,31 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         created=created.isoformat(timespec="seconds"),
         software=software(),
         session_began_s=session_began_s(final.trained) if isinstance(final, Evidence) else None,
+        nameplate_holdout_error_percent=_nameplate_error(fitted),
     )
+
+
+def _nameplate_error(fitted: Fit) -> RelativeError | None:
+    """What the hold-out would be told of with nothing calibrated: the declared model and the nameplate's gains.
+
+    ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the scale of its gain, but ‖Y_j‖ does: the total is put together with the
+    ‖Y_j‖ of the calibration, so that a smaller gain alone makes no total smaller.
+    """
+    before, after = fitted.identification, fitted.final.holdout_error
+    if before.holdout is None or after is None or before.estimate.gains_fixed:
+        return None
+    nameplate = np.array([axis.nameplate_gain for axis in fitted.cell.axes])
+    method = Method.ML if before.estimate.method is Method.TLS else before.estimate.method  # tls corrects gains
+    try:
+        held = estimate_with(method, before.system, nameplate)
+    except (IdentificationError, np.linalg.LinAlgError):
+        return None
+    axes = held.relative_error(before.holdout).axes
+    gains = np.concatenate((fitted.final.estimate.gains, np.zeros(len(held.parameters) + 1)))
+    size = before.holdout.joints.square_sum(gains)
+    moved = size > 0.0
+    left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
+    return RelativeError(axes, of_squares(size, left).total)
 
 
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
@@ -313,13 +345,18 @@ def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ..
         error_before, error_after = finding.error_before_percent, finding.error_after_percent
     return AcceptedEffect(
         name=placed.effect.name,
-        axis=fitted.cell.axes[placed.axis].name,
+        axis=axis_of(placed, fitted.cell),
         settings={name: float(value) for name, value in placed.effect.settings.items()},
         coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
         error_before_percent=error_before,
         error_after_percent=error_after,
         ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in finding.ambiguity),
     )
+
+
+def axis_of(placed: PlacedEffect, cell: Cell) -> str:
+    """Name of the axis that an effect is on; what acts on every motor alike is placed on the first for order only."""
+    return ALL_AXES if placed.effect.side is Side.ALL_MOTORS else cell.axes[placed.axis].name
 
 
 def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[Identification | Evidence, Step, Finding]:

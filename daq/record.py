@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -18,13 +19,15 @@ from daq.configuration.cell_file import bundle
 from daq.conversion import Scaling, scaling
 from daq.current_check import check_currents
 from daq.disk_space import DiskRoom, FreeBytes, free_bytes, largest_log_bytes
-from daq.errors import ConfigurationInconsistent, DiskSpaceShort
+from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.log.metadata import RunInfo, RunStatistics
 from daq.log.readback import readback_of_drives
 from daq.log.writer import LogContent, LogWriter
+from daq.payload_mass import check_entered_mass
 from daq.plan import Plan
 from daq.planned_move import path_of
 from daq.version import software
+from daq.write_back.controller_file import read_bytes
 from drivers.errors import MotionRefused
 from drivers.event import CellEvent, EventKind
 from drivers.motion import execute
@@ -104,6 +107,7 @@ def record(
     granted_by: str | None,
     run_id: str,
     speed: float = 1.0,
+    entered_kg: float | None = None,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
     undisturbed: Undisturbed = nullcontext,
@@ -121,12 +125,14 @@ def record(
         granted_by: who allows the motion; None refuses it.
         run_id: unique.
         speed: share of its planned speed that the plan's moves have been given (`daq.plan.slowed`), for the log.
+        entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
         clocks: wall and monotonic time.
         free: room on the disk of a folder.
         undisturbed: keeps signals from the stop of the axes.
         progress: told the moves done and their number.
 
     Raises:
+        UsageError: the mass from the scale is not the payload's; nothing has moved and no file was made.
         MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
             marked invalid.
@@ -137,6 +143,7 @@ def record(
     clocks = clocks or Clocks()
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
+    check_entered_mass(cell, payload, entered_kg)
     with network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
         network.prepare()
         warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
@@ -152,6 +159,8 @@ def record(
             started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
             started_monotonic_ns=started_ns,
             speed=speed,
+            entered_kg=entered_kg,
+            controller_sha256=controller_digest(cell),
         )
         # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
         # the schedule of the recording's waits for nobody, and what follows here takes many periods.
@@ -197,6 +206,15 @@ def record(
         if short is not None:
             raise short
         return Recorded(out, log.statistics, stream.statistics, warnings)
+
+
+def controller_digest(cell: Cell) -> str | None:
+    """SHA-256 of the controller's file as it is now; None where the cell names none, or it is not to be had."""
+    path = cell.controller_path
+    try:
+        return None if path is None else hashlib.sha256(read_bytes(path)).hexdigest()
+    except ControllerUnfit:
+        return None
 
 
 def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: DiskRoom, check_every: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ident.recording import Recording
 from ident.relative_error import RelativeError
 
 
@@ -56,7 +57,7 @@ class AcceptedEffect:
 
     Attributes:
         name: family, as in ident/effects/.
-        axis: name of the axis.
+        axis: name of the axis, or of all together.
         settings: the searched (non-linear) parameters by name, units in the names.
         coefficients: the linear parameters, identified.
         error_before_percent, error_after_percent: of the axis, or in total for an effect on all motors, without and
@@ -84,12 +85,18 @@ class Source:
         role: in the fit.
         partial: it is what was saved of a recording that was never finished, or one with losses; nothing of
             it may reach a controller.
+        payload: name of what was mounted; None without load, and in calibrations of earlier versions.
+        mass_kg: of it, as fitted; None where the fit was not told.
+        recording: what the log tells of its making; None in calibrations of earlier versions.
     """
 
     name: str
     sha256: str
     role: str
     partial: bool = False
+    payload: str | None = None
+    mass_kg: float | None = None
+    recording: Recording | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +119,8 @@ class Calibration:
         configuration_sha256: of the cell configuration that the logs carry.
         created: ISO 8601 time, given by the caller.
         software: name and version that made it.
+        nameplate_holdout_error_percent: on the same run, of the declared model fitted with the nameplate's gains; its
+            axes are put together with the torques of the calibration. None where there is none to compare.
         session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where not all told.
     """
 
@@ -130,3 +139,4 @@ class Calibration:
     created: str
     software: str
     session_began_s: float | None = None
+    nameplate_holdout_error_percent: RelativeError | None = None

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.payload import Payload
+from ident.recording import Recording
 
 FloatArray = NDArray[np.float64]
 
@@ -28,6 +29,7 @@ class Run:
         valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
         started_s: when the run began, on a clock that the runs of one session share [s]; None where no one knows.
         partial: it is what was saved of a recording that was never finished, or one whose losses somebody accepted.
+        recording: what the log tells of its making; None where the run is from no log.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Run:
     valid: NDArray[np.bool_] | None = None
     started_s: float | None = None
     partial: bool = False
+    recording: Recording | None = None
 
     @property
     def rate_hz(self) -> float:

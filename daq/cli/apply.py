@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 import shlex
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.syntax import Syntax
-from rich.table import Table
 
-from daq.calibration_file import load
+from daq.calibration_file import decode, read
+from daq.cli.applier import Applier, AuditOption, ByOption, applier, audit_of, tell_history
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
-from daq.errors import ConfigurationInconsistent, ControllerChanged, OutputFailed
-from daq.report.gain_table import with_deviation
-from daq.write_back.apply import Proposal, apply, propose, refused
+from daq.errors import CalibrationRefused, OutputFailed, UsageError
+from daq.history.store import HistoryStore
+from daq.report.proposal import describe, show
+from daq.write_back.apply import Proposal, apply, propose_for, refused
 from daq.write_back.controller_write import Written
-from daq.write_back.gates import GainChange
-
-_DEFAULT = ApplyPolicy()
+from ident.calibration import Calibration
 
 
 def apply_verb(
@@ -34,138 +35,145 @@ def apply_verb(
     base: Annotated[
         str | None, typer.Option("--base", help="Write only if the controller file still has this SHA-256 (dry run).")
     ] = None,
+    by: ByOption = None,
+    payload_mass: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=KG: mass of a payload from the scale, where `record --mass` was not given."),
+    ] = None,
     max_change_percent: Annotated[
-        float, typer.Option(help="Largest change from the gain in the file.", min=0.0)
-    ] = _DEFAULT.max_change_percent,
+        float | None, typer.Option(help="Largest change from the gain in the file; at most the cell's.", min=0.0)
+    ] = None,
     max_nameplate_percent: Annotated[
-        float, typer.Option(help="Largest distance from the nameplate.", min=0.0)
-    ] = _DEFAULT.max_nameplate_percent,
+        float | None, typer.Option(help="Largest distance from the nameplate; at most the cell's.", min=0.0)
+    ] = None,
     max_std_percent: Annotated[
-        float, typer.Option(help="Largest standard deviation of a gain.", min=0.0)
-    ] = _DEFAULT.max_std_percent,
+        float | None, typer.Option(help="Largest standard deviation of a gain; at most the cell's.", min=0.0)
+    ] = None,
     configuration_changed: Annotated[
         bool,
         typer.Option("--configuration-changed", help="Accept a cell configuration that changed since the recording."),
     ] = False,
+    audit: AuditOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Write identified gains into the controller file: dry run and diff first, --yes to write, with a backup."""
-    declared = load_cell(cell)
-    if declared.controller is None:
-        raise ConfigurationInconsistent(
-            f"{cell}: controller",
-            found="none",
-            expected="the controller's file and the key of each gain",
-            remedy="add `controller: {file: ..., gains: [...]}` to the cell",
-        )
-    file = to or declared.controller_path
-    if file is None:
-        raise ConfigurationInconsistent(
-            str(cell), found="no controller file", expected="one", remedy="give it with --to FILE"
-        )
-    proposal = propose(
-        load(calibration),
-        file,
-        dict(zip(declared.axis_names, declared.controller.gains, strict=True)),
-        cell=declared.name,
-        configuration_sha256=None if configuration_changed else declared.digest,
-        policy=ApplyPolicy(max_change_percent, max_nameplate_percent, max_std_percent),
+    """Write identified gains into the controller file: dry run and diff first, --yes to write, with a backup.
+
+    The gates are those of the cell's `policy: {apply: ...}`; see docs/write-back.md.
+    """
+    declared, now, doer = load_cell(cell), datetime.now(UTC), applier(by)
+    content = read(calibration)
+    fitted = decode(content, str(calibration))
+    proposal = propose_for(
+        declared,
+        fitted,
+        to,
+        now=now,
+        policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
+        configuration_changed=configuration_changed,
+        entered_kg=entered_masses(payload_mass or (), fitted),
+        looked_at=base,
+        appliers=doer.names,
+        calibration_file=calibration,
+        calibration_content=content,
     )
-    if base is not None and base != proposal.base_sha256:
-        raise ControllerChanged(
-            str(file),
-            found=f"content {proposal.base_sha256[:12]}…",
-            expected=f"{base[:12]}…, as --base says",
-            remedy="somebody has changed the file: look at a new dry run",
-        )
     if not json:
         show(proposal, Console())
-    written = _write(proposal) if yes and not proposal.refusals else None
+    book = audit_of(declared, audit)
+    try:
+        written = _write(proposal, now, book, doer) if yes else None
+    except CalibrationRefused:
+        if json:
+            print_json(describe(proposal, None))
+        raise
+    if written is not None:
+        digest, target = hashlib.sha256(content).hexdigest(), str(written.file)
+
+        def enter(store: HistoryStore) -> None:
+            store.add(fitted, digest=digest, at=now)
+            store.applied(digest, at=now, who=str(doer), target=target)
+
+        tell_history(declared, enter)
     if json:
         print_json(describe(proposal, written))
     if proposal.refusals:
         raise refused(proposal)
     if not json:
-        _say_outcome(proposal, written, yes)
+        _say_outcome(proposal, written, yes, cell, to, book)
 
 
-def show(proposal: Proposal, console: Console) -> None:
-    """The change as a table and as a diff."""
-    console.print(change_table(proposal.changes))
-    console.print()
-    if proposal.diff:
-        console.print(Syntax(proposal.diff, "diff", background_color="default", word_wrap=True))
+def tightened(
+    policy: ApplyPolicy, change_percent: float | None, nameplate_percent: float | None, std_percent: float | None
+) -> ApplyPolicy:
+    """The cell's policy with bounds of the command line, which may be tighter and not wider.
+
+    Args:
+        policy: of the cell.
+        change_percent, nameplate_percent, std_percent: bounds asked for [%]; None leaves the cell's.
+
+    Raises:
+        UsageError: one is wider.
+    """
+    return replace(
+        policy,
+        max_change_percent=_tighter("max_change_percent", change_percent, policy.max_change_percent),
+        max_nameplate_percent=_tighter("max_nameplate_percent", nameplate_percent, policy.max_nameplate_percent),
+        max_std_percent=_tighter("max_std_percent", std_percent, policy.max_std_percent),
+    )
 
 
-def change_table(changes: tuple[GainChange, ...]) -> Table:
-    """Old and new gain of each axis with what there is to judge the change by."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    table.add_column("axis", no_wrap=True)
-    for heading in ("in the file", "identified ± σ", "σ %", "change %", "nameplate"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
-    for change in changes:
-        table.add_row(
-            change.axis,
-            f"{change.old:.5g}",
-            with_deviation(change.new, change.std),
-            f"{change.std_percent:.2f}",
-            f"{change.change_percent:+.1f}",
-            f"{change.nameplate:.5g}",
-            change.unit,
-        )
-    return table
+def _tighter(name: str, asked: float | None, allowed: float) -> float:
+    if asked is None or asked <= allowed:
+        return allowed if asked is None else asked
+    raise UsageError(
+        f"--{name.replace('_', '-')} {asked:g}",
+        found="a bound that is wider than the cell's",
+        expected=f"at most {allowed:g}",
+        remedy=f"whoever answers for the cell may widen it in its file: `policy: {{apply: {{{name}: ...}}}}`",
+    )
 
 
-def describe(proposal: Proposal, written: Written | None) -> dict[str, Any]:
-    """The proposal and its outcome for --json."""
-    return {
-        "file": str(proposal.file),
-        "base_sha256": proposal.base_sha256,
-        "applied": written is not None,
-        "backup": None if written is None else str(written.backup),
-        "changes": [
-            {
-                "axis": change.axis,
-                "key": change.key,
-                "line": change.line,
-                "old": change.old,
-                "new": change.new,
-                "change_percent": change.change_percent,
-                "std_percent": change.std_percent,
-                "nameplate": change.nameplate,
-                "unit": change.unit,
-            }
-            for change in proposal.changes
-        ],
-        "refusals": [
-            {
-                "gate": refusal.gate.value,
-                "subject": refusal.subject,
-                "found": refusal.found,
-                "expected": refusal.expected,
-                "remedy": refusal.remedy,
-            }
-            for refusal in proposal.refusals
-        ],
-        "diff": proposal.diff,
-    }
+def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str, float]:
+    """Masses that were entered a second time, by payload [kg].
+
+    Raises:
+        UsageError: not NAME=KG, or no log of the calibration had that payload.
+    """
+    mounted = tuple(dict.fromkeys(one.payload for one in calibration.sources if one.payload is not None))
+    found = {}
+    for text in entries:
+        name, _, number = text.rpartition("=")
+        try:
+            mass_kg = float(number)
+        except ValueError:
+            mass_kg = math.nan
+        if not 0.0 < mass_kg < math.inf or name not in mounted:
+            raise UsageError(
+                f"--payload-mass {text}",
+                found="no mass in kg" if name in mounted else f"no payload {name!r}",
+                expected=f"NAME=KG with one of {', '.join(mounted) or 'none: the calibration tells of no payload'}",
+                remedy="correct the option",
+            )
+        found[name] = mass_kg
+    return found
 
 
-def _write(proposal: Proposal) -> Written | None:
+def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier) -> Written | None:
     try:
-        return apply(proposal, datetime.now(UTC))
+        return apply(proposal, now, audit=audit, who=str(doer))
     except OSError as error:
         raise OutputFailed.of(proposal.file, error) from error
 
 
-def _say_outcome(proposal: Proposal, written: Written | None, yes: bool) -> None:
+def _say_outcome(
+    proposal: Proposal, written: Written | None, yes: bool, cell: Path, to: Path | None, audit: Path | None
+) -> None:
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if proposal.before == proposal.after:
         console.print("Nothing to write: the controller file has these gains already.")
     elif written is not None:
-        console.print(f"Written to {written.file}, backup {written.backup.name}.")
-        console.print(f"To undo: drivegain rollback --to {shlex.quote(str(proposal.file))}")
+        console.print(f"Written to {written.file}, backup {written.backup.name}; the audit is {audit}.")
+        other = "" if to is None else f" --to {shlex.quote(str(to))}"
+        console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell))}{other}")
     elif not yes:
         console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
         console.print(f"  --yes --base {proposal.base_sha256}")

@@ -11,7 +11,6 @@ import typer
 from rich.console import Console
 
 from daq.atomic_file import replace_file
-from daq.cli.apply import show as show_proposal
 from daq.cli.progress import Stepper
 from daq.cli.residual import before_after_table, ranking_table
 from daq.cli.scan import scan_rows, scan_table
@@ -20,6 +19,7 @@ from daq.configuration.simulation import shipped_simulation
 from daq.demo import Outcome, Settings, Telling, demonstrate, summary
 from daq.errors import OutputFailed
 from daq.report.gain_table import gain_table
+from daq.report.proposal import show as show_proposal
 
 
 def demo(

@@ -17,6 +17,7 @@ from daq.configuration.cell import Cell, MotionPolicy, Pacing
 from daq.configuration.cell_bus import bus_loads
 from daq.configuration.cell_file import load_cell
 from daq.errors import DiskSpaceShort, ExitCode, OutputExists, OutputFailed, UsageError
+from daq.payload_mass import check_entered_mass
 from daq.plan import slowed
 from daq.plan_file import load_plan
 from daq.record import record
@@ -36,6 +37,10 @@ def record_verb(
         ),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
+    mass: Annotated[
+        float | None,
+        typer.Option(help="Mass of the payload in kg, read off the scale now; it must be the cell file's.", min=0.0),
+    ] = None,
     operator: Annotated[str | None, typer.Option(help="Who stands for this recording; you, by default.")] = None,
     speed: Annotated[
         float,
@@ -47,6 +52,12 @@ def record_verb(
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or getpass.getuser()
+    carried = mounted(declared, payload)
+    check_entered_mass(declared, carried, mass)
+    if carried is not None and mass is None:
+        typer.echo(
+            "the payload's mass was not entered from the scale (--mass KG): `drivegain apply` will ask", err=True
+        )
     part = _free(out)
     for line in load_lines(declared):
         typer.echo(line, err=True)
@@ -60,11 +71,12 @@ def record_verb(
                 declared,
                 moves,
                 out,
-                payload=mounted(declared, payload),
+                payload=carried,
                 operator=who,
                 granted_by=allowed_by,
                 run_id=str(uuid.uuid4()),
                 speed=speed,
+                entered_kg=mass,
                 undisturbed=undisturbed,
                 progress=lambda count, total: told(count, total, "moves"),
             )
@@ -178,5 +190,7 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
 
 
 RECORD = Verb(
-    "record", record_verb, "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --enable-motion"
+    "record",
+    record_verb,
+    "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
 )

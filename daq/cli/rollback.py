@@ -11,23 +11,46 @@ import typer
 from rich.console import Console
 from rich.syntax import Syntax
 
+from daq.cli.applier import AuditOption, ByOption, applier, audit_of, tell_history
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.errors import OutputFailed
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.write_back.controller_write import Restored, roll_back
 
 
 def rollback(
-    to: Annotated[Path, typer.Option("--to", help="Controller file to restore from its newest backup.")],
+    cell: Annotated[
+        Path | None, typer.Option(help="Cell file; it says which controller file, and which audit.")
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--to", help="Controller file to restore, instead of the one that the cell names.")
+    ] = None,
+    by: ByOption = None,
+    audit: AuditOption = None,
     json: JsonOption = False,
 ) -> None:
     """Take the last write to a controller file back; what that replaces is backed up too, so a second one undoes it.
 
-    A file that somebody has edited since, and a backup that somebody has changed, are refused.
+    A file that somebody has edited since, and a backup that somebody has changed, are refused. With --to alone nothing
+    says where the audit is: give it with --audit, or nothing is written down.
     """
+    declared = None if cell is None else load_cell(cell)
+    file, now, doer = _file(declared, cell, to), datetime.now(UTC), applier(by)
+    book = audit_of(declared, audit)
     try:
-        done = roll_back(to, datetime.now(UTC))
+        done = roll_back(
+            file,
+            now,
+            audit=book,
+            who=str(doer),
+            format=None if declared is None or declared.controller is None else declared.controller.format,
+        )
     except OSError as error:
-        raise OutputFailed.of(to, error) from error
+        raise OutputFailed.of(file, error) from error
+    if declared is not None:
+        target = str(done.file)
+        tell_history(declared, lambda store: store.rolled_back(at=now, who=str(doer), target=target))
     diff = _diff(done)
     if json:
         print_json(
@@ -35,6 +58,7 @@ def rollback(
                 "file": str(done.file),
                 "restored": str(done.source),
                 "backup": None if done.backup is None else str(done.backup),
+                "audit": None if book is None else str(book),
                 "diff": diff,
             }
         )
@@ -43,6 +67,25 @@ def rollback(
     console.print(Syntax(diff, "diff", background_color="default", word_wrap=True))
     stood = "the file was gone" if done.backup is None else f"what stood there is now {done.backup.name}"
     console.print(f"Restored {done.source.name} to {done.file}; {stood}.", markup=False)
+    if book is None:
+        console.print("Not written down: no --cell and no --audit was given.", markup=False)
+
+
+def _file(cell: Cell | None, cell_file: Path | None, to: Path | None) -> Path:
+    if to is not None:
+        return to
+    if cell is None:
+        raise UsageError(
+            "rollback",
+            found="neither a cell nor a controller file",
+            expected="--cell CELL",
+            remedy="name the cell whose controller is to be as it was",
+        )
+    if cell.controller_path is None:
+        raise ConfigurationInconsistent(
+            f"{cell_file}: controller", found="no file", expected="one", remedy="give it with --to FILE"
+        )
+    return cell.controller_path
 
 
 def _diff(done: Restored) -> str:
@@ -57,4 +100,4 @@ def _diff(done: Restored) -> str:
     return "\n".join(lines)
 
 
-ROLLBACK = Verb("rollback", rollback, "drivegain rollback --to controllers/demo.yaml")
+ROLLBACK = Verb("rollback", rollback, "drivegain rollback --cell cells/demo.yaml")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from daq.configuration.yaml_file import StrictModel
 
@@ -31,14 +32,22 @@ class ApplyPolicy:
         max_nameplate_percent: from the manufacturer's gain [%].
         max_std_percent: relative standard deviation of the identified gain [%].
         max_error_percent: relative error of the torques, on held-out data where there are any [%].
+        max_age_days: of the oldest log [days]; None where age does not matter, as for imported logs, which have none.
+        max_saturated_percent: share of an axis's samples in which a limit acted [%].
         by: who applies what a scheduled job has found.
+        signatures: how many of the signers must have signed the calibration; whoever applies it is not counted.
+        signers: public key (minisign) of each person who may sign, by name.
     """
 
     max_change_percent: float = 35.0
     max_nameplate_percent: float = 50.0
     max_std_percent: float = 3.0
     max_error_percent: float = 25.0
+    max_age_days: float | None = 30.0
+    max_saturated_percent: float = 2.0
     by: Applier = Applier.PERSON
+    signatures: int = 0
+    signers: Mapping[str, str] = field(default_factory=dict)
 
 
 DEFAULT_APPLY_POLICY = ApplyPolicy()
@@ -51,7 +60,17 @@ class ApplyPolicyModel(StrictModel):
     max_nameplate_percent: _Percent = DEFAULT_APPLY_POLICY.max_nameplate_percent
     max_std_percent: _Percent = DEFAULT_APPLY_POLICY.max_std_percent
     max_error_percent: _Percent = DEFAULT_APPLY_POLICY.max_error_percent
+    max_age_days: Annotated[float, Field(gt=0)] | None = DEFAULT_APPLY_POLICY.max_age_days
+    max_saturated_percent: _Percent = DEFAULT_APPLY_POLICY.max_saturated_percent
     by: Applier = DEFAULT_APPLY_POLICY.by
+    signatures: Annotated[int, Field(ge=0)] = DEFAULT_APPLY_POLICY.signatures
+    signers: dict[str, str] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _signers_enough(self) -> ApplyPolicyModel:
+        if self.signatures > len(self.signers):
+            raise ValueError(f"at least {self.signatures} `signers`, a public key by each name, for so many signatures")
+        return self
 
     @property
     def policy(self) -> ApplyPolicy:

@@ -42,6 +42,8 @@ class RunInfo:
         started_monotonic_ns: the monotonic clock at the same moment [ns]; a clock jump shows in the difference.
         origin: where the samples came from: "recorded", or the import's sources.
         speed: share of the plan's speed that the moves were made with; 1 but for a first run.
+        entered_kg: mass of the payload as somebody read it off the scale for this recording; None where nobody did.
+        controller_sha256: digest of the controller's file at the start; None where the cell names none.
     """
 
     run_id: str
@@ -53,6 +55,8 @@ class RunInfo:
     started_monotonic_ns: int
     origin: str = "recorded"
     speed: float = 1.0
+    entered_kg: float | None = None
+    controller_sha256: str | None = None
 
     @property
     def role(self) -> Role:
@@ -107,11 +111,13 @@ def run_record(info: RunInfo) -> dict[str, str]:
         "wall_minus_monotonic_ns": str(info.wall_minus_monotonic_ns),
         "origin": info.origin,
         "speed": repr(info.speed),
+        "payload_entered_kg": "" if info.entered_kg is None else repr(info.entered_kg),
+        "controller_sha256": info.controller_sha256 or "",
     }
 
 
 def run_from_record(record: Mapping[str, str]) -> RunInfo:
-    """What `run_record` wrote; logs of earlier versions say nothing of the speed.
+    """What `run_record` wrote; logs of earlier versions say nothing of speed, second weighing and controller.
 
     Raises:
         KeyError: an entry is missing.
@@ -134,6 +140,9 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
     speed = float(record.get("speed", "1"))
     if not 0.0 < speed <= 1.0:
         raise ValueError(f"share of the plan's speed {record['speed']!r}")
+    entered = record.get("payload_entered_kg", "")
+    if entered and not 0.0 < float(entered) < math.inf:
+        raise ValueError(f"mass of the payload as entered {entered!r:.40}")
     wall_ns = int(record["started_wall_ns"])
     if not 0 <= wall_ns < 2**63:
         raise ValueError(f"start time {record['started_wall_ns']!r}")
@@ -147,6 +156,8 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         started_monotonic_ns=int(record["started_monotonic_ns"]),
         origin=record["origin"],
         speed=speed,
+        entered_kg=float(entered) if entered else None,
+        controller_sha256=record.get("controller_sha256") or None,
     )
 
 

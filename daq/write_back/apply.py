@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
+from daq.calibration_file import encode
 from daq.configuration.apply_policy import ApplyPolicy
-from daq.errors import CalibrationRefused, ControllerUnfit
-from daq.write_back.controller_file import ControllerFile, Scalar, decode, read_bytes
+from daq.configuration.cell import Cell
+from daq.configuration.controller_target import ControllerFormat
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
+from daq.write_back.base_gate import base_refusals
+from daq.write_back.circumstances import Circumstances, circumstances
+from daq.write_back.controller_file import decode, read_bytes
 from daq.write_back.controller_write import Written, sha256, write
-from daq.write_back.gain_spelling import spell
-from daq.write_back.gates import GainChange, Refusal, calibration_refusals, gain_refusals
+from daq.write_back.fit_gates import fit_refusals
+from daq.write_back.gain_gates import GainChange, gain_refusals
+from daq.write_back.gates import Refusal
+from daq.write_back.link import followed, require_there
+from daq.write_back.scalar import Scalar, respell
+from daq.write_back.signature_gate import signature_refusals
+from daq.write_back.source_gates import source_refusals
+from daq.write_back.written_down import Chronicle
 from ident.calibration import Calibration, Gain
 
 
@@ -28,6 +40,9 @@ class Proposal:
         before, after: its text; equal where there is nothing to change.
         changes: one a gain, in the order of the calibration.
         refusals: closed gates; only a proposal without any can be applied.
+        before_content, after_content: what stands, and would stand, in the file.
+        format: of the file; None where its name tells.
+        evidence: what the change rests on, for the audit: digests of calibration, configuration and logs.
     """
 
     file: Path
@@ -36,6 +51,10 @@ class Proposal:
     after: str
     changes: tuple[GainChange, ...]
     refusals: tuple[Refusal, ...]
+    before_content: bytes
+    after_content: bytes
+    format: ControllerFormat | None = None
+    evidence: Mapping[str, object] = field(default_factory=dict)
 
     @property
     def diff(self) -> str:
@@ -50,6 +69,61 @@ class Proposal:
         return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
 
 
+def propose_for(
+    declared: Cell,
+    calibration: Calibration,
+    file: Path | None = None,
+    *,
+    now: datetime,
+    policy: ApplyPolicy | None = None,
+    configuration_changed: bool = False,
+    entered_kg: Mapping[str, float] | None = None,
+    looked_at: str | None = None,
+    appliers: Collection[str] = (),
+    calibration_file: Path | None = None,
+    calibration_content: bytes | None = None,
+) -> Proposal:
+    """Work out what a calibration changes in the controller file of a cell, with every gate there is; reads only.
+
+    Args:
+        declared: the cell as it is now.
+        calibration: with the identified gains.
+        file: the controller's file, where it is not the one that the cell names.
+        now: for the age of the logs.
+        policy: bounds; the cell's when None.
+        configuration_changed: somebody has looked at what changed in the cell's configuration since the recording.
+        entered_kg, looked_at, appliers, calibration_file, calibration_content: see `propose`.
+
+    Raises:
+        ConfigurationInconsistent: the cell names no controller file, or no keys in it.
+        ControllerUnfit, CalibrationRefused: see `propose`.
+    """
+    target = file or declared.controller_path
+    if declared.controller is None or not declared.controller.gains or target is None:
+        raise ConfigurationInconsistent(
+            f"cell {declared.name!r}: controller",
+            found="none" if declared.controller is None else "no file, or no key of each gain in it",
+            expected="the controller's file and the key of each gain",
+            remedy="add `controller: {file: ..., gains: [...]}` to the cell file",
+        )
+    names, controller = declared.axis_names, declared.controller
+    return propose(
+        calibration,
+        target,
+        dict(zip(names, controller.gains, strict=True)),
+        cell=declared.name,
+        configuration_sha256=None if configuration_changed else declared.digest,
+        policy=policy or declared.apply,
+        held=circumstances(declared, now, entered_kg or {}),
+        looked_at=looked_at,
+        appliers=appliers,
+        calibration_file=calibration_file,
+        calibration_content=calibration_content,
+        format=controller.format,
+        factors=dict(zip(names, controller.factors, strict=True)) if controller.factors else {},
+    )
+
+
 def propose(
     calibration: Calibration,
     file: Path,
@@ -58,60 +132,103 @@ def propose(
     cell: str,
     configuration_sha256: str | None = None,
     policy: ApplyPolicy | None = None,
+    held: Circumstances | None = None,
+    looked_at: str | None = None,
+    appliers: Collection[str] = (),
+    calibration_file: Path | None = None,
+    calibration_content: bytes | None = None,
+    format: ControllerFormat | None = None,  # noqa: A002 - as the cell file calls it
+    factors: Mapping[str, float] | None = None,
 ) -> Proposal:
-    """Work out what a calibration changes in a controller file; reads only.
+    """Work out what a calibration changes in a controller file; reads only. `propose_for` takes all of it from a cell.
 
     Args:
         calibration: with the identified gains.
-        file: the controller's YAML file.
-        keys: dotted path of each axis's gain in it, by the axis's name.
+        file: the controller's file.
+        keys: key of each axis's gain in it, by the axis's name.
         cell: name of the cell that the controller drives.
         configuration_sha256: digest of that cell's configuration, None where it is not to be compared.
         policy: bounds; the default ones when None.
+        held: what the logs are held against; what it does not tell is not compared.
+        looked_at: digest of the controller file that somebody has looked at.
+        appliers: names of whoever applies it; their signatures do not count.
+        calibration_file: where signatures are looked for.
+        calibration_content: of that file, as it was read.
+        format: of the controller's file; None where its name tells.
+        factors: number in the file = gain × factor, by the axis's name; 1 where it is not there.
 
     Raises:
         ControllerUnfit: the file cannot be read, does not parse, or lacks a gain that can be changed on its own.
         CalibrationRefused: the calibration has other axes than the cell.
+        ConfigurationInconsistent: a signer's public key is none.
     """
-    policy = policy or ApplyPolicy()
+    policy, held, factors = policy or ApplyPolicy(), held or Circumstances(), factors or {}
     _check_axes(calibration, keys)
+    require_there(file)
     content = read_bytes(file)
-    now = decode(content, str(file))
+    now = decode(content, str(file), format)
+    base_sha256 = sha256(content)
     scalars = now.locate(tuple(keys[gain.axis] for gain in calibration.gains))
-    changes = tuple(_change(gain, scalar) for gain, scalar in zip(calibration.gains, scalars, strict=True))
-    refusals = calibration_refusals(calibration, cell, configuration_sha256, policy) + tuple(
-        r for c in changes for r in gain_refusals(c, policy)
+    changes = tuple(
+        _change(gain, scalar, factors.get(gain.axis, 1.0))
+        for gain, scalar in zip(calibration.gains, scalars, strict=True)
     )
-    spelling = {change.key: change.spelling for change in changes if change.spelling}
-    return Proposal(file, sha256(content), now.text, now.with_values(spelling).text, changes, refusals)
+    signed = encode(calibration) if calibration_content is None else calibration_content
+    refusals = (
+        *fit_refusals(calibration, cell, configuration_sha256, policy),
+        *source_refusals(calibration, policy, held),
+        *base_refusals(calibration, str(file), base_sha256, looked_at),
+        *signature_refusals(calibration_file, signed, policy, appliers),
+        *(refusal for change in changes for refusal in gain_refusals(change, policy)),
+    )
+    after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
+    return Proposal(
+        file,
+        base_sha256,
+        now.text,
+        after.text,
+        changes,
+        refusals,
+        content,
+        after.content,
+        format,
+        _evidence(calibration, signed, calibration_file),
+    )
 
 
-def apply(proposal: Proposal, now: datetime) -> Written | None:
+def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: str = "") -> Written | None:
     """Make a proposed change.
 
     Args:
         proposal: without refusals.
-        now: time for the backup's name.
+        now: time for the backup's name and the audit.
+        audit: where it is written down that it begins, before anything is replaced, how it ended, and what was refused;
+            None for nowhere.
+        who: in whose name.
 
     Returns:
         what was written, None where the file had these gains already.
 
     Raises:
         CalibrationRefused: a gate is closed, with every one of them.
-        ControllerChanged, ControllerBusy: see `daq.write_back.controller_write.write`.
+        ControllerChanged, ControllerBusy, AuditUnusable: see `daq.write_back.controller_write.write`.
         OSError: from the file system; the file stands as it was.
     """
+    details = {"changes": [_documented(change) for change in proposal.changes], **proposal.evidence}
     if proposal.refusals:
+        Chronicle(audit, who, now).refusal(followed(proposal.file), proposal.refusals, details)
         raise refused(proposal)
-    if proposal.after == proposal.before:
+    if proposal.after_content == proposal.before_content:
         return None
     spelling = {change.key: change.spelling for change in proposal.changes}
-    before = ControllerFile(str(proposal.file), proposal.before)
+    before = decode(proposal.before_content, str(proposal.file), proposal.format)
 
     def check(content: bytes) -> None:
-        decode(content, str(proposal.file)).check_against(before, spelling)
+        decode(content, str(proposal.file), proposal.format).check_against(before, spelling)
 
-    return write(proposal.file, proposal.after.encode(), proposal.base_sha256, check, now)
+    return write(
+        proposal.file, proposal.after_content, proposal.base_sha256, check, now, audit=audit, who=who, details=details
+    )
 
 
 def refused(proposal: Proposal) -> CalibrationRefused:
@@ -147,19 +264,38 @@ def _check_axes(calibration: Calibration, keys: Mapping[str, str]) -> None:
         )
 
 
-def _change(gain: Gain, scalar: Scalar) -> GainChange:
+def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
     writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    spelling = spell(gain.value, gain.std, scalar.text) if writable else ""
-    if spelling and float(spelling) == scalar.value:
-        spelling = scalar.text  # the same number in the human's own spelling is no change
+    put = respell(scalar, gain.value, gain.std, factor) if writable else None
     return GainChange(
         axis=gain.axis,
         key=scalar.key,
         line=scalar.line,
-        old=scalar.value,
-        new=float(spelling) if spelling else gain.value,
+        old=scalar.value / factor,
+        new=gain.value if put is None else put.new,
         std=gain.std,
         unit=gain.unit,
         nameplate=gain.nameplate,
-        spelling=spelling,
+        spelling="" if put is None else put.spelling,
     )
+
+
+def _evidence(calibration: Calibration, content: bytes, file: Path | None) -> dict[str, object]:
+    return {
+        "calibration": {
+            "file": None if file is None else str(file.absolute()),
+            "sha256": hashlib.sha256(content).hexdigest(),
+            "cell": calibration.cell,
+            "created": calibration.created,
+            "software": calibration.software,
+        },
+        "configuration_sha256": calibration.configuration_sha256,
+        "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
+    }
+
+
+def _documented(change: GainChange) -> dict[str, object]:
+    """For the audit, which takes finite numbers only."""
+    numbers = {"old": change.old, "new": change.new, "std": change.std}
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    return {"axis": change.axis, "key": change.key, "unit": change.unit, **finite}

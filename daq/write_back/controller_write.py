@@ -1,31 +1,25 @@
-"""The controller file on the disk: one writer at a time, a backup first, replaced whole, and back again.
-
-A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first of SHA-256: of what is in the backup, and
-of what took its place. So a backup says by itself whether somebody has changed it, and whether somebody has changed the
-controller file since; no other file could be lost, or disagree.
-"""
+"""The controller file on the disk: one writer at a time, written down, a backup first, replaced whole; and back."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import hashlib
-import os
-import re
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
 from daq.atomic_file import replace_file
-from daq.errors import BackupMissing, ControllerBusy, ControllerChanged, ControllerUnfit
+from daq.configuration.controller_target import ControllerFormat
+from daq.errors import BackupMissing, ControllerChanged
+from daq.write_back.audit import AuditAction
+from daq.write_back.backups import Backup, back_up, backups, short_digest
 from daq.write_back.controller_file import decode, read_bytes
-
-_STAMP = "%Y%m%dT%H%M%SZ"
-_DIGEST = 12
-"""Hexadecimal digits of SHA-256 in a backup's name: 48 bits tell a few hundred contents apart."""
+from daq.write_back.link import followed
+from daq.write_back.one_writer import only_writer
+from daq.write_back.written_down import Chronicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,30 +56,22 @@ class Restored:
     after: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Backup:
-    """A backup beside a controller file, as its name tells.
-
-    Attributes:
-        path: of it.
-        stamp, count: its place in the order of time.
-        was: digest of what is in it.
-        became: digest of what took its place in the controller file.
-    """
-
-    path: Path
-    stamp: str
-    count: int
-    was: str
-    became: str
-
-
 def sha256(content: bytes) -> str:
     """Digest by which a base file is recognised."""
     return hashlib.sha256(content).hexdigest()
 
 
-def write(file: Path, after: bytes, base_sha256: str, check: Callable[[bytes], None], now: datetime) -> Written:
+def write(
+    file: Path,
+    after: bytes,
+    base_sha256: str,
+    check: Callable[[bytes], None],
+    now: datetime,
+    *,
+    audit: Path | None = None,
+    who: str = "",
+    details: Mapping[str, object] | None = None,
+) -> Written:
     """Replace a controller file, if it is still the one that was looked at.
 
     Args:
@@ -93,52 +79,85 @@ def write(file: Path, after: bytes, base_sha256: str, check: Callable[[bytes], N
         after: its new content.
         base_sha256: digest of the content that the change was worked out for.
         check: called with what the disk gives back before anything is replaced.
-        now: time for the backup's name.
+        now: time for the backup's name and the audit.
+        audit: where it is written down, before anything is replaced and after; None for nowhere.
+        who: in whose name.
+        details: what else the audit shall know.
 
     Raises:
         ControllerChanged: somebody has changed the file since.
         ControllerBusy: somebody is writing it.
         ControllerUnfit: from `check`, or it cannot be read.
+        AuditUnusable: it could not be written down; the old content stands.
         OSError: from the file system; the old content stands, and neither backup nor temporary file is left.
     """
-    target = file.resolve()
-    with _only_writer(target):
-        before = read_bytes(target)
-        found = sha256(before)
-        if found != base_sha256:
-            raise ControllerChanged(
-                str(file),
-                found=f"content {found[:12]}…",
-                expected=f"{base_sha256[:12]}…, for which the change was shown",
-                remedy="somebody has changed the file: look at a new dry run",
-            )
-        return _replace(target, before, after, check, now)
+    target = followed(file)
+    chronicle, known = Chronicle(audit, who, now), details or {}
+    with contextlib.ExitStack() as lock:
+        with chronicle.of_question(target, known):
+            lock.enter_context(only_writer(target))
+            before = read_bytes(target)
+            found = sha256(before)
+            if found != base_sha256:
+                raise ControllerChanged(
+                    str(file),
+                    found=f"content {found[:12]}…",
+                    expected=f"{base_sha256[:12]}…, for which the change was shown",
+                    remedy="somebody has changed the file: look at a new dry run",
+                )
+        with chronicle.of_write(AuditAction.APPLY_BEGUN, AuditAction.APPLIED, target, before, after, known):
+            return _replace(target, before, after, check, now)
 
 
-def roll_back(file: Path, now: datetime) -> Restored:
+def roll_back(
+    file: Path,
+    now: datetime,
+    *,
+    audit: Path | None = None,
+    who: str = "",
+    format: ControllerFormat | None = None,  # noqa: A002 - as the cell file calls it
+) -> Restored:
     """Take the last write back: put the newest backup that differs from the file in its place.
 
     What it replaces becomes a backup too, so that a second way back undoes the first. A file that was deleted comes
     back as it was before the last write.
 
+    Args:
+        file: the controller file, or a symbolic link to it.
+        now: time for the backup's name and the audit.
+        audit, who: as in `write`.
+        format: of the file; None where its name tells.
+
     Raises:
         BackupMissing: there is none.
         ControllerBusy: somebody is writing the file.
         ControllerChanged: the file is not what was written when that backup was made: somebody has edited it since.
-        ControllerUnfit: the file cannot be read; the backup was changed, or is no YAML.
+        ControllerUnfit: the file cannot be read; the backup was changed, or does not parse.
+        AuditUnusable: it could not be written down; the file stands as it was.
         OSError: from the file system; the file stands as it was.
     """
-    target = file.resolve()
-    with _only_writer(target):
-        before = read_bytes(target) if target.exists() else None
-        found = backups(target)
-        for backup in reversed(found):
-            # A writer that was killed before it replaced the file leaves a backup of what is still there.
-            if before is None or backup.was != _digest(before):
-                after = _content(backup)
-                if before is not None:
-                    _check_unedited(file, before, backup)
-                return _restore(target, before, after, backup, now)
+    target = followed(file)
+    chronicle = Chronicle(audit, who, now)
+    with contextlib.ExitStack() as lock:
+        with chronicle.of_question(target, {"asked": "rollback"}):
+            lock.enter_context(only_writer(target))
+            before = read_bytes(target) if target.exists() else None
+            backup = _way_back(file, target, before)
+            after = backup.content()
+            if before is not None:
+                _check_unedited(file, before, backup)
+        details = {"restored": backup.path.name}
+        check = partial(_check_parses, name=str(backup.path), format=format)
+        with chronicle.of_write(AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK, target, before, after, details):
+            return _restore(target, before, after, backup, check, now)
+
+
+def _way_back(file: Path, target: Path, before: bytes | None) -> Backup:
+    found = backups(target)
+    for backup in reversed(found):
+        # A writer that was killed before it replaced the file leaves a backup of what is still there.
+        if before is None or backup.was != short_digest(before):
+            return backup
     raise BackupMissing(
         str(file),
         found=f"{len(found)} backups with the same content" if found else "no backup beside it",
@@ -147,44 +166,21 @@ def roll_back(file: Path, now: datetime) -> Restored:
     )
 
 
-def backups(target: Path) -> tuple[Backup, ...]:
-    """Backups beside a controller file, oldest first."""
-    found = (_backup(target, path) for path in target.parent.iterdir())
-    return tuple(sorted((backup for backup in found if backup is not None), key=lambda b: (b.stamp, b.count)))
-
-
-def _content(backup: Backup) -> bytes:
-    """What is in a backup.
-
-    Raises:
-        ControllerUnfit: it is not what was put there.
-    """
-    content = backup.path.read_bytes()
-    if _digest(content) != backup.was:
-        raise ControllerUnfit(
-            str(backup.path),
-            found=f"{len(content)} bytes with SHA-256 {_digest(content)}…",
-            expected=f"{backup.was}…, as its name says",
-            remedy="this backup was changed after it was made, and nothing was restored; if its gains are right, copy "
-            "it over the controller file by hand",
-        )
-    return content
-
-
 def _check_unedited(file: Path, before: bytes, backup: Backup) -> None:
-    if _digest(before) != backup.became:
+    if short_digest(before) != backup.became:
         one, other = shlex.quote(str(backup.path)), shlex.quote(str(file))
         raise ControllerChanged(
             str(file),
-            found=f"content {_digest(before)}…",
+            found=f"content {short_digest(before)}…",
             expected=f"{backup.became}…, as drivegain wrote it when it made {backup.path.name}",
             remedy="somebody has edited the file since, and going back would lose that; look at the difference with "
             f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
         )
 
 
-def _restore(target: Path, before: bytes | None, after: bytes, source: Backup, now: datetime) -> Restored:
-    check = partial(_check_parses, name=str(source.path))
+def _restore(
+    target: Path, before: bytes | None, after: bytes, source: Backup, check: Callable[[bytes], None], now: datetime
+) -> Restored:
     if before is not None:
         written = _replace(target, before, after, check, now)
         return Restored(target, source.path, written.backup, before, after)
@@ -197,7 +193,7 @@ def _restore(target: Path, before: bytes | None, after: bytes, source: Backup, n
 
 
 def _replace(target: Path, before: bytes, after: bytes, check: Callable[[bytes], None], now: datetime) -> Written:
-    backup = _back_up(target, before, after, now)
+    backup = back_up(target, before, after, now)
     try:
         replace_file(target, after, check=check)
     except BaseException:
@@ -210,75 +206,5 @@ def _replace(target: Path, before: bytes, after: bytes, check: Callable[[bytes],
     return Written(target, backup, before, after)
 
 
-def _back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
-    """Write a complete backup, later in order than every other."""
-    stamp, count = now.astimezone(UTC).strftime(_STAMP), 0
-    taken = backups(target)
-    if taken and (taken[-1].stamp, taken[-1].count) >= (stamp, count):
-        # A clock set back, or two writes in one second, must not make an older backup look newer.
-        stamp, count = taken[-1].stamp, taken[-1].count + 1
-    order = f"{stamp}-{count}" if count else stamp
-    backup = target.with_name(f"{target.name}.{order}.{_digest(before)}-{_digest(after)}.bak")
-    # The lock keeps every other drivegain out, and time and count are beyond every backup: nobody has this name.
-    try:
-        replace_file(backup, before, like=target)
-    except BaseException:
-        backup.unlink(missing_ok=True)
-        raise
-    return backup
-
-
-def _backup(target: Path, path: Path) -> Backup | None:
-    """A backup by its name, None for any other file."""
-    match = re.fullmatch(
-        re.escape(target.name) + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak", path.name
-    )
-    return None if match is None else Backup(path, match[1], int(match[2] or 0), match[3], match[4])
-
-
-def _digest(content: bytes) -> str:
-    return sha256(content)[:_DIGEST]
-
-
-@contextlib.contextmanager
-def _only_writer(target: Path) -> Iterator[None]:
-    """Hold the file's lock; the system gives it back even after a kill.
-
-    The lock file is removed at the end. A second writer may have opened it just before: its lock is then on a file
-    that has no name any more, which it sees by the inode, and takes the lock anew.
-    """
-    lock = target.parent / f".{target.name}.lock"
-    while True:
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        try:
-            _take(descriptor, target)
-            if _is_at(descriptor, lock):
-                try:
-                    yield
-                finally:
-                    lock.unlink(missing_ok=True)
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _take(descriptor: int, target: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise ControllerBusy(
-            str(target),
-            found="another drivegain writing it",
-            expected="one writer at a time",
-            remedy="wait until it has finished, then look at a new dry run",
-        ) from error
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    with contextlib.suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    return False
-
-
-def _check_parses(content: bytes, name: str) -> None:
-    decode(content, name).locate(())
+def _check_parses(content: bytes, name: str, format: ControllerFormat | None) -> None:  # noqa: A002
+    decode(content, name, format).locate(())

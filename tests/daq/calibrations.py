@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import UTC, datetime
+
 from hypothesis import strategies as st
 
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.recording import Recording
 from ident.relative_error import RelativeError
 
 NAMEPLATE = (32.96, 32.96, 25.65, -11.52, 18.48, 7.68)
 IDENTIFIED = (33.9, 32.4, 24.2, -9.21, 16.3, 6.79)
 AXES = ("J1", "J2", "J3", "J4", "J5", "J6")
+RECORDED = datetime(2025, 1, 2, 2, 0, 0, tzinfo=UTC)
 KEYS = {axis: f"drives.{axis}.gain" for axis in AXES}
 
 
@@ -31,10 +36,38 @@ def demo_calibration() -> Calibration:
         condition=812.0,
         rows=14400,
         filter={"position_cutoff_hz": 40.0, "standstill_rad_s": [0.03] * 6},
-        sources=(Source("unloaded", "a" * 64, "unloaded"), Source("loaded", "b" * 64, "loaded with disc")),
+        sources=(
+            Source("unloaded", "a" * 64, "fit", recording=demo_recording()),
+            Source("loaded", "b" * 64, "fit", False, "disc", 4.59, demo_recording(4.592)),
+            Source("unused", "d" * 64, "holdout", False, "disc", 4.59, demo_recording(4.588)),
+        ),
         configuration_sha256="c" * 64,
         created="2025-01-02T03:04:05+00:00",
         software="drivegain 0.1.0",
+        nameplate_holdout_error_percent=RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3),
+    )
+
+
+def demo_recording(entered_kg: float | None = None, at: datetime = RECORDED) -> Recording:
+    """Of the demo cell's drives, without losses, some samples saturated."""
+    serials = tuple(range(1001, 1007))
+    return Recording(at.timestamp(), entered_kg, serials, (0.0, 0.1, 0.0, 0.0, 1.9, 0.0), 0, (0,) * 6, None)
+
+
+def recorded(calibration: Calibration, at: datetime) -> Calibration:
+    """The same, of logs that were recorded at another time."""
+    return with_recordings(calibration, recorded_s=at.timestamp())
+
+
+def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
+    """The same with something else in what every log tells of its making."""
+    told = [(source, source.recording) for source in calibration.sources]
+    return replace(
+        calibration,
+        sources=tuple(
+            source if recording is None else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
+            for source, recording in told
+        ),
     )
 
 
@@ -43,6 +76,27 @@ _deviations = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
 _texts = st.text(max_size=12)
 _parameters = st.builds(Parameter, _texts, _numbers, _deviations, _texts)
 _errors = st.builds(RelativeError, st.lists(_numbers, max_size=3).map(tuple), _numbers)
+_percents = st.lists(st.floats(0.0, 100.0), max_size=3).map(tuple)
+_recordings = st.builds(
+    Recording,
+    recorded_s=st.none() | _numbers,
+    entered_kg=st.none() | _numbers,
+    serials=st.lists(st.none() | st.integers(0, 2**32 - 1), max_size=3).map(tuple),
+    saturated_percent=_percents,
+    lost_cycles=st.integers(0, 10**9),
+    missing=st.lists(st.integers(0, 10**9), max_size=3).map(tuple),
+    controller_sha256=st.none() | _texts,
+)
+_sources = st.builds(
+    Source,
+    name=_texts,
+    sha256=_texts,
+    role=_texts,
+    partial=st.booleans(),
+    payload=st.none() | _texts,
+    mass_kg=st.none() | _numbers,
+    recording=st.none() | _recordings,
+)
 _effects = st.builds(
     AcceptedEffect,
     name=_texts,
@@ -65,8 +119,9 @@ calibrations = st.builds(
     condition=_numbers,
     rows=st.integers(min_value=0, max_value=10**9),
     filter=st.dictionaries(_texts, _numbers | st.lists(_numbers, max_size=3), max_size=3),
-    sources=st.lists(st.builds(Source, _texts, _texts, _texts), max_size=2).map(tuple),
+    sources=st.lists(_sources, max_size=2).map(tuple),
     configuration_sha256=_texts,
     created=_texts,
     software=_texts,
+    nameplate_holdout_error_percent=st.none() | _errors,
 )

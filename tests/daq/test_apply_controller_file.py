@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import tempfile
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 import yaml
@@ -12,8 +15,12 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from daq.errors import ControllerUnfit
+from daq.write_back.apply import apply, propose
+from daq.write_back.audit import AuditAction, read
 from daq.write_back.controller_file import ControllerFile, decode
 from daq.write_back.gain_spelling import spell
+from ident.calibration import Gain
+from tests.daq.calibrations import demo_calibration
 
 _words = st.text("abcdefghijklmnopqrstuvwxyzé_", min_size=1, max_size=6).filter(
     lambda word: word not in ("y", "n", "no", "on", "off", "yes", "true", "false", "null", "gain")
@@ -22,6 +29,19 @@ _comments = st.sampled_from(["", "   # data sheet", " # Ü 漢 😀", " #", "   
 _numbers = st.sampled_from(["32.96", "-11.52", "7", "+1.5", "1e3", "2.5E-3", "0.10", ".5", "5.", "00.5"])
 _quotes = st.sampled_from(["", "", "", "'", '"'])
 _gaps = st.sampled_from([" ", "  ", "        "])
+_elsewhere = st.sampled_from(
+    [
+        "",
+        "defaults: &d {kp: 1, ti: [1, 2.50]}|uses: *d|merged: {<<: *d, kp: 3}|",
+        "text: >-|  gain: 32.96|  folded # no comment|",
+        "literal: |+|  32.96|||",
+        "? [a, complex key]|: {gain: 32.96, 'quoted key': \"\\u00e9 32.96\"}|",
+        "deep: {a: [{b: {c: [[1, 2], {d: 32.96}]}}]}|",
+        "date: 2024-01-02|octal: 0o17|hex: 0x20|flag: yes|empty:|tilde: ~|",
+        "wide: [1.0,|  2.0,  # of the second||  3.0]|",
+    ]
+)
+"""Before and behind the drives; | is a line end."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +62,9 @@ def _cases(draw: st.DrawFn) -> _Case:
     axes = draw(st.lists(_words, min_size=1, max_size=4, unique=True))
     step = " " * draw(st.sampled_from([1, 2, 4]))
     head = draw(st.sampled_from(["", "\ufeff", "# a human's file", "---", "%YAML 1.1\n---", "title: 'déjà 漢 😀 vu'"]))
-    pieces = [head + (newline if head.strip("\ufeff") else "") + f"drives:{newline}"]
+    around = [draw(_elsewhere).replace("|+|", "\0+|").replace("|", newline).replace("\0", "|") for _ in range(2)]
+    around[1] = around[1].replace("&d", "&e").replace("*d", "*e").replace(": ", "_2: ", 1) if around[1] else ""
+    pieces = [head + (newline if head.strip("\ufeff") else "") + around[0] + f"drives:{newline}"]
     numbers: list[str] = []
     keys: list[str] = []
     for axis in axes:
@@ -60,6 +82,7 @@ def _cases(draw: st.DrawFn) -> _Case:
         pieces.append(quote + after)
         numbers.append(number)
         keys.append(f"drives.{axis}.{'1' if shape == 'list' else 'gain'}")
+    pieces[-1] += around[1]
     return _Case(tuple(pieces), tuple(numbers), tuple(keys))
 
 
@@ -84,6 +107,35 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
     assert changed.text == case.text(spelt)
     assert [scalar.text for scalar in changed.locate(case.keys)] == list(spelt)
     assert file.with_values({}).text == file.text
+
+
+@settings(max_examples=500, deadline=None)
+@given(_cases(), st.data())
+def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, data: st.DataObject) -> None:
+    """The whole way, with lock, audit, backup and rename; and the bytes that stand there afterwards."""
+    axes = [f"J{number + 1}" for number in range(len(case.keys))]
+    olds = [float(number) for number in case.numbers]
+    shares = data.draw(st.lists(st.floats(0.7, 1.3), min_size=len(axes), max_size=len(axes)))
+    gains = tuple(
+        Gain(axis, share * old, 0.004 * abs(share * old), "Nm/A", old)
+        for axis, share, old in zip(axes, shares, olds, strict=True)
+    )
+    spelt = tuple(
+        text if float(told := spell(gain.value, gain.std, text)) == float(text) else told
+        for gain, text in zip(gains, case.numbers, strict=True)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        file, audit = Path(folder) / "robot.yaml", Path(folder) / "audit.jsonl"
+        file.write_bytes(case.text(case.numbers).encode())
+        calibration = replace(demo_calibration(), gains=gains)
+        proposal = propose(calibration, file, dict(zip(axes, case.keys, strict=True)), cell="demo")
+        assert proposal.refusals == ()
+        written = apply(proposal, datetime(2025, 1, 2, tzinfo=UTC), audit=audit, who="Ada")
+        assert file.read_bytes() == case.text(spelt).encode()
+        if spelt != case.numbers:
+            assert written is not None
+            assert written.backup.read_bytes() == case.text(case.numbers).encode()
+            assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
 
 
 @settings(max_examples=300, deadline=None)

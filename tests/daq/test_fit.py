@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from daq import fit as fit_module
+from daq.cli.fit import error_table
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.errors import LogRepeated, LogsDiffer, ModelContradicted
-from daq.fit import check_explained, fit
+from daq.fit import calibration_of, check_explained, fit
 from daq.log.losses import LossyLogs
 from daq.resources import shipped_configurations
 from ident.errors import PayloadUnseen
@@ -102,6 +106,17 @@ def test_every_method_hears_of_a_payload_that_was_not_there(
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     with pytest.raises(PayloadUnseen):
         fit(_paths("undeclared", "run1", "run2", "run3"), method=method)
+
+
+def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    found = fit(_paths("run0", "run1"))
+    calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
+    rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
+    out = io.StringIO()
+    Console(file=out, width=100).print(error_table(found, replace(calibration, holdout_error_percent=rested)))
+    (unused,) = (line.split() for line in out.getvalue().splitlines() if "unused" in line)
+    assert unused == ["unused", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
 
 
 @given(total=st.floats(0.0, 200.0), axis=st.floats(0.0, 1000.0))

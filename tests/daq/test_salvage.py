@@ -26,7 +26,9 @@ from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
 from daq.log.writer import LogWriter
 from daq.salvage import salvage
-from daq.write_back.gates import Gate, calibration_refusals
+from daq.write_back.circumstances import Circumstances
+from daq.write_back.gates import Gate
+from daq.write_back.source_gates import source_refusals
 from drivers.event import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
@@ -246,8 +248,8 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     again = decode(encode(partial), "calibration.yaml")
     assert again == partial
     policy = ApplyPolicy()
-    assert not calibration_refusals(good, "demo", None, policy)
-    assert [refusal.gate for refusal in calibration_refusals(again, "demo", None, policy)] == [Gate.PARTIAL]
+    assert not source_refusals(good, policy, Circumstances())
+    assert [refusal.gate for refusal in source_refusals(again, policy, Circumstances())] == [Gate.PARTIAL]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
 
 

@@ -1,0 +1,213 @@
+"""The audit of a cell: a file to which entries are appended and from which none is ever taken away.
+
+One entry a line (JSON), each with the digest of the one before. An entry is on the disk before `append` returns. It is
+written at once and under a lock; a writer that was killed while it wrote leaves an unfinished line at most. That line
+stays: the next entry begins on a line of its own and says what it found.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import stat
+import time
+from collections.abc import Collection, Iterator, Mapping
+from datetime import datetime
+from pathlib import Path
+
+from daq.errors import AuditUnusable
+from daq.write_back.audit_chain import (
+    AuditFlaw,
+    AuditVerdict,
+    Content,
+    Flaw,
+    OpenWrite,
+    judge,
+    lines_of,
+    torn_details,
+)
+from daq.write_back.audit_entry import FIRST, AuditAction, AuditEntry, decode, encode, entry, is_fragment
+
+__all__ = [
+    "AuditAction",
+    "AuditEntry",
+    "AuditFlaw",
+    "AuditVerdict",
+    "Content",
+    "Flaw",
+    "OpenWrite",
+    "append",
+    "digest_now",
+    "read",
+    "verify",
+]
+
+_TRIES, _PAUSE_S = 100, 0.05
+"""For the lock: whoever holds it writes one line."""
+
+
+def append(
+    path: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
+) -> AuditEntry:
+    """Add an entry, durably.
+
+    Args:
+        path: of the audit; made where there is none, its folder must exist.
+        action: what happened.
+        at: when, with its time zone.
+        who: the person or the job.
+        subject: what it happened to.
+        details: plain JSON without numbers that are not finite.
+
+    Raises:
+        AuditUnusable: no regular file, locked for long, or its last line is not what was written.
+        OSError: from the file system; at most an unfinished line was left.
+    """
+    with _locked(path) as descriptor:
+        content = _read_all(descriptor)
+        new: list[AuditEntry] = []
+
+        def add(kind: AuditAction, says: Mapping[str, object]) -> None:
+            before = new[-1] if new else last
+            number, previous = (1, FIRST) if before is None else (before.number + 1, before.sha256)
+            new.append(entry(number, at.isoformat(), who, kind, subject, says, previous))
+
+        last, unfinished = _end_of(content, path)
+        if unfinished:
+            add(AuditAction.TORN_LINE, torn_details(unfinished))
+        add(action, details)
+        begin = b"" if not content or content.endswith(b"\n") else b"\n"
+        line = begin + b"".join(encode(one) + b"\n" for one in new)
+        if os.write(descriptor, line) != len(line):
+            raise OSError(28, "No space left on device", str(path))
+        os.fsync(descriptor)
+        if not content:
+            _fsync_folder(path.resolve().parent)
+        return new[-1]
+
+
+def read(path: Path) -> tuple[AuditEntry, ...]:
+    """All entries, oldest first, none where there is no file; whether they are what was written, `verify` says.
+
+    Raises:
+        AuditUnusable: no regular file, or it cannot be read.
+    """
+    return tuple(one for one in map(decode, lines_of(_content(path))) if one is not None)
+
+
+def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
+    """Whether the audit is what was written, and what became of writes that were begun and never ended.
+
+    Args:
+        path: of the audit; without a file there is nothing to object to, unless something was noted elsewhere.
+        heads: `sha256` of entries noted elsewhere: a chain cannot tell by itself that its last lines are missing.
+
+    Raises:
+        AuditUnusable: no regular file, or it cannot be read.
+    """
+    return judge(_content(path), digest_now, heads)
+
+
+def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
+    """The last entry, and unfinished lines after it.
+
+    Raises:
+        AuditUnusable: the last line is something else.
+    """
+    unfinished: list[bytes] = []
+    for number, line in reversed(list(enumerate(lines_of(content), start=1))):
+        one = decode(line)
+        if one is not None and one.holds:
+            return one, unfinished[::-1]
+        if one is not None or not is_fragment(line):
+            raise AuditUnusable(
+                str(path),
+                found=f"line {number} that is not what drivegain wrote",
+                expected="entries that were never changed",
+                remedy="look at it with `drivegain history --verify`, then move this audit away, keep it, and begin "
+                "another; nothing was written",
+            )
+        unfinished.append(line)
+    return None, unfinished[::-1]
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[int]:
+    # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+    try:
+        descriptor = os.open(path, flags, 0o666)
+    except IsADirectoryError as error:
+        raise _no_file(path, "a folder") from error
+    try:
+        _check_regular(descriptor, path)
+        for _ in range(_TRIES):
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            time.sleep(_PAUSE_S)
+        else:
+            raise AuditUnusable(
+                str(path),
+                found="another program that keeps it locked",
+                expected="a lock for as long as a line takes",
+                remedy="see who has it open (`fuser`); nothing was written",
+            )
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _content(path: Path) -> bytes:
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise _no_file(path, (error.strerror or type(error).__name__).lower()) from error
+    try:
+        _check_regular(descriptor, path)
+        return _read_all(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _check_regular(descriptor: int, path: Path) -> None:
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        raise _no_file(path, "something that is no regular file")
+
+
+def _no_file(path: Path, found: str) -> AuditUnusable:
+    return AuditUnusable(
+        str(path),
+        found=found,
+        expected="the cell's audit, a regular file",
+        remedy="correct `history.audit` of the cell file, or give --audit FILE; nothing was written",
+    )
+
+
+def _read_all(descriptor: int) -> bytes:
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    pieces = []
+    while piece := os.read(descriptor, 1 << 20):
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+def digest_now(subject: str) -> str | None:
+    """SHA-256 of the file that an entry is about, as it is now; None where it is none, or cannot be read."""
+    path = Path(subject)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+    except OSError:
+        return None
+
+
+def _fsync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,171 @@
+"""Gates of the logs that a calibration rests on: whole, fresh, of these drives, and with a payload weighed twice."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+
+from daq.configuration.apply_policy import ApplyPolicy
+from daq.payload_mass import agree, tolerance_kg
+from daq.write_back.circumstances import Circumstances
+from daq.write_back.gates import Gate, Refusal
+from ident.calibration import Calibration, Source
+from ident.recording import Recording
+
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_UNFINISHED = ".part"
+_CLOCKS = timedelta(days=1)
+"""By which the recorder's clock may be ahead of ours."""
+
+
+def source_refusals(calibration: Calibration, policy: ApplyPolicy, held: Circumstances) -> tuple[Refusal, ...]:
+    """Closed gates of the logs.
+
+    Args:
+        calibration: to be written.
+        policy: bounds.
+        held: what the logs are held against.
+    """
+    if not calibration.sources:
+        return (
+            Refusal(Gate.SOURCES, "calibration", "no logs it rests on", "at least one", "fit from logs of this cell"),
+        )
+    axes = [gain.axis for gain in calibration.gains]
+    closed = [refusal for source in calibration.sources for refusal in _refusals(source, axes, policy, held)]
+    return (*closed, *_exchanged(calibration.sources, axes))
+
+
+def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circumstances) -> Iterator[Refusal]:
+    name = f"log {source.name}"
+    if source.name.endswith(_UNFINISHED) or not _SHA256.fullmatch(source.sha256):
+        unfinished = source.name.endswith(_UNFINISHED)
+        found = "a recording that was never finished" if unfinished else f"no SHA-256 digest ({source.sha256[:20]!r})"
+        yield Refusal(Gate.SOURCES, name, found, "a finished, valid log", "record it again and fit")
+    if source.partial:
+        yield Refusal(
+            Gate.PARTIAL,
+            name,
+            "what was salvaged of a recording that was never finished, or one with losses",
+            "a recording that its recorder stands for to the end",
+            "record it again and fit",
+        )
+    told = source.recording
+    if told is None:
+        if held.serials is not None or held.payloads is not None or held.now is not None:
+            yield Refusal(
+                Gate.SOURCES,
+                name,
+                "nothing of how it was recorded: the calibration is of an earlier drivegain",
+                "its date, drives, payload and losses",
+                "fit the logs again",
+            )
+        return
+    yield from _losses(source, told, name)
+    yield from _age(told, name, policy, held.now)
+    yield from _serials(told, name, axes, held)
+    yield from _saturation(told, name, axes, policy)
+    yield from _mass(source, told, name, held)
+
+
+def _losses(source: Source, told: Recording, name: str) -> Iterator[Refusal]:
+    # A log whose losses somebody has accepted is called partial: once is enough.
+    if not source.partial and (told.lost_cycles or any(told.missing)):
+        yield Refusal(
+            Gate.LOSSY,
+            name,
+            f"{told.lost_cycles} SYNC cycles lost, {sum(told.missing)} answers missing",
+            "a recording without losses",
+            "record it again, with less load on the bus and the computer, and fit",
+        )
+
+
+def _age(told: Recording, name: str, policy: ApplyPolicy, now: datetime | None) -> Iterator[Refusal]:
+    if now is None or policy.max_age_days is None:
+        return
+    expected = f"recorded within the last {policy.max_age_days:g} days"
+    if told.recorded_s is None:
+        found = "no date: it was imported"
+        remedy = "record with drivegain, or allow it with `max_age_days: null` in the cell's `policy: {apply: ...}`"
+    else:
+        age = now - datetime.fromtimestamp(told.recorded_s, UTC)
+        if -_CLOCKS <= age <= timedelta(days=policy.max_age_days):
+            return
+        days = age / timedelta(days=1)
+        found = f"recorded {days:.1f} days ago" if days > 0 else f"recorded {-days:.1f} days from now"
+        remedy = "record again and fit" if days > 0 else "set the clocks of this computer and of the recorder"
+    yield Refusal(Gate.STALE, name, found, expected, remedy)
+
+
+def _serials(told: Recording, name: str, axes: list[str], held: Circumstances) -> Iterator[Refusal]:
+    declared = {} if held.serials is None else held.serials
+    for axis, serial in zip(axes, told.serials, strict=False):
+        wanted = declared.get(axis)
+        if wanted is not None and serial != wanted:
+            yield Refusal(
+                Gate.SERIAL,
+                f"{name}, axis {axis}",
+                "a drive that told no serial number" if serial is None else f"serial number {serial}",
+                f"{wanted}, the drive of this axis in the cell file",
+                "was the drive exchanged? then record again with it; else correct the cell file",
+            )
+
+
+def _exchanged(sources: tuple[Source, ...], axes: list[str]) -> Iterator[Refusal]:
+    """Drives that differ between the logs of one fit."""
+    logs = [(source.name, source.recording.serials) for source in sources if source.recording is not None]
+    for index, axis in enumerate(axes):
+        met: dict[int, str] = {}
+        for name, serials in logs:
+            serial = serials[index] if index < len(serials) else None
+            if serial is not None:
+                met.setdefault(serial, name)
+        if len(met) > 1:
+            found = ", ".join(f"{serial} in {name}" for serial, name in met.items())
+            yield Refusal(
+                Gate.SERIAL,
+                f"axis {axis}",
+                f"drives of different serial numbers ({found})",
+                "one drive in all logs of a fit",
+                "fit the logs of one drive only",
+            )
+
+
+def _saturation(told: Recording, name: str, axes: list[str], policy: ApplyPolicy) -> Iterator[Refusal]:
+    for axis, percent in zip(axes, told.saturated_percent, strict=False):
+        if percent > policy.max_saturated_percent:
+            yield Refusal(
+                Gate.SATURATED,
+                f"{name}, axis {axis}",
+                f"a limit acting in {percent:.1f} % of the samples",
+                f"at most {policy.max_saturated_percent:g} %",
+                "record slower moves (`record --speed`), or a smaller payload",
+            )
+
+
+def _mass(source: Source, told: Recording, name: str, held: Circumstances) -> Iterator[Refusal]:
+    if held.payloads is None or source.payload is None:
+        return
+    subject, fitted_kg = f"{name}, payload {source.payload}", source.mass_kg
+    at_apply_kg = held.entered_kg.get(source.payload)
+    entered = [kg for kg in (told.entered_kg, at_apply_kg) if kg is not None]
+    if fitted_kg is None or not entered:
+        found = "no mass" if fitted_kg is None else f"{fitted_kg:g} kg, entered once (in the cell file)"
+        yield Refusal(
+            Gate.MASS,
+            subject,
+            found,
+            "the same mass entered a second time, from the scale",
+            f"weigh it and give --payload-mass {source.payload}=KG, or `record --mass KG` the next time",
+        )
+        return
+    within_kg = tolerance_kg(held.payloads, source.payload)
+    for other_kg in entered:
+        if not agree(other_kg, fitted_kg, within_kg):
+            yield Refusal(
+                Gate.MASS,
+                subject,
+                f"{other_kg:g} kg entered the second time",
+                f"{fitted_kg:g} kg within {within_kg:g} kg, as fitted",
+                "weigh it again, correct the wrong one of the two, and fit: all gains are in proportion to this mass",
+            )

@@ -1,0 +1,105 @@
+"""A write to a controller, written down: that it begins, before anything is replaced, and how it ended."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from daq.errors import AuditUnusable, CalibrationRefused
+from daq.write_back.audit import AuditAction, append, digest_now
+from daq.write_back.gates import Refusal
+
+_LOG = logging.getLogger("drivegain")
+_NOT_WRITTEN = (OSError, AuditUnusable)
+
+
+@dataclass(frozen=True, slots=True)
+class Chronicle:
+    """Where writes are written down, and in whose name.
+
+    Attributes:
+        audit: file; None for a library that keeps none.
+        who: the person or the job.
+        at: when.
+    """
+
+    audit: Path | None
+    who: str
+    at: datetime
+
+    @contextlib.contextmanager
+    def of_write(
+        self,
+        begun: AuditAction,
+        ended: AuditAction,
+        target: Path,
+        before: bytes | None,
+        after: bytes,
+        details: Mapping[str, object],
+    ) -> Iterator[None]:
+        """Around the replacement of a file.
+
+        Args:
+            begun, ended: what is written down before it, and after it when all went well.
+            target: the file, symbolic links followed.
+            before, after: content; before is None where the file is gone.
+            details: what else is to be known of it.
+
+        Raises:
+            AuditUnusable, OSError: the beginning could not be written down; the file stands as it was.
+        """
+        if self.audit is None:
+            yield
+            return
+        digests = {"sha256_before": None if before is None else _sha256(before), "sha256_after": _sha256(after)}
+        entry = self._append(self.audit, begun, target, {**digests, **details})
+        try:
+            yield
+        except BaseException as error:  # an interrupt ends a write too
+            # An interrupt may come when all is done: the digest says what stands there, whatever the error says.
+            found = {"begun": entry, "error": _said(error), "sha256_found": digest_now(str(target))}
+            self._end(self.audit, AuditAction.FAILED, target, found)
+            raise
+        self._end(self.audit, ended, target, {"begun": entry})
+
+    def refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
+        """Somebody asked for a write, and gates were closed."""
+        told = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
+        self._refused(target, {"refusals": told, **details})
+
+    @contextlib.contextmanager
+    def of_question(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
+        """Around what is asked of a file before it is written; a no is written down."""
+        try:
+            yield
+        except CalibrationRefused as error:
+            told = {"gate": "file", "subject": error.subject, "found": error.found}
+            self._refused(target, {"refusals": [told], **details})
+            raise
+
+    def _refused(self, target: Path, details: Mapping[str, object]) -> None:
+        if self.audit is not None:
+            self._end(self.audit, AuditAction.REFUSED, target, details)
+
+    def _append(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> int:
+        return append(audit, action, at=self.at, who=self.who, subject=str(target), details=details).number
+
+    def _end(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> None:
+        try:
+            self._append(audit, action, target, details)
+        except _NOT_WRITTEN as error:
+            # What was done stands, and the beginning with the digests tells of it: no reason to call it undone.
+            _LOG.warning("the audit could not be told that it is %s: %s", action.value, error)
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _said(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"[:500]

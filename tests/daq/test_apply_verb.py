@@ -1,0 +1,239 @@
+"""`drivegain apply` and `drivegain rollback`, as a person uses them, on a copy of the demo cell."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import shlex
+import shutil
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from daq.calibration_file import save
+from daq.cli.app import main
+from daq.cli.apply import entered_masses, tightened
+from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.cell_file import load_cell
+from daq.errors import ExitCode, UsageError
+from daq.history.store import HistoryStore
+from daq.report.proposal import significant
+from daq.write_back.audit import AuditAction, read, verify
+from daq.write_back.gain_gates import GainChange
+from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A cell of one's own, and a calibration of it that was recorded just now."""
+
+    cell: Path
+    controller: Path
+    calibration: Path
+
+    @property
+    def audit(self) -> Path:
+        """Of the cell."""
+        return self.cell.with_name("cell.audit.jsonl")
+
+    def apply(self, *options: str) -> int:
+        """The command."""
+        return main(["apply", str(self.calibration), "--cell", str(self.cell), *options])
+
+    def rollback(self, *options: str) -> int:
+        """The command."""
+        return main(["rollback", "--cell", str(self.cell), *options])
+
+    def actions(self) -> list[AuditAction]:
+        """What was written down; the chain holds."""
+        verdict = verify(self.audit)
+        assert verdict.holds
+        assert verdict.open_writes == ()
+        return [entry.action for entry in verdict.entries]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    """In folders with blanks in their names."""
+    cells, controllers = tmp_path / "the cells", tmp_path / "controllers"
+    cells.mkdir()
+    controllers.mkdir()
+    text = (CONFIGS / "cells" / "demo.yaml").read_text().replace("../robots", str(CONFIGS / "robots"))
+    cell = cells / "cell.yaml"
+    cell.write_text(text)
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
+    calibration = recorded(demo_calibration(), datetime.now(UTC))
+    save(replace(calibration, configuration_sha256=load_cell(cell).digest), tmp_path / "calibration.yaml")
+    return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
+
+
+def test_a_dry_run_is_a_table_a_diff_and_no_trace(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply() == ExitCode.OK
+    shown = capsys.readouterr().out
+    fourth = next(line for line in shown.splitlines() if line.startswith("J4"))
+    # Old, new ± σ, σ %, change %, change in σ with its mark, nameplate, distance from it.
+    assert " ".join(fourth.split()) == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 62.7 * -11.52 -20.1 Nm/A"
+    assert "+    gain: -9.2100" in shown
+    assert "nothing was written" in shown
+    assert bench.controller.read_bytes() == before
+    assert not bench.audit.exists()
+
+
+def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--json") == ExitCode.OK
+    dry = json.loads(capsys.readouterr().out)
+    assert (dry["applied"], dry["refusals"], dry["backup"]) == (False, [], None)
+    assert [change["axis"] for change in dry["changes"]] == list(AXES)
+    assert all(change["significant"] for change in dry["changes"])
+
+    assert bench.apply("--yes", "--base", "0" * 64) == ExitCode.CALIBRATION_REFUSED
+    assert "--base" in capsys.readouterr().err
+    assert bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
+    outcome = capsys.readouterr()
+    assert {refusal["gate"] for refusal in json.loads(outcome.out)["refusals"]} == {"change"}
+    assert "J4" in outcome.err
+    assert bench.controller.read_bytes() == before
+    assert bench.actions() == [AuditAction.REFUSED] * 2
+
+    assert bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada") == ExitCode.OK
+    undo = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("To undo: drivegain "))
+    assert undo == ["rollback", "--cell", str(bench.cell)]
+    assert b"-9.2100" in bench.controller.read_bytes()
+
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "these gains already" in capsys.readouterr().out
+
+    assert main(undo) == ExitCode.OK
+    assert "Restored" in capsys.readouterr().out
+    assert bench.controller.read_bytes() == before
+    begun = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert bench.actions() == [AuditAction.REFUSED] * 2 + begun
+    assert read(bench.audit)[2].who == f"Ada (login {getpass.getuser()})"
+    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+        assert [event.target for event in store.events()] == [str(bench.controller)] * 2
+
+
+def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes") == ExitCode.OK
+    begun, applied = read(bench.audit)
+    assert (begun.action, begun.who, begun.subject) == (
+        AuditAction.APPLY_BEGUN,
+        getpass.getuser(),
+        str(bench.controller),
+    )
+    assert applied.details == {"begun": begun.number}
+    digests = demo_calibration().sources
+    logs = begun.details["logs"]
+    assert isinstance(logs, list)
+    assert [(log["name"], log["sha256"]) for log in logs] == [(one.name, one.sha256) for one in digests]
+    changes = begun.details["changes"]
+    assert isinstance(changes, list)
+    assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == ("J4", -11.52, -9.21)
+    told = begun.details["calibration"]
+    assert isinstance(told, dict)
+    assert told["file"] == str(bench.calibration)
+    assert begun.details["sha256_before"] != begun.details["sha256_after"]
+    assert len(bench.controller.read_bytes()) != len(before)
+
+
+def test_another_configuration_is_refused_until_somebody_says_so(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "# changed\n")
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--configuration-changed" in capsys.readouterr().err
+    assert bench.apply("--yes", "--configuration-changed") == ExitCode.OK
+
+
+def test_the_mass_may_be_entered_at_the_write_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    once = with_recordings(recorded(demo_calibration(), datetime.now(UTC)), entered_kg=None)
+    save(replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration)
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--payload-mass disc=KG" in capsys.readouterr().err
+    assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
+    assert bench.apply("--yes", "--payload-mass", "disc") == ExitCode.USAGE
+    assert bench.apply("--yes", "--payload-mass", "disc=4.592") == ExitCode.OK
+
+
+@pytest.mark.parametrize(
+    "text", ["disc", "disc=", "disc=-1", "disc=nan", "disc=inf", "=4.59", "block=4.59", "disc=1=2"]
+)
+def test_what_is_no_mass_of_a_payload_is_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        entered_masses([text], demo_calibration())
+
+
+def test_options_may_be_tighter_than_the_cell_and_not_wider(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = ApplyPolicy(max_change_percent=20.0)
+    assert tightened(policy, None, 40.0, None) == replace(policy, max_nameplate_percent=40.0)
+    assert tightened(policy, 20.0, None, 0.5) == replace(policy, max_std_percent=0.5)
+    for asked in ((20.1, None, None), (None, 51.0, None), (None, None, 3.1)):
+        with pytest.raises(UsageError, match="wider than the cell's"):
+            tightened(policy, *asked)
+    assert bench.apply("--max-change-percent", "36") == ExitCode.USAGE
+    assert "policy: {apply: {max_change_percent: ...}}" in capsys.readouterr().err
+
+
+def test_the_cell_s_policy_is_the_bound(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {max_change_percent: 15}}\n")
+    assert bench.apply("--configuration-changed", "--json") == ExitCode.CALIBRATION_REFUSED
+    refusals = json.loads(capsys.readouterr().out)["refusals"]
+    assert [(one["gate"], one["subject"]) for one in refusals] == [("change", "J4")]
+
+
+def test_a_policy_that_wants_more_signatures_than_it_names_is_refused(bench: Bench) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {signatures: 1}}\n")
+    assert bench.apply() == ExitCode.CONFIGURATION
+
+
+def test_a_rollback_without_a_cell_says_that_it_is_not_written_down(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
+    assert "Not written down" in capsys.readouterr().out
+    audit = tmp_path / "elsewhere.jsonl"
+    assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
+    assert "Not written down" not in capsys.readouterr().out
+    assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert main(["rollback"]) == ExitCode.USAGE
+
+
+def test_without_room_for_the_audit_nothing_is_written(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    gone = str(bench.cell.parent / "gone" / "a.jsonl")
+    assert bench.apply("--yes", "--audit", gone) == ExitCode.UNEXPECTED
+    os.mkfifo(bench.audit)
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "the cell's audit, a regular file" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
+    assert not list(bench.controller.parent.glob("*.bak"))
+
+
+def test_a_history_that_is_none_does_not_make_a_write_undone(
+    bench: Bench, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert b"-9.2100" in bench.controller.read_bytes()
+
+
+def _change(axis: str, old: float, new: float, std: float) -> GainChange:
+    return GainChange(axis, axis, 1, old, new, std, "Nm/A", old, "")
+
+
+def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
+    large = _change("J1", 30.0, 33.0, 3.0)  # 10 %, 1 σ
+    small = _change("J2", 30.0, 30.3, 0.03)  # 1 %, 10 σ
+    broken = _change("J3", 30.0, float("nan"), 0.1)
+    assert significant((large, small, broken)) == {"J2"}
+    assert significant((broken,)) == frozenset()
