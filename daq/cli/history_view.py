@@ -1,0 +1,203 @@
+"""A history on the screen and as one JSON object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from daq.cli.verb import printable
+from daq.history.entry import Entry
+from daq.history.table import rows
+from daq.history.watch import Point, Series
+from daq.history.words import alarm_words, pattern_of, questions
+from daq.report.gain_table import with_deviation
+from ident.drift_chart import CHART
+
+
+def show(entries: Sequence[Entry], all_series: Sequence[Series], in_force: str | None, console: Console) -> None:
+    """The calibrations, a line each, then each gain as it is now."""
+    if not entries:
+        console.print("The history is empty: no calibration was applied or entered yet.")
+        console.print("To enter one: drivegain history CELL --add CALIBRATION")
+        return
+    console.print(calibration_table(entries, all_series, in_force))
+    console.print()
+    console.print(gain_table(all_series))
+    say_alarms(all_series, console)
+
+
+def show_axis(series: Series, all_series: Sequence[Series], console: Console) -> None:
+    """Every calibration of one gain."""
+    console.print(axis_table(series))
+    for noted in series.acknowledged:
+        console.print(
+            f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
+            f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
+        )
+    words = alarm_words(series)
+    if words is not None:
+        say_alarms(all_series, console)
+    elif series.drift is not None:
+        console.print(f"No alarm. σ of the changes is {series.dispersion:.2f} × that of the fits.")
+
+
+def say_alarms(all_series: Sequence[Series], console: Console) -> None:
+    """What changed, and what it may come from."""
+    alarms = [words for series in all_series if (words := alarm_words(series)) is not None]
+    console.print("No alarm." if not alarms else "")
+    for words in alarms:
+        console.print(f"ALARM: {words}", style="bold")
+    for question in questions(all_series):
+        console.print(question[0].upper() + question[1:])
+    if alarms:
+        console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
+
+
+def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], in_force: str | None) -> Table:
+    """One row a calibration."""
+    table = _table("fitted (UTC)", "calibration")
+    table.add_column("error %", justify="right", no_wrap=True)
+    table.add_column("largest change", justify="right", no_wrap=True)
+    table.add_column("alarms", no_wrap=True)
+    table.add_column("applied")
+    changes = {
+        (series.axis, point.entry.digest): (index, point)
+        for series in all_series
+        for index, point in enumerate(series.points)
+    }
+    for entry in entries:
+        points = [(s, *changes[s.axis, entry.digest]) for s in all_series if (s.axis, entry.digest) in changes]
+        alarms = [s.axis for s, index, _ in points if s.alarm_at(index) is not None]
+        error = entry.error_percent if entry.holdout_percent is None else entry.holdout_percent
+        table.add_row(
+            f"{entry.created:%Y-%m-%d %H:%M}",
+            entry.digest[:8],
+            f"{error:.2f}",
+            _largest([point for _, _, point in points]),
+            ", ".join(alarms) or "-",
+            printable(_applied(entry, in_force)),
+        )
+    return table
+
+
+def gain_table(all_series: Sequence[Series]) -> Table:
+    """Each gain as it was found last, beside its baseline."""
+    table = _table("axis")
+    for heading in ("gain ± σ", "nameplate", "since baseline %", "σ", "state"):
+        table.add_column(heading, justify="left" if heading == "state" else "right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    for series in all_series:
+        if not series.points:
+            table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
+            continue
+        gain, drift = series.points[-1].gain, series.drift
+        count = len(series.points) - series.began
+        known = drift is not None and count > 1
+        state = (
+            "ALARM" if series.alarmed else "ok" if count > CHART.baseline else f"baseline: {count} of {CHART.baseline}"
+        )
+        table.add_row(
+            printable(series.axis),
+            with_deviation(gain.value, gain.std),
+            f"{gain.nameplate:.4g}",
+            f"{drift.change_percent:+.2f}" if drift is not None and known else "-",
+            f"{abs(drift.change_sigmas):.1f}" if drift is not None and known else "-",
+            state,
+            printable(series.unit),
+        )
+    return table
+
+
+def axis_table(series: Series) -> Table:
+    """Every calibration of one gain, with the two sums that are watched."""
+    table = _table("fitted (UTC)")
+    headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("alarm", no_wrap=True)
+    table.add_column("applied")
+    for index, point in enumerate(series.points):
+        stretch = series.stretch_at(index)
+        place = index - stretch.began
+        alarm = series.alarm_at(index)
+        table.add_row(
+            f"{point.entry.created:%Y-%m-%d %H:%M}",
+            with_deviation(point.gain.value, point.gain.std),
+            "-" if point.change is None else f"{point.change.percent:+.2f}",
+            "-" if point.change is None else f"{abs(point.change.sigmas):.1f}",
+            f"{stretch.drift.upper[place]:.1f}",
+            f"{stretch.drift.lower[place]:.1f}",
+            "-" if alarm is None else alarm.kind.value,
+            printable(_applied(point.entry, None)),
+        )
+    return table
+
+
+def describe(
+    cell: str,
+    entries: Sequence[Entry],
+    chosen: Sequence[Series],
+    all_series: Sequence[Series],
+    in_force: str | None,
+) -> dict[str, Any]:
+    """All of it for --json; `chosen` are the axes that were asked for."""
+    return {
+        "cell": cell,
+        "calibrations": len(entries),
+        "in_force": in_force,
+        "chart": {
+            "reference": CHART.reference,
+            "threshold": CHART.threshold,
+            "single": CHART.single,
+            "baseline": CHART.baseline,
+        },
+        "pattern": pattern_of(all_series).value,
+        "questions": list(questions(all_series)),
+        "axes": [
+            {
+                "axis": series.axis,
+                "unit": series.unit,
+                "dispersion": series.dispersion,
+                "alarmed": series.alarmed,
+                "alarm": alarm_words(series),
+                "since": None if series.onset is None else series.onset.isoformat(),
+                "change_percent": None if series.drift is None else series.drift.change_percent,
+                "change_sigmas": None if series.drift is None else series.drift.change_sigmas,
+                "baseline": None if series.drift is None else series.drift.baseline,
+                "baseline_std": None if series.drift is None else series.drift.baseline_std,
+                "acknowledged": [
+                    {"since": a.since.isoformat(), "at": a.at.isoformat(), "who": a.who, "why": a.why}
+                    for a in series.acknowledged
+                ],
+                "points": rows(series),
+            }
+            for series in chosen
+        ],
+    }
+
+
+def _table(*first: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for heading in first:
+        table.add_column(heading, no_wrap=True)
+    return table
+
+
+def _largest(points: Sequence[Point]) -> str:
+    told = [(abs(point.change.sigmas), point) for point in points if point.change is not None]
+    if not told:
+        return "-"
+    sigmas, point = max(told, key=lambda pair: pair[0])
+    percent = 0.0 if point.change is None else point.change.percent
+    return f"{printable(point.gain.axis)} {percent:+.1f} % {sigmas:.1f} σ"
+
+
+def _applied(entry: Entry, in_force: str | None) -> str:
+    if not entry.events:
+        return "-"
+    last = entry.events[-1]
+    return f"{last.deed.value} by {last.who}" + (", in force" if entry.digest == in_force else "")

@@ -1,0 +1,263 @@
+"""The history of a cell in one SQLite file: every calibration, which were applied, which changes were explained.
+
+With SQLite's rollback journal, not its write-ahead log: one file that can be copied, that opens on a medium that cannot
+be written, and on network folders. A writer that is killed leaves a journal, and whoever opens the file next takes the
+unfinished transaction back. Why SQLite at all: docs/decisions/0024.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from daq.calibration_file import encode
+from daq.errors import HistoryMixed
+from daq.history import schema
+from daq.history.database import Access, connect, telling, transaction
+from daq.history.entry import Acknowledgement, Deed, Entry, Event, GainRecord, iso, utc
+from ident.calibration import Calibration, Gain
+
+
+class HistoryStore:
+    """The history's file; use as a context manager. Without a file it is empty, and the first `add` makes it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._connection: sqlite3.Connection | None = None
+
+    def __enter__(self) -> HistoryStore:
+        """Open it.
+
+        Raises:
+            HistoryUnreadable: it is no history, of another version, broken, or locked for long.
+        """
+        if self.path.exists():
+            self._connection = connect(self.path, Access.READ)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
+        """Enter a calibration.
+
+        Args:
+            calibration: of this cell.
+            digest: SHA-256 of its file.
+            at: now, with its zone.
+
+        Returns:
+            whether it is new: the same file is entered once.
+
+        Raises:
+            HistoryMixed: another cell, other axes, or a gain in another unit than the history's.
+            HistoryUnreadable: see `__enter__`.
+            OutputFailed: the file cannot be written.
+        """
+        with self._writing() as connection:
+            if connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
+                return False
+            self._check_like(calibration)
+            holdout = calibration.holdout_error_percent
+            row = (
+                digest,
+                iso(utc(calibration.created, at)),
+                iso(at),
+                calibration.cell,
+                calibration.configuration_sha256,
+                calibration.method,
+                calibration.software,
+                calibration.relative_error_percent.total,
+                None if holdout is None else holdout.total,
+                calibration.rows,
+                encode(calibration).decode(),
+            )
+            connection.execute("INSERT INTO calibration VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            connection.executemany(
+                "INSERT INTO gain VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (digest, place, g.axis, g.value, g.std, g.unit, g.nameplate)
+                    for place, g in enumerate(calibration.gains)
+                ],
+            )
+        return True
+
+    def applied(self, digest: str, *, at: datetime, who: str, target: str, audit: str | None = None) -> None:
+        """A calibration's gains were written.
+
+        Args:
+            digest: of the calibration, which was entered before.
+            at: when, with its zone.
+            who: the person or the job.
+            target: the controller's file, as the audit names it.
+            audit: SHA-256 of the entry in the audit that tells of it; `drivegain history --verify` looks for it there,
+                and so notices an audit whose end was cut off.
+
+        Raises:
+            ValueError: the calibration was never entered, or the time has no zone.
+            HistoryUnreadable, OutputFailed: as `add`.
+        """
+        with self._writing() as connection:
+            if not connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
+                raise ValueError(f"calibration {digest[:12]}… is not in the history")
+            self._note(connection, Event(digest, Deed.APPLIED, at, who, target, audit))
+
+    def rolled_back(self, *, at: datetime, who: str, target: str, audit: str | None = None) -> str | None:
+        """The last write to `target` was taken back: it has the gains again that it had before.
+
+        Returns:
+            digest of the calibration whose gains these are, None where the history does not know.
+        """
+        with self._writing() as connection:
+            earlier = [event.digest for event in self.events() if event.target == target]
+            # A rollback exchanges the file with its backup, so a second one brings the first state back.
+            digest = earlier[-2] if len(earlier) > 1 else None
+            self._note(connection, Event(digest, Deed.ROLLED_BACK, at, who, target, audit))
+        return digest
+
+    def acknowledge(self, noted: Acknowledgement) -> None:
+        """A change of one gain is explained. Raises as `applied`."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT INTO acknowledgement (axis, since, at, who, why, audit) VALUES (?, ?, ?, ?, ?, ?)",
+                (noted.axis, iso(noted.since), iso(noted.at), noted.who, noted.why, noted.audit),
+            )
+
+    def entries(self) -> tuple[Entry, ...]:
+        """All calibrations, oldest first by when they were fitted."""
+        events = self.events()
+        rows = self._rows(
+            "SELECT digest, created, entered, cell, configuration_sha256, method, software, error_percent,"
+            " holdout_percent, rows FROM calibration ORDER BY created, entered, digest"
+        )
+        gains: dict[str, list[Gain]] = {}
+        for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
+            gains.setdefault(digest, []).append(Gain(*gain))
+        with telling(self.path, Access.READ):
+            return tuple(
+                Entry(
+                    digest=digest,
+                    created=_time(created),
+                    entered=_time(entered),
+                    cell=cell,
+                    configuration_sha256=configuration,
+                    method=method,
+                    software=software,
+                    error_percent=error,
+                    holdout_percent=holdout,
+                    rows=count,
+                    gains=tuple(gains.get(digest, ())),
+                    events=tuple(event for event in events if event.digest == digest),
+                )
+                for digest, created, entered, cell, configuration, method, software, error, holdout, count in rows
+            )
+
+    def gains(self) -> tuple[GainRecord, ...]:
+        """All gains of all calibrations, in the order of `entries` and of the axes."""
+        return tuple(
+            GainRecord(entry.digest, entry.created, gain, entry.applied)
+            for entry in self.entries()
+            for gain in entry.gains
+        )
+
+    def events(self) -> tuple[Event, ...]:
+        """All writes to controllers, oldest first."""
+        rows = self._rows("SELECT digest, deed, at, who, target, audit FROM event ORDER BY number")
+        with telling(self.path, Access.READ):
+            return tuple(Event(row[0], Deed(row[1]), _time(row[2]), *row[3:]) for row in rows)
+
+    def acknowledgements(self) -> tuple[Acknowledgement, ...]:
+        """All of them, oldest first."""
+        rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
+        with telling(self.path, Access.READ):
+            return tuple(Acknowledgement(row[0], _time(row[1]), _time(row[2]), *row[3:]) for row in rows)
+
+    def audited(self) -> frozenset[str]:
+        """SHA-256 of all entries that the audit must have."""
+        noted = {event.audit for event in self.events()} | {noted.audit for noted in self.acknowledgements()}
+        return frozenset(sha256 for sha256 in noted if sha256 is not None)
+
+    def in_force(self, target: str | None = None) -> str | None:
+        """Digest of the calibration whose gains a controller has as far as the history knows; None where it does not.
+
+        Args:
+            target: the controller's file; None for whichever was written last.
+        """
+        events = [event for event in self.events() if target in {None, event.target}]
+        return events[-1].digest if events else None
+
+    def document(self, digest: str) -> bytes | None:
+        """The calibration file of this digest, None where it was never entered."""
+        rows = self._rows("SELECT document FROM calibration WHERE digest = ?", (digest,))
+        return str(rows[0][0]).encode() if rows else None
+
+    def integrity(self) -> tuple[str, ...]:
+        """What SQLite finds broken in the file; nothing where all is well."""
+        found = [str(row[0]) for row in self._rows("PRAGMA integrity_check")]
+        found += [f"row of {row[0]} without its {row[2]}" for row in self._rows("PRAGMA foreign_key_check")]
+        return tuple(text for text in found if text != "ok")
+
+    def _check_like(self, calibration: Calibration) -> None:
+        entries = self.entries()
+        if not entries:
+            return
+        known = entries[-1]
+        mine, theirs = ({g.axis: g.unit for g in gains} for gains in (calibration.gains, known.gains))
+        other = [axis for axis in mine if axis in theirs and mine[axis] != theirs[axis]]
+        if calibration.cell != known.cell:
+            found, expected = (
+                f"a calibration of cell {calibration.cell!r}",
+                f"of {known.cell!r}, as all in this history",
+            )
+        elif mine.keys() != theirs.keys():
+            found, expected = f"gains of {', '.join(mine)}", f"of {', '.join(theirs)}"
+        elif other:
+            axis = other[0]
+            found, expected = f"the gain of {axis} in {mine[axis]}", f"{theirs[axis]}, as in the calibrations before"
+        else:
+            return
+        raise HistoryMixed(
+            str(self.path),
+            found=found,
+            expected=expected,
+            remedy="gains are compared over time only where they mean the same: begin another history "
+            "(`history.store` of the cell file); nothing was entered",
+        )
+
+    def _note(self, connection: sqlite3.Connection, event: Event) -> None:
+        connection.execute(
+            "INSERT INTO event (digest, deed, at, who, target, audit) VALUES (?, ?, ?, ?, ?, ?)",
+            (event.digest, event.deed.value, iso(event.at), event.who, event.target, event.audit),
+        )
+
+    def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
+        if self._connection is None:
+            return []
+        with telling(self.path, Access.READ):
+            if schema.is_empty(self._connection):
+                return []
+            return self._connection.execute(query, values).fetchall()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        if self._connection is None:
+            self._connection = connect(self.path, Access.WRITE)
+        with transaction(self._connection, self.path):
+            yield self._connection
+
+
+def _time(text: str) -> datetime:
+    found = datetime.fromisoformat(text)
+    if found.tzinfo is None:
+        raise ValueError(f"{text!r} is a time without its zone")
+    return found

@@ -1,0 +1,166 @@
+"""The gains of a history as series, each with its chart: what changed, and whether that is more than noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import pairwise
+
+import numpy as np
+
+from daq.history.entry import Acknowledgement, Entry
+from ident.calibration import Gain
+from ident.drift import Change, change_significance, dispersions
+from ident.drift_chart import CHART, Alarm, Chart, Drift, cusum
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One gain of one calibration.
+
+    Attributes:
+        entry: the calibration.
+        gain: identified, with σ.
+        change: from the one before; None for the first.
+    """
+
+    entry: Entry
+    gain: Gain
+    change: Change | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Calibrations with one baseline.
+
+    Attributes:
+        began: index of the first of them in the points of its series.
+        drift: what became of the gain within.
+    """
+
+    began: int
+    drift: Drift
+
+    @property
+    def ended(self) -> int:
+        """Index behind the last of them."""
+        return self.began + len(self.drift.deviations)
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One gain over time.
+
+    Attributes:
+        axis, unit: of the gain.
+        dispersion: how much more repeated calibrations scatter than σ says; it is in every σ that is told here.
+        points: oldest first; calibrations that held the gain fixed are left out, they know nothing of it.
+        stretches: between changes that were explained, oldest first.
+        watching: whether the last of them goes on; not where no calibration came since the last explanation.
+        acknowledged: changes that were explained, oldest first.
+    """
+
+    axis: str
+    unit: str
+    dispersion: float
+    points: tuple[Point, ...]
+    stretches: tuple[Stretch, ...]
+    watching: bool
+    acknowledged: tuple[Acknowledgement, ...]
+
+    @property
+    def began(self) -> int:
+        """Index of the first point of the present baseline; as many as there are points where none came since."""
+        return self.stretches[-1].began if self.watching else len(self.points)
+
+    @property
+    def drift(self) -> Drift | None:
+        """From the present baseline on; None without points since."""
+        return self.stretches[-1].drift if self.watching else None
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether the newest calibration raises an alarm."""
+        return self.drift is not None and self.drift.alarmed
+
+    @property
+    def onset(self) -> datetime | None:
+        """When the last calibration before the change was made; None without alarm."""
+        if self.drift is None or self.drift.onset is None:
+            return None
+        return self.points[self.began + self.drift.onset].entry.created
+
+    def stretch_at(self, index: int) -> Stretch:
+        """The stretch that a point is in, by its index in `points`."""
+        return next(stretch for stretch in self.stretches if stretch.began <= index < stretch.ended)
+
+    def alarm_at(self, index: int) -> Alarm | None:
+        """The alarm of a point, by its index in `points`."""
+        stretch = self.stretch_at(index)
+        return next((alarm for alarm in stretch.drift.alarms if stretch.began + alarm.index == index), None)
+
+
+def watch(
+    entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement], chart: Chart = CHART
+) -> tuple[Series, ...]:
+    """One series an axis, in the order of the axes.
+
+    Args:
+        entries: oldest first, of one cell, with gains of the same axes and units.
+        acknowledgements: oldest first.
+        chart: limits.
+    """
+    if not entries:
+        return ()
+    found = [
+        [
+            (entry, gain)
+            for entry in entries
+            for gain in entry.gains
+            if gain.axis == axis and gain.std > 0 and gain.value
+        ]
+        for axis in (gain.axis for gain in entries[-1].gains)
+    ]
+    factors = _dispersions(found)
+    return tuple(
+        _series(gain.axis, gain.unit, known, factor, [a for a in acknowledgements if a.axis == gain.axis], chart)
+        for gain, known, factor in zip(entries[-1].gains, found, factors, strict=True)
+    )
+
+
+def _series(
+    axis: str,
+    unit: str,
+    known: list[tuple[Entry, Gain]],
+    dispersion: float,
+    acknowledged: list[Acknowledgement],
+    chart: Chart,
+) -> Series:
+    starts = {sum(entry.created < a.since for entry, _ in known) for a in acknowledged}
+    bounds = sorted({0, *starts, len(known)})
+    stretches = []
+    for began, ended in pairwise(bounds):
+        gains = [gain for _, gain in known[began:ended]]
+        stretches.append(
+            Stretch(began, cusum([g.value for g in gains], [g.std for g in gains], dispersion=dispersion, chart=chart))
+        )
+    points = []
+    for index, (entry, gain) in enumerate(known):
+        before = known[index - 1][1] if index else None
+        points.append(Point(entry, gain, None if before is None else _change(before, gain, dispersion)))
+    watching = bool(stretches) and len(known) not in starts
+    return Series(axis, unit, dispersion, tuple(points), tuple(stretches), watching, tuple(acknowledged))
+
+
+def _change(before: Gain, after: Gain, dispersion: float) -> Change:
+    return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
+
+
+def _dispersions(found: list[list[tuple[Entry, Gain]]]) -> list[float]:
+    """Of all axes together where the same calibrations identified them all, else of each by itself."""
+    values = [[gain.value for _, gain in known] for known in found]
+    stds = [[gain.std for _, gain in known] for known in found]
+    if len({tuple(entry.digest for entry, _ in known) for known in found}) == 1:
+        return [float(factor) for factor in dispersions(values, stds)]
+    return [float(dispersions(np.array([v]), np.array([s]))[0]) for v, s in zip(values, stds, strict=True)]

@@ -1,0 +1,253 @@
+"""Keys and signatures as bytes and lines of text: the file formats of minisign, with Ed25519 (RFC 8032) and BLAKE2b.
+
+Layouts as minisign's documentation gives them, numbers little-endian, each as base64 under a line of comment::
+
+    public key   "Ed" | key id 8 | public key 32
+    secret key   "Ed" | kdf 2 | "B2" | salt 32 | opslimit 8 | memlimit 8 | key id 8 | seed 32 | public key 32 | check 32
+    signature    "ED" | key id 8 | signature 64 of BLAKE2b-512(file);
+                 then a trusted comment, and 64 bytes that sign signature | trusted comment
+
+The last 104 bytes of a secret key are XORed with scrypt's key stream where kdf is "Sc"; then check is
+BLAKE2b-256("Ed" | key id | seed | public key). Where kdf is zero they are plain, and check is zero.
+Whatever does not fit is a ValueError that says what was found.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import struct
+from dataclasses import dataclass
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
+
+UNTRUSTED, TRUSTED = "untrusted comment: ", "trusted comment: "
+_KEY, _PREHASHED, _CHECK = b"Ed", b"ED", b"B2"
+_SCRYPT, _PLAIN = b"Sc", b"\0\0"
+_PUBLIC = struct.Struct("<2s8s32s")
+_SECRET = struct.Struct("<2s2s2s32sQQ104s")
+_BODY = struct.Struct("<8s32s32s32s")
+_SIGNATURE = struct.Struct("<2s8s64s")
+_SIGNATURE_LINES = 4
+
+# scrypt with N = 2¹⁷, r = 8, p = 1: 128 MB and half a second, which the PC of a cell can spare (minisign's own: 1 GB).
+_OPSLIMIT, _MEMLIMIT = 2**22, 2**27
+_MEMLIMIT_ALLOWED, _OPSLIMIT_ALLOWED = 2**30, 2**26
+
+
+@dataclass(frozen=True, slots=True)
+class PublicKey:
+    """What a signature is checked with.
+
+    Attributes:
+        key_id: 8 bytes that name the key pair.
+        key: Ed25519 public key, 32 bytes.
+    """
+
+    key_id: bytes
+    key: bytes
+
+    @property
+    def line(self) -> str:
+        """As `minisign -P` and a cell file take it."""
+        return base64.b64encode(_PUBLIC.pack(_KEY, self.key_id, self.key)).decode()
+
+    @property
+    def text(self) -> str:
+        """Of its file."""
+        return f"{UNTRUSTED}minisign public key {_spelt(self.key_id)}\n{self.line}\n"
+
+    def check(self, signature: Signature, content: bytes) -> None:
+        """Whether the holder of the secret key signed these bytes and this comment.
+
+        Raises:
+            ValueError: no, with what does not fit.
+        """
+        if signature.key_id != self.key_id:
+            raise ValueError(f"a signature of key {_spelt(signature.key_id)}, not of {_spelt(self.key_id)}")
+        public = Ed25519PublicKey.from_public_bytes(self.key)
+        try:
+            public.verify(signature.signature, hashlib.blake2b(content).digest())
+        except InvalidSignature:
+            raise ValueError("a signature of other content") from None
+        try:
+            public.verify(signature.whole, signature.signature + signature.comment.encode())
+        except InvalidSignature:
+            raise ValueError("a trusted comment that was changed") from None
+
+
+@dataclass(frozen=True, slots=True)
+class SecretKey:
+    """What a file is signed with, in memory only.
+
+    Attributes:
+        key_id: 8 bytes that name the key pair.
+        seed: Ed25519 private key, 32 bytes; out of every representation.
+    """
+
+    key_id: bytes
+    seed: bytes
+
+    def __repr__(self) -> str:
+        """Without the secret: this must not reach a log by way of a traceback."""
+        return f"SecretKey({_spelt(self.key_id)})"
+
+    @property
+    def public(self) -> PublicKey:
+        """The half that may be known."""
+        return PublicKey(self.key_id, Ed25519PrivateKey.from_private_bytes(self.seed).public_key().public_bytes_raw())
+
+    def sign(self, content: bytes, comment: str) -> Signature:
+        """Sign bytes, and with them a comment of one line."""
+        private = Ed25519PrivateKey.from_private_bytes(self.seed)
+        signed = private.sign(hashlib.blake2b(content).digest())
+        return Signature(self.key_id, signed, comment, private.sign(signed + comment.encode()))
+
+    def text(self, password: str, salt: bytes) -> str:
+        """Of its file.
+
+        Args:
+            password: empty for a key that nothing but the file's mode protects.
+            salt: 32 random bytes.
+        """
+        public = self.public.key
+        if password:
+            body = _BODY.pack(self.key_id, self.seed, public, _checksum(self.key_id, self.seed, public))
+            body = _xor(body, _stream(password, salt, _OPSLIMIT, _MEMLIMIT))
+            packed = _SECRET.pack(_KEY, _SCRYPT, _CHECK, salt, _OPSLIMIT, _MEMLIMIT, body)
+        else:
+            body = _BODY.pack(self.key_id, self.seed, public, bytes(32))
+            packed = _SECRET.pack(_KEY, _PLAIN, _CHECK, bytes(32), 0, 0, body)
+        kind = "encrypted" if password else "unencrypted"
+        return f"{UNTRUSTED}minisign {kind} secret key\n{base64.b64encode(packed).decode()}\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """One signature.
+
+    Attributes:
+        key_id: of the key pair that made it.
+        signature: of the content's BLAKE2b-512, 64 bytes.
+        comment: the trusted comment.
+        whole: of `signature` and `comment` together, 64 bytes.
+    """
+
+    key_id: bytes
+    signature: bytes
+    comment: str
+    whole: bytes
+
+    @property
+    def text(self) -> str:
+        """Of its file."""
+        signed = base64.b64encode(_SIGNATURE.pack(_PREHASHED, self.key_id, self.signature)).decode()
+        whole = base64.b64encode(self.whole).decode()
+        return f"{UNTRUSTED}signature by drivegain\n{signed}\n{TRUSTED}{self.comment}\n{whole}\n"
+
+
+def parse_public_key(text: str) -> PublicKey:
+    """A public key: its one line of base64, or its file with the comment above.
+
+    Raises:
+        ValueError: it is none.
+    """
+    lines = text.strip().splitlines()
+    algorithm, key_id, key = _PUBLIC.unpack(_decoded(lines[-1] if lines else "", _PUBLIC.size, "a public key"))
+    if algorithm != _KEY or len(lines) > 2:
+        raise ValueError(f"a key of algorithm {algorithm!r}, or more than a key")
+    return PublicKey(key_id, key)
+
+
+def is_encrypted(text: str) -> bool:
+    """Whether a secret key asks for a password; raises ValueError where the text is none."""
+    return _parts(text)[0] == _SCRYPT
+
+
+def parse_secret_key(text: str, password: str = "") -> SecretKey:
+    """A secret key from its file.
+
+    Raises:
+        ValueError: it is none, or does not decrypt with this password.
+    """
+    kdf, salt, opslimit, memlimit, body = _parts(text)
+    if kdf == _SCRYPT:
+        if not password:
+            raise ValueError("a key with a password, and no password")
+        body = _xor(body, _stream(password, salt, opslimit, memlimit))
+    key_id, seed, public, check = _BODY.unpack(body)
+    if kdf == _SCRYPT and check != _checksum(key_id, seed, public):
+        raise ValueError("a key that this password does not open")
+    key = SecretKey(key_id, seed)
+    if key.public.key != public:
+        raise ValueError("a secret key whose halves do not belong together")
+    return key
+
+
+def parse_signature(text: str) -> Signature:
+    """A signature from its file.
+
+    Raises:
+        ValueError: it is none, or not a prehashed one.
+    """
+    lines = text.removesuffix("\n").split("\n")
+    shaped = len(lines) == _SIGNATURE_LINES and lines[0].startswith(UNTRUSTED) and lines[2].startswith(TRUSTED)
+    if not shaped:
+        raise ValueError("no signature: expected four lines, comment, signature, trusted comment, signature")
+    packed = _decoded(lines[1], _SIGNATURE.size, "a signature")
+    algorithm, key_id, signature = _SIGNATURE.unpack(packed)
+    if algorithm != _PREHASHED:
+        raise ValueError(f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign -S -H` makes it)")
+    whole = _decoded(lines[3], 64, "the signature of the trusted comment")
+    return Signature(key_id, signature, lines[2].removeprefix(TRUSTED), whole)
+
+
+def _parts(text: str) -> tuple[bytes, bytes, int, int, bytes]:
+    lines = text.strip().splitlines()
+    packed = _decoded(lines[-1] if lines else "", _SECRET.size, "a secret key")
+    algorithm, kdf, check, salt, opslimit, memlimit, body = _SECRET.unpack(packed)
+    if algorithm != _KEY or check != _CHECK or kdf not in {_SCRYPT, _PLAIN}:
+        raise ValueError(f"a key of algorithm {algorithm!r}, key derivation {kdf!r}, checksum {check!r}")
+    return kdf, salt, opslimit, memlimit, body
+
+
+def _decoded(line: str, size: int, what: str) -> bytes:
+    try:
+        decoded = base64.b64decode(line.strip(), validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise ValueError(f"text that is not base64 where {what} should be") from error
+    if len(decoded) != size:
+        raise ValueError(f"{len(decoded)} bytes where {what} has {size}")
+    return decoded
+
+
+def _checksum(key_id: bytes, seed: bytes, public: bytes) -> bytes:
+    return hashlib.blake2b(_KEY + key_id + seed + public, digest_size=32).digest()
+
+
+def _stream(password: str, salt: bytes, opslimit: int, memlimit: int) -> bytes:
+    if opslimit > _OPSLIMIT_ALLOWED or memlimit > _MEMLIMIT_ALLOWED:
+        raise ValueError(f"a key that asks for {memlimit} bytes and {opslimit} operations to open")
+    work, parallel = _scrypt_parameters(opslimit, memlimit)
+    return Scrypt(salt=salt, length=_BODY.size, n=work, r=8, p=parallel).derive(password.encode())
+
+
+def _scrypt_parameters(opslimit: int, memlimit: int) -> tuple[int, int]:
+    """N and p for r = 8, as libsodium picks them from its two limits (crypto_pwhash_scryptsalsa208sha256)."""
+    opslimit = max(opslimit, 32768)
+    quick = opslimit < memlimit // 32
+    largest = opslimit // 32 if quick else memlimit // 1024
+    exponent = max(1, (largest // 2).bit_length())
+    return 2**exponent, 1 if quick else max(1, (opslimit // 4 >> exponent) // 8)
+
+
+def _xor(left: bytes, right: bytes) -> bytes:
+    return bytes(a ^ b for a, b in zip(left, right, strict=True))
+
+
+def _spelt(key_id: bytes) -> str:
+    """As minisign prints it."""
+    return key_id[::-1].hex().upper()

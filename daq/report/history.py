@@ -1,0 +1,116 @@
+"""The picture of a history: each gain over time with its baseline, and beneath it what its deviations add up to."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from daq.atomic_file import replace_file
+from daq.history.watch import Series
+from daq.report.picture import BLUE, DPI, GREY, ORANGE, PURPLE, SKY, legend_below, panels, unformatted
+from ident.drift_chart import CHART, Chart
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SIGMAS = 2.0
+_COLUMNS = 2
+
+
+def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:
+    """Draw gains ± 2σ, those that a controller had filled, alarms, and the CUSUM with its threshold.
+
+    Args:
+        path: of the picture, .png or .svg.
+        all_series: one an axis, at least one.
+        title: says which cell it is.
+        chart: limits that `all_series` was watched with.
+
+    Raises:
+        OSError: from the file system.
+    """
+    columns = min(_COLUMNS, len(all_series))
+    bands = -(-len(all_series) // columns)
+    figure, places = panels(2 * columns * bands, columns, unformatted(title))
+    for number, series in enumerate(all_series):
+        band, column = divmod(number, columns)
+        above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
+        _draw_gains(above, series)
+        _draw_sums(beneath, series, chart)
+    for unused in range(len(all_series), columns * bands):
+        for row in range(2):
+            places[(2 * (bands - 1) + row) * columns + unused % columns].set_axis_off()
+    _date(places, [_days(point.entry.created) for series in all_series for point in series.points])
+    legend_below(figure, places[0], places[columns])
+    _save(figure, path)
+
+
+def _draw_gains(place: Axes, series: Series) -> None:
+    times = [_days(point.entry.created) for point in series.points]
+    values = [point.gain.value for point in series.points]
+    widths = [_SIGMAS * series.dispersion * point.gain.std for point in series.points]
+    place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
+    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {_SIGMAS:g} σ")
+    held = [(_days(point.entry.created), point.gain.value) for point in series.points if point.entry.applied]
+    place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
+    alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
+    place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
+    for stretch in series.stretches:
+        drift = stretch.drift
+        ends = [times[stretch.began], times[stretch.ended - 1]]
+        low, high = (drift.baseline + sign * _SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
+        place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
+        place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
+    for noted in series.acknowledged:
+        place.axvline(_days(noted.since), color=PURPLE, linestyle=":", linewidth=1.2, label="change acknowledged")
+    place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
+
+
+def _draw_sums(place: Axes, series: Series, chart: Chart) -> None:
+    place.axhline(0.0, color=GREY, linewidth=0.8)
+    for sign in (-1.0, 1.0):
+        place.axhline(sign * chart.threshold, color=ORANGE, linestyle="--", linewidth=1.0, label="threshold h")
+    for stretch in series.stretches:
+        times = [_days(point.entry.created) for point in series.points[stretch.began : stretch.ended]]
+        place.step(times, stretch.drift.upper, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
+        place.step(times, -stretch.drift.lower, where="mid", color=BLUE, linewidth=1.4)
+    place.set_ylabel("CUSUM [σ]", fontsize=8)
+
+
+def _days(at: datetime) -> float:
+    """As matplotlib counts dates: days since 1970, UTC."""
+    return at.timestamp() / 86_400.0
+
+
+def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [when for when, _ in points], [value for _, value in points]
+
+
+def _date(places: list[Axes], days: list[float]) -> None:
+    import matplotlib.dates  # noqa: PLC0415
+
+    dates: Any = matplotlib.dates  # without types
+    # Of a single day there would be no range to label.
+    beside = max(0.5, 0.03 * (max(days) - min(days)))
+    for place in places:
+        place.set_xlim(min(days) - beside, max(days) + beside)
+        # At most so many labels as fit beside each other.
+        locator = dates.AutoDateLocator(maxticks=7)
+        place.xaxis.set_major_locator(locator)
+        place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
+
+
+def _save(figure: Figure, path: Path) -> None:
+    from matplotlib import rc_context  # noqa: PLC0415
+
+    drawn = io.BytesIO()
+    kind = path.suffix.lower().removeprefix(".")
+    # Neither time nor random names: the same history gives the same bytes.
+    metadata = {"Date": None} if kind == "svg" else {"Software": None}
+    with rc_context({"svg.hashsalt": "drivegain"}):
+        figure.savefig(drawn, format=kind, dpi=DPI, metadata=metadata)
+    replace_file(path, drawn.getvalue())

@@ -1,0 +1,199 @@
+"""Whether gains have changed: one change against its noise, a recalibration as a whole, and a slow drift over many.
+
+Recordings of different days are independent, so σ of a difference is the root of the sum of squares. But σ of a single
+fit knows only what one session shows: repeated sessions scatter more (friction warms up, magnets too). Every function
+here therefore takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions`
+estimates it from a history.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2, norm
+
+FloatArray = NDArray[np.float64]
+
+DISPERSION = 1.05
+"""Before a history says otherwise: repeated fits of simulated cells scatter 5 % more than their σ."""
+FALSE_ALARM = 0.01
+"""Share of recalibrations without any change in which `decide` finds one."""
+
+_POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
+"""How many successive differences the prior is worth, and the pooled estimate beside an axis' own."""
+_FEWEST_DIFFERENCES = 4
+_MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One gain, then and now.
+
+    Attributes:
+        percent: of the old value's magnitude [%], inf from zero; negative where the gain has lost.
+        sigmas: the change over its σ, signed as `percent`.
+        probability: of so large a change by noise alone, two-sided.
+    """
+
+    percent: float
+    sigmas: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeDecision:
+    """Whether a recalibration says anything new.
+
+    Attributes:
+        differs: at least one gain has changed by more than noise.
+        axes: names, as they were given.
+        changes: one an axis.
+        adjusted: probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
+        joint: probability of the whole vector of changes (χ²), None where the correlation of the errors is unknown.
+        words: the same in one sentence.
+    """
+
+    differs: bool
+    axes: tuple[str, ...]
+    changes: tuple[Change, ...]
+    adjusted: tuple[float, ...]
+    joint: float | None
+    words: str
+
+
+def change_significance(
+    old: float, old_std: float, new: float, new_std: float, *, dispersion: float = DISPERSION
+) -> Change:
+    """How significant one change is; of independent recordings, with normal errors.
+
+    Args:
+        old, old_std, new, new_std: gains and their σ in one unit; σ is 0 for what is known exactly.
+        dispersion: scatter of repeated calibrations over their σ.
+
+    Raises:
+        ValueError: a number is not finite, or a σ negative.
+    """
+    numbers = np.array([old, old_std, new, new_std, dispersion])
+    if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
+        raise ValueError(f"expected finite gains and σ ≥ 0, found {old} ± {old_std} and {new} ± {new_std}")
+    change = (new - old) * (np.sign(old) or 1.0)
+    std = dispersion * np.hypot(old_std, new_std)
+    sigmas = _ratio(float(change), float(std))
+    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, float(2.0 * norm.sf(abs(sigmas))))
+
+
+def decide(
+    axes: tuple[str, ...],
+    old: ArrayLike,
+    old_std: ArrayLike,
+    new: ArrayLike,
+    new_std: ArrayLike,
+    *,
+    dispersion: ArrayLike = DISPERSION,
+    correlation: tuple[ArrayLike, ArrayLike] | None = None,
+    false_alarm: float = FALSE_ALARM,
+) -> ChangeDecision:
+    """Whether a recalibration changes anything, over all axes together.
+
+    Each axis is looked at by itself, with the probabilities corrected for there being several. Where the correlation
+    of the errors is known, the vector of all changes is tested too (δᵀ Σ⁻¹ δ against χ²), which sees many small
+    changes; the two share the false alarms evenly. A fixed per cent is nowhere asked for.
+
+    Args:
+        axes: n names.
+        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
+        dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
+        correlation: of the errors of the old and of the new gains, shape (n, n) each; None where unknown.
+        false_alarm: share of recalibrations without change in which one is found, at most.
+
+    Raises:
+        ValueError: shapes do not fit, or a number is not finite.
+    """
+    n = len(axes)
+    columns = [np.broadcast_to(np.asarray(c, float), (n,)) for c in (old, old_std, new, new_std, dispersion)]
+    changes = tuple(
+        change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
+    )
+    adjusted = _holm(np.array([change.probability for change in changes]))
+    joint = None if correlation is None else _joint(columns, correlation)
+    probabilities = [float(adjusted.min(initial=1.0))] + ([] if joint is None else [joint])
+    level = false_alarm / len(probabilities)
+    words = _words(axes, changes, adjusted, joint, level)
+    return ChangeDecision(min(probabilities) <= level, axes, changes, tuple(map(float, adjusted)), joint, words)
+
+
+def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
+    """How much more repeated calibrations scatter than their σ says, for each axis; never less than 1.
+
+    From differences of successive calibrations, so that a slow drift adds little, by the median of their magnitudes, so
+    that a sudden change adds nothing. All axes together tell more than one does: the estimate of an axis is drawn
+    towards theirs, and that towards DISPERSION, by weights in numbers of differences (as a scaled inverse-χ² prior).
+
+    Args:
+        values, stds: shape (..., axes, n), oldest first; leading dimensions are histories of their own.
+
+    Returns:
+        shape (..., axes).
+    """
+    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    count = values.shape[-1] - 1
+    if count < _FEWEST_DIFFERENCES:
+        return np.full(values.shape[:-1], DISPERSION)
+    # Not about their own median, which of few differences is too near to them.
+    away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
+    own = (np.median(away, axis=-1) / _MEDIAN_OF_NORMAL) ** 2
+    all_axes = (np.median(away.reshape(*away.shape[:-2], -1), axis=-1) / _MEDIAN_OF_NORMAL) ** 2
+    total = count * values.shape[-2]
+    pooled = (_POOLED_WEIGHT * DISPERSION**2 + total * all_axes) / (_POOLED_WEIGHT + total)
+    drawn = (_AXIS_WEIGHT * pooled[..., None] + count * own) / (_AXIS_WEIGHT + count)
+    return np.asarray(np.sqrt(np.maximum(drawn, 1.0)))
+
+
+def _ratio(part: float, whole: float) -> float:
+    """Infinite where something changed that cannot, 0 where nothing did."""
+    if whole:
+        return part / whole
+    return math.copysign(math.inf, part) if part else 0.0
+
+
+def _joint(columns: list[FloatArray], correlation: tuple[ArrayLike, ArrayLike]) -> float:
+    old, old_std, new, new_std, dispersion = columns
+    covariance = sum(
+        np.outer(dispersion * std, dispersion * std) * np.asarray(matrix, float)
+        for std, matrix in zip((old_std, new_std), correlation, strict=True)
+    )
+    change = new - old
+    return float(
+        chi2.sf(change @ np.linalg.pinv(covariance, hermitian=True) @ change, np.linalg.matrix_rank(covariance))
+    )
+
+
+def _holm(probabilities: FloatArray) -> FloatArray:
+    """Adjusted for several tests: the smallest times their number, the next times one less, never falling."""
+    order = np.argsort(probabilities)
+    count = len(probabilities)
+    adjusted = np.empty(count)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(count, 0, -1)))
+    return adjusted
+
+
+def _words(
+    axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, joint: float | None, level: float
+) -> str:
+    if not axes:
+        return "no gain to compare"
+    told = [
+        f"{axis} {change.percent:+.2g} % ({abs(change.sigmas):.1f} σ, p = {p:.2g} among {len(axes)})"
+        for axis, change, p in zip(axes, changes, adjusted, strict=True)
+    ]
+    together = "" if joint is None else f"; all together p = {joint:.2g}"
+    changed = [text for text, p in zip(told, adjusted, strict=True) if p <= level]
+    if changed:
+        return f"changed by more than noise: {', '.join(changed)}{together}"
+    largest = told[int(np.argmax([abs(change.sigmas) for change in changes]))]
+    if joint is not None and joint <= level:
+        return f"no gain alone has changed by more than noise, all together have: the largest is {largest}{together}"
+    return f"no gain has changed by more than noise: the largest change is {largest}{together}"

@@ -1,0 +1,197 @@
+"""A slow drift of one gain over many calibrations: the two-sided tabular CUSUM, and a limit for single points.
+
+With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery, Introduction to Statistical
+Quality Control, ch. 9)::
+
+    C⁺ᵢ = max(0, C⁺ᵢ₋₁ + zᵢ − k),   C⁻ᵢ = max(0, C⁻ᵢ₋₁ − zᵢ − k),   alarm where either exceeds h
+
+The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while there are fewer, of
+all that came before (Hawkins 1987), so that the zᵢ are independent and the chart watches from the second one on. The
+baseline's own uncertainty is part of the σ of zᵢ. What it cannot see: a drift during the first calibrations becomes
+part of the baseline in part.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ident.drift import DISPERSION
+
+FloatArray = NDArray[np.float64]
+
+_RECENT = 3
+"""Calibrations that the size of a change is averaged over: enough to tame noise, few enough to be of now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """What raises an alarm; the defaults come of `python -m tests.studies.drift_study`, docs/history.md has its table.
+
+    Attributes:
+        reference: k [σ]: half the shift that is to be found soonest.
+        threshold: h [σ]: how much has to add up.
+        single: deviation of one calibration that is an alarm by itself [σ].
+        baseline: number of calibrations that make it.
+    """
+
+    reference: float = 1.0
+    threshold: float = 5.8
+    single: float = 5.0
+    baseline: int = 12
+
+
+CHART = Chart()
+
+
+class AlarmKind(Enum):
+    """What has raised an alarm."""
+
+    DRIFT = "drift"
+    """Small deviations to one side have added up (CUSUM)."""
+    JUMP = "jump"
+    """One calibration is far off by itself (Shewhart)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """One calibration with an alarm.
+
+    Attributes:
+        index: of the calibration, from 0.
+        kind: drift where both hold.
+        rose: whether the gain's magnitude rose.
+    """
+
+    index: int
+    kind: AlarmKind
+    rose: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """What became of one gain since its baseline began.
+
+    Attributes:
+        baseline, baseline_std: what the newest calibrations are compared with, in the unit of the gains: the chart's
+            baseline, up to the onset where there is an alarm.
+        deviations: z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
+        upper, lower: C⁺ and C⁻, shape (n,).
+        alarms: in the order of the calibrations.
+        onset: index of the last calibration before the change that the last alarm tells of; None without alarm.
+        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset if fewer)
+            [% of the baseline's magnitude].
+        change_sigmas: the same over its σ.
+    """
+
+    baseline: float
+    baseline_std: float
+    deviations: FloatArray
+    upper: FloatArray
+    lower: FloatArray
+    alarms: tuple[Alarm, ...]
+    onset: int | None
+    change_percent: float
+    change_sigmas: float
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether the newest calibration raises an alarm."""
+        return bool(self.alarms) and self.alarms[-1].index == len(self.deviations) - 1
+
+
+def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION, chart: Chart = CHART) -> Drift:
+    """Watch one gain.
+
+    Args:
+        values, stds: of its calibrations since the last change that somebody acknowledged, oldest first, shape (n,),
+            n ≥ 1, in one unit; σ > 0.
+        dispersion: scatter of repeated calibrations over their σ, as `ident.drift.dispersions` finds it.
+        chart: limits.
+
+    Raises:
+        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline is zero.
+    """
+    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    if values.ndim != 1 or values.shape != stds.shape or not len(values):
+        raise ValueError(f"expected as many values as σ, at least one, found shapes {values.shape} and {stds.shape}")
+    if not (np.isfinite(values).all() and np.isfinite(stds).all() and (stds > 0).all()):
+        raise ValueError("expected finite gains with σ > 0")
+    sign = 1.0 if values.sum() > 0 else -1.0
+    deviations, upper, lower = path(sign * values, stds, dispersion, chart)
+    lines = enumerate(zip(deviations, upper, lower, strict=True))
+    alarms = tuple(_alarm(i, *found, chart) for i, found in lines if _beyond(*found, chart))
+    onset = _onset(alarms[-1], upper, lower) if alarms else None
+    last = len(values) - 1
+    # What came after the onset is no part of what it is compared with.
+    first = max(1, min(last if onset is None else onset + 1, chart.baseline))
+    newest = max(1, min(_RECENT, len(values) - first))
+    baseline, baseline_std = _mean(values[:first], stds[:first])
+    recent, recent_std = _mean(values[-newest:], stds[-newest:])
+    if baseline == 0:
+        raise ValueError("expected gains other than zero")
+    change = (recent - baseline) * sign if last else 0.0
+    return Drift(
+        baseline=baseline,
+        baseline_std=dispersion * baseline_std,
+        deviations=deviations,
+        upper=upper,
+        lower=lower,
+        alarms=alarms,
+        onset=onset,
+        change_percent=100.0 * change / abs(baseline),
+        change_sigmas=change / (dispersion * math.hypot(recent_std, baseline_std)),
+    )
+
+
+def path(
+    values: FloatArray, stds: FloatArray, dispersion: FloatArray | float, chart: Chart
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The chart's three lines, for any number of gains at once.
+
+    Args:
+        values, stds: magnitudes, shape (..., n), oldest first.
+        dispersion: shape (...) or a number.
+        chart: limits.
+
+    Returns:
+        z, C⁺ and C⁻, shape (..., n) each.
+    """
+    weights = np.cumsum(1.0 / stds**2, axis=-1)
+    means = np.cumsum(values / stds**2, axis=-1) / weights
+    shape, n = values.shape, values.shape[-1]
+    deviations, upper, lower = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for i in range(1, n):
+        last = min(i, chart.baseline) - 1
+        std = dispersion * np.sqrt(stds[..., i] ** 2 + 1.0 / weights[..., last])
+        deviations[..., i] = z = (values[..., i] - means[..., last]) / std
+        upper[..., i] = np.maximum(0.0, upper[..., i - 1] + z - chart.reference)
+        lower[..., i] = np.maximum(0.0, lower[..., i - 1] - z - chart.reference)
+    return deviations, upper, lower
+
+
+def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
+    """Weighted by 1/σ², and its σ."""
+    weights = 1.0 / stds**2
+    total = float(weights.sum())
+    return float(weights @ values) / total, math.sqrt(1.0 / total)
+
+
+def _beyond(z: float, upper: float, lower: float, chart: Chart) -> bool:
+    return max(upper, lower) > chart.threshold or abs(z) > chart.single
+
+
+def _alarm(index: int, z: float, upper: float, lower: float, chart: Chart) -> Alarm:
+    if max(upper, lower) > chart.threshold:
+        return Alarm(index, AlarmKind.DRIFT, bool(upper > lower))
+    return Alarm(index, AlarmKind.JUMP, bool(z > 0))
+
+
+def _onset(alarm: Alarm, upper: FloatArray, lower: FloatArray) -> int:
+    """The last calibration where the sum that has the alarm was zero (Page's estimate of the change point)."""
+    line = (upper if alarm.rose else lower)[: alarm.index + 1]
+    return int(np.flatnonzero(line == 0.0)[-1])

@@ -1,0 +1,60 @@
+"""Histories for tests: calibrations a week apart, with or without a drift."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+
+from daq.calibration_file import encode
+from daq.history.store import HistoryStore
+from ident.calibration import Calibration
+from tests.daq.calibrations import demo_calibration
+
+BEGIN = datetime(2026, 1, 5, 6, 0, 0, tzinfo=UTC)
+STD = 0.004
+
+
+def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibration:
+    """The demo calibration of that week, each gain times a factor."""
+    demo = demo_calibration()
+    gains = tuple(
+        replace(gain, value=float(gain.value * factor), std=STD * abs(gain.value))
+        for gain, factor in zip(demo.gains, factors, strict=True)
+    )
+    return replace(demo, gains=gains, created=(BEGIN + timedelta(weeks=week)).isoformat())
+
+
+def digest_of(calibration: Calibration) -> str:
+    """SHA-256 of its file."""
+    return hashlib.sha256(encode(calibration)).hexdigest()
+
+
+def enter(store: HistoryStore, calibration: Calibration) -> str:
+    """Add it at the time that it was made."""
+    digest = digest_of(calibration)
+    store.add(calibration, digest=digest, at=datetime.fromisoformat(calibration.created))
+    return digest
+
+
+def fill(store: HistoryStore, weeks: int, true: Callable[[int], tuple[float, ...]], seed: int = 3) -> tuple[str, ...]:
+    """Enter calibrations with their noise.
+
+    Args:
+        store: to fill.
+        weeks: number of calibrations.
+        true: factor of each gain in that week.
+        seed: of the noise.
+
+    Returns:
+        their digests.
+    """
+    rng = np.random.default_rng(seed)
+    noise = 1.0 + STD * rng.standard_normal((weeks, 6))
+    return tuple(
+        enter(store, calibration_of(week, tuple(map(float, np.array(true(week)) * noise[week]))))
+        for week in range(weeks)
+    )

@@ -1,0 +1,344 @@
+"""`drivegain history`: what a technician sees of drifts, of broken audits, and of nothing at all."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.calibration_file import save
+from daq.cli.app import main
+from daq.configuration.cell_file import load_cell
+from daq.configuration.history_place import HistoryPlace
+from daq.history.store import HistoryStore
+from daq.history.table import COLUMNS
+from daq.history.watch import Series, watch
+from daq.history.words import alarm_words, questions
+from daq.write_back.audit import AuditAction, append, read
+from tests.daq.calibrations import AXES
+from tests.daq.histories import BEGIN, calibration_of, enter, fill
+
+FLAT = (1.0,) * 6
+
+
+def drifting(week: int) -> tuple[float, ...]:
+    """J4 loses 6 % from the 14th calibration on, in twelve weeks."""
+    return (1.0, 1.0, 1.0, 1.0 - 0.06 * min(max(week - 13, 0) / 12.0, 1.0), 1.0, 1.0)
+
+
+def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
+    """All gains by their factors from the 15th calibration on."""
+    return lambda week: factors if week > 14 else FLAT
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """The demo cell in a folder of its own."""
+    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    shutil.copytree(Path(__file__).parents[2] / "configs", tmp_path / "configs", ignore=kept)
+    return tmp_path / "configs" / "cells" / "demo.yaml"
+
+
+def _place(cell: Path) -> HistoryPlace:
+    place = load_cell(cell).history
+    assert place is not None
+    return place
+
+
+def _filled(cell: Path, weeks: int, true: Callable[[int], tuple[float, ...]]) -> tuple[str, ...]:
+    with HistoryStore(_place(cell).store) as store:
+        return fill(store, weeks, true)
+
+
+def _series(cell: Path) -> tuple[Series, ...]:
+    with HistoryStore(_place(cell).store) as store:
+        return watch(store.entries(), store.acknowledgements())
+
+
+def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main(["history", *arguments, "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def test_an_empty_history_says_what_to_do(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["history", str(cell)]) == 0
+    assert "The history is empty" in capsys.readouterr().out
+    assert _json(capsys, str(cell))["axes"] == []
+    assert main(["history", str(cell), "--verify"]) == 0
+    assert "0 entries, chain unbroken" in capsys.readouterr().out
+    assert not _place(cell).store.exists()
+    assert main(["history", str(cell), "--axis", "J4"]) == 2
+    assert main(["history", str(cell), "--plot", str(cell.with_suffix(".png"))]) == 2
+
+
+def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = cell.parent / "calibration.yaml"
+    save(calibration_of(0), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    shown = capsys.readouterr()
+    assert "entered" in shown.err
+    assert "33.90 ± 0.14" in shown.out
+    assert "baseline: 1 of 12" in shown.out
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "already" in capsys.readouterr().err
+    save(replace(calibration_of(1), cell="another"), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 4
+    assert "another" in capsys.readouterr().err
+    assert main(["history", str(cell), "--add", str(cell)]) == 4
+    assert main(["history", str(cell), "--add", str(file) + ".none"]) == 4
+    assert len(_series(cell)[0].points) == 1
+
+
+def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    digests = _filled(cell, 26, drifting)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digests[8], at=BEGIN + timedelta(weeks=8), who="anna", target="x.yaml")
+    assert main(["history", str(cell)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"ALARM: gain of J4 fell 5\.\d % since 2026-04-\d\d, \d\d\.\d σ", out)
+    assert out.count("ALARM:") == 1
+    assert "demagnetised" in out
+    assert "Worn teeth alone do not change a ratio" in out
+    assert "applied by anna, in force" in out
+    found = _json(capsys, str(cell), "--axis", "J4")
+    (axis,) = found["axes"]
+    assert found["pattern"] == "one axis"
+    assert axis["alarmed"]
+    assert axis["change_percent"] == pytest.approx(-5.7, abs=0.5)
+    # 6 % in twelve weeks with σ 0.4 % have cumulated 3 σ after three.
+    first = next(number for number, point in enumerate(axis["points"]) if point["alarm"])
+    assert 15 <= first <= 18
+    assert found["in_force"] == digests[8]
+    assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
+
+
+def test_without_a_drift_there_is_no_alarm(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 25, lambda _: FLAT)
+    assert main(["history", str(cell)]) == 0
+    out = capsys.readouterr().out
+    assert "No alarm." in out
+    assert "ALARM" not in out
+    assert _json(capsys, str(cell))["questions"] == []
+
+
+@pytest.mark.parametrize(
+    ("factors", "says"),
+    [
+        ((0.96,) * 6, "is the payload heavier than the mass that was entered"),
+        ((1.04,) * 6, "is the payload lighter than the mass that was entered"),
+        ((1.0, 1.0, 1.0, 1.05, 1.0, 1.0), "Magnets do not grow stronger"),
+        ((1.0, 0.95, 1.0, 1.05, 1.0, 1.0), "several axes, each by an amount of its own"),
+    ],
+)
+def test_each_pattern_has_its_question(cell: Path, factors: tuple[float, ...], says: str) -> None:
+    _filled(cell, 20, stepping(factors))
+    assert says in questions(_series(cell))[0]
+
+
+def test_a_configuration_that_changed_is_asked_for(cell: Path) -> None:
+    _filled(cell, 20, stepping((0.96,) * 6))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(calibration_of(20, (0.96,) * 6), configuration_sha256="d" * 64))
+    assert "configuration changed" in questions(_series(cell))[1]
+
+
+def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
+    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    series = _series(cell)[3]
+    assert series.points[-1].gain.value < 0
+    words = alarm_words(series)
+    assert words is not None
+    assert words.startswith("gain of J4 fell 9.6 %")
+
+
+def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    fixed = calibration_of(5)
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:])))
+    assert [len(series.points) for series in _series(cell)] == [3, 4, 4, 4, 4, 4]
+    assert main(["history", str(cell)]) == 0
+    assert "J1" in capsys.readouterr().out
+
+
+def test_an_axis_has_a_table_of_its_own(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 5, lambda _: FLAT)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("2026-0") == 5
+    assert "CUSUM" in out
+    assert "No alarm" in out
+    assert main(["history", str(cell), "--axis", "J9"]) == 2
+    assert "one of J1" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_change_that_is_explained_begins_a_new_baseline(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 26, drifting)
+    explain = ["history", str(cell), "--acknowledge", "J4", "--by", "anna", "--why", "gearbox changed"]
+    assert main(explain) == 0
+    capsys.readouterr()
+    series = _series(cell)[3]
+    assert not series.alarmed
+    assert series.began == 25
+    assert [stretch.began for stretch in series.stretches] == [0, 25]
+    assert series.alarm_at(24) is not None  # what was told stays told
+    assert not any(other.acknowledged for other in _series(cell) if other.axis != "J4")
+    (entry,) = read(_place(cell).audit)
+    assert entry.action is AuditAction.ACKNOWLEDGED
+    assert entry.who.startswith("anna")
+    assert entry.details["why"] == "gearbox changed"
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    assert "gearbox changed" in capsys.readouterr().out
+    assert main(["history", str(cell), "--verify"]) == 0
+    # The next calibrations at the new level are compared with that level.
+    with HistoryStore(_place(cell).store) as store:
+        for week in range(26, 30):
+            enter(store, calibration_of(week, drifting(week)))
+    assert not _series(cell)[3].alarmed
+
+
+def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
+    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    explain = ["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged", "--since"]
+    assert main([*explain, "someday"]) == 2
+    assert main([*explain, (BEGIN + timedelta(weeks=15)).date().isoformat()]) == 0
+    series = _series(cell)[3]
+    assert series.began == 15
+    assert not series.alarmed
+    # Of a change that is still to come, nothing has been seen yet.
+    assert main([*explain, "2030-01-01"]) == 0
+    series = _series(cell)[3]
+    assert (series.began, series.drift, series.onset, alarm_words(series)) == (20, None, None, None)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--acknowledge", "J4"],
+        ["--acknowledge", "J4", "--why", "  "],
+        ["--acknowledge", "J9", "--why", "x"],
+        ["--why", "x"],
+        ["--by", "anna"],
+        ["--since", "2026-01-01"],
+    ],
+)
+def test_an_explanation_without_its_parts_is_refused(cell: Path, arguments: list[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    assert main(["history", str(cell), *arguments]) == 2
+    assert not _place(cell).audit.exists()
+
+
+def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 15, drifting)
+    out = cell.parent / "history.csv"
+    assert main(["history", str(cell), "--csv", str(out)]) == 0
+    assert main(["history", str(cell), "--csv", str(out)]) == 0  # an earlier one is replaced
+    with out.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert tuple(rows[0]) == COLUMNS
+    assert [row["axis"] for row in rows[::15]] == list(AXES)
+    found = {series.axis: series for series in _series(cell)}
+    for row, point in zip(rows[45:60], found["J4"].points, strict=True):
+        assert float(row["gain"]) == point.gain.value
+        assert datetime.fromisoformat(row["created"]) == point.entry.created
+        assert row["unit"] == "Nm/A"
+    assert rows[0]["change_percent"] == ""
+    capsys.readouterr()
+    assert main(["history", str(cell), "--csv", str(cell)]) == 2
+    assert cell.read_bytes().startswith(b"#") or b"axes" in cell.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+@pytest.mark.parametrize("arguments", [[], ["--axis", "J4"]])
+def test_the_picture_is_drawn_the_same_each_time(cell: Path, suffix: str, arguments: list[str]) -> None:
+    _filled(cell, 26, drifting)
+    out = cell.parent / f"history{suffix}"
+    draw = ["history", str(cell), "--plot", str(out), *arguments]
+    assert main(draw) == 0
+    first = out.read_bytes()
+    assert len(first) > 10_000
+    assert first.startswith({".png": b"\x89PNG", ".svg": b"<?xml"}[suffix])
+    assert main(draw) == 0
+    assert out.read_bytes() == first
+
+
+def test_a_picture_has_its_kind_and_replaces_only_its_like(cell: Path) -> None:
+    _filled(cell, 1, lambda _: FLAT)
+    assert main(["history", str(cell), "--plot", str(cell.parent / "history.pdf")]) == 2
+    notes = cell.parent / "notes.png"
+    notes.write_text("my notes")
+    assert main(["history", str(cell), "--plot", str(notes)]) == 2
+    assert notes.read_text() == "my notes"
+    assert main(["history", str(cell), "--plot", str(cell.parent / "none" / "history.png")]) == 1
+
+
+def test_a_broken_audit_is_told_by_its_first_line(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    audit = _place(cell).audit
+    for number in range(4):
+        append(audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number})
+    verify = ["history", str(cell), "--verify"]
+    assert main(verify) == 0
+    assert "4 entries, chain unbroken" in capsys.readouterr().out
+    audit.write_bytes(audit.read_bytes().replace(b'"k":2', b'"k":7'))
+    assert main(verify) == 4
+    shown = capsys.readouterr()
+    assert "line 3" in shown.err
+    assert "BROKEN" in shown.out
+    assert "keep this file" in shown.err
+    assert main([*verify, "--json"]) == 4
+    assert json.loads(capsys.readouterr().out)["audit"]["broken_line"] == 3
+
+
+def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A chain cannot tell that by itself: the history knows which entries there must be."""
+    place = _place(cell)
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    entries = [
+        append(place.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={}) for _ in range(3)
+    ]
+    with HistoryStore(place.store) as store:
+        store.applied(digest, at=BEGIN, who="anna", target="x", audit=entries[2].sha256)
+    assert main(["history", str(cell), "--verify"]) == 0
+    place.audit.write_bytes(b"".join(place.audit.read_bytes().splitlines(keepends=True)[:2]))
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert entries[2].sha256[:12] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")])
+def test_a_write_that_never_ended_is_told_with_what_the_file_is(
+    cell: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str
+) -> None:
+    file = cell.parent / "controller.yaml"
+    file.write_bytes(content)
+    digests = {"sha256_before": hashlib.sha256(b"old").hexdigest(), "sha256_after": hashlib.sha256(b"new").hexdigest()}
+    append(_place(cell).audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=str(file), details=digests)
+    assert main(["history", str(cell), "--verify"]) == 0
+    assert says in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_broken_history_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = _place(cell)
+    place.store.write_bytes(b"no history" * 1000)
+    assert main(["history", str(cell)]) == 4
+    assert "restore the last good one" in " ".join(capsys.readouterr().err.split())
+    place.store.unlink()
+    _filled(cell, 2, lambda _: FLAT)
+    with closing(sqlite3.connect(place.store)) as other:
+        other.execute("PRAGMA foreign_keys = OFF")
+        other.execute("DELETE FROM calibration WHERE created < '2026-01-08'")
+        other.commit()
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert "without its calibration" in " ".join(capsys.readouterr().err.split())
