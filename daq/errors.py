@@ -3,13 +3,16 @@
 DaqError
 ├── UsageError                  the command asks for what cannot be done                      exit 2
 │   ├── OutputExists            a file would be overwritten
+│   ├── SecretKeyUnfit          no secret key, another password, or a key that others may read
 │   └── PlanUnfit               no moves within these limits excite every parameter
 ├── CalibrationRefused          a gate of the write-back is closed                            exit 3
 │   ├── CalibrationEdited       calibration.yaml was changed by hand
 │   ├── ControllerUnfit         the controller file cannot be read, or lacks a gain's key
 │   ├── ControllerChanged       the controller file is not the one that the diff was shown for
 │   ├── ControllerBusy          somebody else is writing the controller file
-│   └── BackupMissing           there is nothing to roll back to
+│   ├── SignatureInvalid        a trusted person's signature does not fit the calibration
+│   ├── BackupMissing           there is nothing to roll back to
+│   └── AuditUnusable           what is done could not be written down
 ├── DataError                   a recording cannot be used                                    exit 4
 │   ├── CalibrationMissing      there is no such calibration file
 │   ├── CalibrationUnreadable   it is none, of another version, or broken
@@ -26,6 +29,9 @@ DaqError
 │   │   ├── TableColumns        it has other columns than the description says
 │   │   ├── TableNotNumeric     a field is not a finite number
 │   │   └── TimeNotUniform      its time column has gaps or jumps
+│   ├── HistoryUnreadable       the history is no SQLite file of ours, broken, of another version, or cannot be written
+│   ├── HistoryMixed            a calibration of another cell, other axes, or gains in other units
+│   ├── AuditBroken             the audit is not what was written: entries were changed, moved or taken away
 │   ├── LogsDiffer              logs of different cells, or of different configurations of one
 │   ├── LogRepeated             one recording twice
 │   ├── RolesExchanged          loaded and unloaded runs are mistaken for each other
@@ -43,9 +49,16 @@ DaqError
 │   ├── YamlInvalid             not YAML, a duplicate key, an alias
 │   ├── SchemaMismatch          unknown key, missing key, wrong type
 │   └── ConfigurationInconsistent  each value is well-formed, together they describe no cell
+├── JobHeld                     a job may not go on now; the next one takes it up             exit 14
+│   ├── NotReleased             the interlock does not let the robot move                     exit 11
+│   ├── BusTaken                another recording or job of drivegain has the bus             exit 12
+│   ├── TimeBoundReached        the job took longer than it may; the axes were stopped        exit 13
+│   ├── MountFailed             the command that mounts a payload failed
+│   └── ClockWentBack           the wall clock is behind what was written down before
 └── OutputFailed                the disk is full, the folder is read-only                     exit 1
     └── DiskSpaceShort          too little room for a recording, before it or during it
 
+`drivegain recalibrate` ends with 10 where it found a change that waits for a person.
 drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4.
 """
 
@@ -68,6 +81,11 @@ class ExitCode(IntEnum):
     DATA_UNFIT = 4
     DEVICE_FAULT = 5
     CONFIGURATION = 6
+    PROPOSED = 10
+    NOT_RELEASED = 11
+    BUS_TAKEN = 12
+    TIME_BOUND = 13
+    JOB_HELD = 14
     INTERRUPTED = 130
 
 
@@ -95,6 +113,10 @@ class OutputExists(UsageError):
     """A file would be overwritten."""
 
 
+class SecretKeyUnfit(UsageError):
+    """No secret key, another password, or a key that others may read."""
+
+
 class PlanUnfit(UsageError):
     """No moves within these limits and this time excite every parameter."""
 
@@ -119,8 +141,16 @@ class ControllerBusy(CalibrationRefused):
     """Somebody else is writing the controller file."""
 
 
+class SignatureInvalid(CalibrationRefused):
+    """A trusted person's signature stands beside the calibration and does not fit it."""
+
+
 class BackupMissing(CalibrationRefused):
     """There is nothing to roll back to."""
+
+
+class AuditUnusable(CalibrationRefused):
+    """The audit is no regular file, is locked for long, or its last line is not what was written."""
 
 
 class DataError(DaqError):
@@ -185,6 +215,18 @@ class TableNotNumeric(TableUnfit):
 
 class TimeNotUniform(TableUnfit):
     """The time column has gaps or jumps."""
+
+
+class HistoryUnreadable(DataError):
+    """The history is no SQLite file of ours, broken, of another version, or cannot be written."""
+
+
+class HistoryMixed(DataError):
+    """A calibration of another cell, of other axes, or with gains in other units than the history's."""
+
+
+class AuditBroken(DataError):
+    """The audit is not what was written: entries were changed, moved or taken away."""
 
 
 class LogsDiffer(DataError):
@@ -255,6 +297,30 @@ class ConfigurationInconsistent(ConfigurationError):
     """Each value is well-formed; together they describe no cell."""
 
 
+class JobHeld(DaqError):
+    """A job may not go on now; nothing was written to a controller, and the next one takes it up."""
+
+
+class NotReleased(JobHeld):
+    """The interlock does not let the robot move."""
+
+
+class BusTaken(JobHeld):
+    """Another recording or job of drivegain has the bus."""
+
+
+class TimeBoundReached(JobHeld):
+    """The job took longer than it may; the axes were stopped."""
+
+
+class MountFailed(JobHeld):
+    """The command that mounts a payload failed, or took too long."""
+
+
+class ClockWentBack(JobHeld):
+    """The wall clock is behind what was written down before."""
+
+
 class OutputFailed(DaqError):
     """The disk is full, or the folder is read-only."""
 
@@ -278,6 +344,10 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (CalibrationRefused, ExitCode.CALIBRATION_REFUSED),
     (DataError, ExitCode.DATA_UNFIT),
     (ConfigurationError, ExitCode.CONFIGURATION),
+    (NotReleased, ExitCode.NOT_RELEASED),
+    (BusTaken, ExitCode.BUS_TAKEN),
+    (TimeBoundReached, ExitCode.TIME_BOUND),
+    (JobHeld, ExitCode.JOB_HELD),
     (OutputFailed, ExitCode.UNEXPECTED),
     (IdentificationError, ExitCode.DATA_UNFIT),
     (MotionRefused, ExitCode.USAGE),

@@ -11,6 +11,10 @@ DriverError
 ├── ScaleImplausible          a drive's ampere value cannot be true (drivers/scale.py)
 ├── MappingRefused            a PDO mapping could not be written, or reads back differently
 ├── StateRefused              a CiA 402 transition did not happen in its bound
+├── PowerNotOff               a parameter was to be written while the axis has power, or may have
+├── SaveRefused               nobody knows what a drive's save would keep, or it would keep a recording's settings
+├── ReadbackDiffers           a parameter reads back as another value than was written
+├── ParametersMixed           a write failed midway, and not every drive has its old value again
 ├── FeedbackDiffers           a PDO carries another value than the object that it maps
 ├── SampleLost                a SYNC cycle had no complete answer
 ├── CellSilent                no axis answers any more
@@ -144,6 +148,52 @@ class StateRefused(DriverError):
         self.asked = asked
         self.found = found
         self.statusword = statusword
+
+
+class PowerNotOff(DriverError):
+    """A parameter was to be written while the axis has power, or may have."""
+
+    def __init__(self, node_id: int, state: str, statusword: int) -> None:
+        super().__init__(
+            f"node {node_id}: {state} (statusword {statusword:#06x}): its power stage is not off, and no parameter is "
+            "written while it is on; disable the axes with the controller that enabled them, then try again"
+        )
+        self.node_id = node_id
+        self.state = state
+        self.statusword = statusword
+
+
+class SaveRefused(DriverError):
+    """Nobody knows what a drive's save would keep, or it would keep a recording's settings."""
+
+    def __init__(self, node_id: int, reason: str, remedy: str) -> None:
+        super().__init__(f"node {node_id}: nothing was written, because saving it {reason}; {remedy}")
+        self.node_id = node_id
+        self.reason = reason
+
+
+class ReadbackDiffers(DriverError):
+    """A parameter reads back as another value than was written."""
+
+    def __init__(self, node_id: int, entry: str, written: str, found: str) -> None:
+        super().__init__(
+            f"node {node_id}: object {entry} reads back as {found}, written was {written}; does the drive limit or "
+            "round it, or is it another object?"
+        )
+        self.node_id = node_id
+        self.entry = entry
+
+
+class ParametersMixed(DriverError):
+    """A write failed midway, and not every drive has its old value again."""
+
+    def __init__(self, restored: tuple[str, ...], problems: tuple[str, ...]) -> None:
+        super().__init__(
+            f"the write failed midway; the old values stand again in {', '.join(restored) or 'no drive'}, and are NOT "
+            f"known to stand where {'; '.join(problems)}; do not enable the axes before `drivegain rollback --drives`"
+        )
+        self.restored = restored
+        self.problems = problems
 
 
 class FeedbackDiffers(DriverError):

@@ -205,7 +205,7 @@ class CanopenNetwork:
                 drivers/errors.py; what was changed until then is restored on leaving the network.
             ScaleImplausible: the ampere of a drive cannot be true (drivers/scale.py).
         """
-        self._require_quiet()
+        self.require_quiet()
         identities = self.check_identities()
         for axis in self.axes:
             original = self._originals.setdefault(axis.node_id, _Original())
@@ -224,9 +224,22 @@ class CanopenNetwork:
             self._readback[axis.name] = self._describe(axis, identity, mapped)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
 
-    def _require_quiet(self) -> None:
+    def require_quiet(self) -> None:
+        """Listen for a while before the first frame is sent.
+
+        Raises:
+            BusBusy: another master commands this bus.
+        """
         self.link.foreign.clear()
         self.link.wait(self.bounds.listen_s)
+        self.require_alone()
+
+    def require_alone(self) -> None:
+        """Look back at what came since `require_quiet`.
+
+        Raises:
+            BusBusy: a command of another master was among it.
+        """
         if self.link.foreign:
             seen = ", ".join(command_name(identifier) for identifier in sorted(self.link.foreign))
             raise BusBusy(str(self.link.address), seen)

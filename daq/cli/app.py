@@ -34,10 +34,15 @@ VERBS = (
     Listed("import", "daq.cli.import_:IMPORT", "Make a log of CSV files of another controller."),
     Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
     Listed("residual", "daq.cli.residual:RESIDUAL", "As fit; then find what the model lacks, and add it."),
+    Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells, one task a cell."),
     Listed("validate", "daq.cli.validate:VALIDATE", "Measure a calibration on any log."),
     Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
+    Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as the second person that a cell asks for."),
     Listed("apply", "daq.cli.apply:APPLY", "Write gains into the controller's file; first a dry run."),
     Listed("rollback", "daq.cli.rollback:ROLLBACK", "Take the last write to a controller's file back."),
+    Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell, and whether its gains drift."),
+    Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "The scheduled job: record, fit, propose or apply."),
+    Listed("install-units", "daq.cli.install_units:INSTALL_UNITS", "Let systemd or cron run the scheduled job."),
     Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, for trying the other verbs."),
 )
 """In the order of the help. A verb is imported when it is called: most of them bring a second of mathematics along."""
@@ -62,7 +67,8 @@ def build_app() -> typer.Typer:
         name="drivegain",
         help="Record a robot over CANopen, identify its joint drive gains and dynamics, write the calibration back.",
         epilog="Exit codes: 0 ok, 1 unexpected, or the output could not be written, 2 usage, 3 calibration refused, "
-        "4 data unfit, 5 device fault, 6 configuration, 130 interrupted.",
+        "4 data unfit, 5 device fault, 6 configuration, 10 to 14 see recalibrate (12: the bus is taken), "
+        "130 interrupted.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

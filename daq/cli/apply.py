@@ -16,6 +16,7 @@ from rich.console import Console
 
 from daq.calibration_file import decode, read
 from daq.cli.applier import Applier, AuditOption, ByOption, applier, audit_of, tell_history
+from daq.cli.apply_drives import DrivesOption, RamOnlyOption, SaveUnknownOption, apply_drives, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
@@ -53,6 +54,9 @@ def apply_verb(
         bool,
         typer.Option("--configuration-changed", help="Accept a cell configuration that changed since the recording."),
     ] = False,
+    drives: DrivesOption = False,
+    ram_only: RamOnlyOption = False,
+    save_unknown: SaveUnknownOption = False,
     audit: AuditOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -63,14 +67,41 @@ def apply_verb(
     declared, now, doer = load_cell(cell), datetime.now(UTC), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
+    policy = tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent)
+    masses_kg = entered_masses(payload_mass or (), fitted)
+    book = audit_of(declared, audit)
+    if drives:
+        if to is not None:
+            raise UsageError(
+                "--drives", found="--to beside it", expected="one target", remedy="leave out one of the two"
+            )
+        apply_drives(
+            declared,
+            cell,
+            fitted,
+            now=now,
+            doer=doer,
+            policy=policy,
+            configuration_changed=configuration_changed,
+            entered_kg=masses_kg,
+            looked_at=base,
+            appliers=doer.names,
+            calibration_file=calibration,
+            calibration_content=content,
+            saving=saving_of(ram_only, save_unknown),
+            audit=book,
+            yes=yes,
+            json=json,
+        )
+        return
     proposal = propose_for(
         declared,
         fitted,
         to,
         now=now,
-        policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
+        policy=policy,
         configuration_changed=configuration_changed,
-        entered_kg=entered_masses(payload_mass or (), fitted),
+        entered_kg=masses_kg,
         looked_at=base,
         appliers=doer.names,
         calibration_file=calibration,
@@ -78,7 +109,6 @@ def apply_verb(
     )
     if not json:
         show(proposal, Console())
-    book = audit_of(declared, audit)
     try:
         written = _write(proposal, now, book, doer) if yes else None
     except CalibrationRefused:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.syntax import Syntax
 
 from daq.cli.applier import AuditOption, ByOption, applier, audit_of, tell_history
+from daq.cli.apply_drives import DrivesOption, RamOnlyOption, SaveUnknownOption, rollback_drives, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
@@ -27,6 +28,9 @@ def rollback(
         Path | None, typer.Option("--to", help="Controller file to restore, instead of the one that the cell names.")
     ] = None,
     by: ByOption = None,
+    drives: DrivesOption = False,
+    ram_only: RamOnlyOption = False,
+    save_unknown: SaveUnknownOption = False,
     audit: AuditOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -36,8 +40,19 @@ def rollback(
     says where the audit is: give it with --audit, or nothing is written down.
     """
     declared = None if cell is None else load_cell(cell)
-    file, now, doer = _file(declared, cell, to), datetime.now(UTC), applier(by)
-    book = audit_of(declared, audit)
+    now, doer, book = datetime.now(UTC), applier(by), audit_of(declared, audit)
+    if drives:
+        if declared is None or to is not None:
+            raise UsageError(
+                "--drives",
+                found="no --cell" if declared is None else "--to beside it",
+                expected="--cell CELL alone, which says where the gains are in the drives",
+                remedy="name the cell, and no file",
+            )
+        saving = saving_of(ram_only, save_unknown)
+        rollback_drives(declared, now=now, doer=doer, saving=saving, audit=book, json=json)
+        return
+    file = _file(declared, cell, to)
     try:
         done = roll_back(
             file,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from daq.configuration.apply_policy import DEFAULT_APPLY_POLICY, ApplyPolicy
 from daq.configuration.clearance import Clearance
+from daq.configuration.controller_target import Controller
 from daq.configuration.history_place import HistoryPlace
 from daq.configuration.joint_unit import JointUnit
 from daq.configuration.recalibration import Recalibration
@@ -129,14 +130,6 @@ class WeighedPayload:
         return Payload(self.name, self.mounting, {**self.known, "m": self.mass_kg})
 
 
-@dataclass(frozen=True, slots=True)
-class Controller:
-    """Where the gains are written: a file, relative to the cell file, and the dotted key of each axis."""
-
-    file: str
-    gains: tuple[str, ...]
-
-
 class MotionPolicy(Enum):
     """Whose leave a recording needs to move the axes."""
 
@@ -191,7 +184,7 @@ class Cell:
     @property
     def controller_path(self) -> Path | None:
         """The controller's file, where it is known."""
-        if self.controller is None or self.folder is None:
+        if self.controller is None or self.controller.file is None or self.folder is None:
             return None
         return (self.folder / self.controller.file).resolve()
 

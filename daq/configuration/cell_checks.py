@@ -12,6 +12,7 @@ from daq.configuration.axis_checks import axis_faults
 from daq.configuration.bus_checks import bus_faults
 from daq.configuration.cell_schema import CellModel, PayloadModel
 from daq.configuration.clearance import clearance_faults
+from daq.configuration.controller_target import controller_faults
 from daq.configuration.drive_train import ratio_of
 from daq.configuration.sync_checks import producer_faults
 from daq.configuration.yaml_file import Document, Fault, describe
@@ -88,8 +89,9 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
     for index, axis in enumerate(model.axes):
         if names[axis.name] > 1:
             yield Fault(("axes", index, "name"), f"{axis.name}, used {names[axis.name]} times", "each name once")
-    if model.controller is not None and len(model.controller.gains) != n:
-        yield Fault(("controller", "gains"), f"{len(model.controller.gains)} keys", f"{n}, one for each axis")
+    if model.controller is not None:
+        on_a_bus = bool(model.buses) and all(axis.node_id is not None and axis.drive for axis in model.axes)
+        yield from controller_faults(model.controller, n, on_a_bus=on_a_bus)
     mountings = Counter(payload.mounting for payload in model.payloads)
     for index, payload in enumerate(model.payloads):
         if payload.mass_kg <= 0:

@@ -9,6 +9,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from daq.configuration.apply_policy import ApplyPolicyModel
 from daq.configuration.cell import RECORDER, MotionPolicy, Pacing
 from daq.configuration.clearance import ClearanceModel, WorkspaceModel
+from daq.configuration.controller_target import ControllerModel
 from daq.configuration.history_place import HistoryModel
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE, JointUnit
 from daq.configuration.recalibration import RecalibrationModel
@@ -202,13 +203,6 @@ class ConditioningModel(StrictModel):
     standstill_rad_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
     standstill_mm_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
     standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
-
-
-class ControllerModel(StrictModel):
-    """Where gains are written."""
-
-    file: FileName
-    gains: tuple[FileName, ...]
 
 
 class PolicyModel(StrictModel):

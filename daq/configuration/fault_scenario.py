@@ -17,15 +17,20 @@ AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Fie
 """J3, or 3."""
 
 
+LONGEST_S = 1e6
+LAST_CYCLE = 10**12
+"""No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them."""
+
+
 class FaultModel(StrictModel):
     """Something that goes wrong; times count from power-on, in the time of the plant."""
 
     fault: FaultKind
     axis: AxisName | None = None
-    at_s: Annotated[float, Field(ge=0)] | None = None
-    at_cycle: Annotated[int, Field(ge=0)] | None = None
-    for_s: Annotated[float, Field(gt=0)] | None = None
-    cycles: Annotated[int, Field(ge=1)] | None = None
+    at_s: Annotated[float, Field(ge=0, le=LONGEST_S)] | None = None
+    at_cycle: Annotated[int, Field(ge=0, le=LAST_CYCLE)] | None = None
+    for_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
+    cycles: Annotated[int, Field(ge=1, le=LAST_CYCLE)] | None = None
     emcy_code: Annotated[int, Field(ge=0x1000, le=0xFFFF)] | None = None
 
     @model_validator(mode="after")

@@ -42,6 +42,7 @@ class AxisSpecModel(StrictModel):
     noise_correlation_s: NotNegative
     dialect: Dialect = Dialect.CIA402
     toggle_bit: Literal[8, 14, 15] | None = None
+    entered_gain_nm_per_a: float = 0.0
 
 
 class BodyModel(StrictModel):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -21,6 +23,8 @@ MAX_DEPTH = 40
 """Lists in lists; deeper ones take time and memory beyond their size."""
 MAX_VALUES = 50_000
 """Keys and values; the largest configuration has a hundredth of that, and a file of 4 MiB could hold two million."""
+MAX_BITS = 64
+"""Of an integer: no object of an amplifier is longer, and Python refuses to write out what is much longer."""
 MAX_EXPLAINED = 100
 """Faults for which the nearest known key is looked up; a hostile file has tens of thousands."""
 MAX_SHOWN = 8
@@ -160,13 +164,16 @@ def not_in_file(kind: str) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Bytes of a configuration file.
+    """Bytes of a configuration file; no more than MAX_BYTES are ever read of it.
 
     Raises:
-        ConfigurationMissing: there is no such file, or it cannot be read.
+        ConfigurationMissing: there is no such file, it is no regular one, too large, or cannot be read.
     """
     try:
-        return path.read_bytes()
+        # Without waiting: a pipe is opened for reading only when somebody writes to it, and a device may never end.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as stream:
+            regular = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
+            content = stream.read(MAX_BYTES + 1) if regular else b""
     except OSError as error:
         raise ConfigurationMissing(
             str(path),
@@ -174,6 +181,14 @@ def read_bytes(path: Path) -> bytes:
             expected="a readable file",
             remedy="check the name and the folder it is meant from",
         ) from error
+    if not regular or len(content) > MAX_BYTES:
+        raise ConfigurationMissing(
+            str(path),
+            found=f"more than {MAX_BYTES} bytes" if regular else "a pipe, a device or a socket",
+            expected=f"a regular file of at most {MAX_BYTES} bytes",
+            remedy="is this the right file?",
+        )
+    return content
 
 
 def read_model(document: Document, model: type[Model]) -> Model:
@@ -251,7 +266,15 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
         return mapping
     if isinstance(node, yaml.SequenceNode):
         return [_convert(loader, child, (*path, i), name, lines) for i, child in enumerate(node.value)]
-    return loader.construct_object(node)
+    value = loader.construct_object(node)
+    if isinstance(value, int) and value.bit_length() > MAX_BITS:
+        raise YamlInvalid(
+            f"{name}:{line}: {spell(path)}",
+            found=f"an integer of {value.bit_length()} bits",
+            expected=f"at most {MAX_BITS}",
+            remedy="was a digit held down, or is this text? then quote it",
+        )
+    return value
 
 
 def _fault(item: Any, model: type[BaseModel]) -> Fault:

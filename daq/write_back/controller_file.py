@@ -1,278 +1,130 @@
-"""A controller's YAML file: where its gains stand, and the same text with other numbers there.
+"""A controller's file, in whichever format: where its gains stand, and the same bytes with other numbers there.
 
-Only the characters of a changed number are touched. Comments, order, quotes, spacing and line ends belong to the
-human who wrote the file and stay byte for byte.
+Only the characters of a changed number are touched. Comments, order, quotes, spacing, line ends and encoding belong to
+the human who wrote the file and stay byte for byte (docs/decisions/0023-documents-keep-their-bytes.md).
 """
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Protocol, Self
 
-import yaml
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
-
+from daq.configuration.controller_target import ControllerFormat
 from daq.errors import ControllerUnfit
+from daq.write_back.dcf_document import dcf_document
+from daq.write_back.json_document import json_document
+from daq.write_back.scalar import Scalar
+from daq.write_back.xml_document import xml_document
+from daq.write_back.yaml_document import yaml_document
 
-_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-_MERGE = "<<"
+MAX_BYTES = 4 * 2**20
+"""No controller's parameter file is larger; a file that is must be something else."""
 
-KeyPath = tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Scalar:
-    """One number in the text.
-
-    Attributes:
-        key: dotted path, as the cell configuration names it.
-        value: the number.
-        text: how it is written.
-        start, end: its characters in the text, quotes outside.
-        line: from 1.
-    """
-
-    key: str
-    value: float
-    text: str
-    start: int
-    end: int
-    line: int
+_SUFFIXES = (
+    (".yaml", ControllerFormat.YAML),
+    (".yml", ControllerFormat.YAML),
+    (".json", ControllerFormat.JSON),
+    (".xml", ControllerFormat.XML),
+    (".dcf", ControllerFormat.DCF),
+    (".eds", ControllerFormat.DCF),
+)
 
 
-@dataclass(frozen=True, slots=True)
-class ControllerFile:
-    """A controller file as it was read.
+class ControllerDocument(Protocol):
+    """A controller's file as it was read; frozen."""
 
-    Attributes:
-        name: what to call it in messages.
-        text: all of it, a byte order mark and the line ends included.
-    """
+    @property
+    def name(self) -> str:
+        """What to call it in messages."""
 
-    name: str
-    text: str
+    @property
+    def text(self) -> str:
+        """All of it."""
+
+    @property
+    def content(self) -> bytes:
+        """The text as it stands in the file."""
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the numbers at some dotted paths, in their order.
+        """Find the numbers of some keys, in their order.
 
         Raises:
-            ControllerUnfit: the file does not parse, or a path leads to no number that can be changed on its own.
+            ControllerUnfit: the file does not parse, or a key leads to no number that can be changed on its own.
         """
-        root = self._compose()
-        references = Counter[int]()
-        _count_references(root, references)
-        return tuple(self._locate(root, key, references) for key in keys)
 
-    def with_values(self, spelling: Mapping[str, str]) -> ControllerFile:
-        """The same text with other numbers at some dotted paths, read back by two parsers.
-
-        Args:
-            spelling: the new number, as text, by dotted path.
+    def with_values(self, spelling: Mapping[str, str]) -> Self:
+        """The same text with other numbers, given as text by their keys, read back and compared.
 
         Raises:
             ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
         """
-        scalars = self.locate(tuple(spelling))
-        text = self.text
-        for scalar in sorted(scalars, key=lambda s: s.start, reverse=True):
-            text = text[: scalar.start] + spelling[scalar.key] + text[scalar.end :]
-        changed = ControllerFile(self.name, text)
-        changed.check_against(self, spelling)
-        return changed
 
-    def check_against(self, before: ControllerFile, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone, for both parsers.
-
-        ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
+    def check_against(self, before: Self, spelling: Mapping[str, str]) -> None:
+        """Refuse unless this file differs from `before` in the named numbers alone.
 
         Raises:
             ControllerUnfit: it differs in more, or in less.
         """
-        targets = {tuple(key.split(".")) for key in spelling}
-        for leaves in (_leaves_1_2, _leaves_1_1):
-            old, new = leaves(before), leaves(self)
-            others = [
-                path for path in old.keys() | new.keys() if path not in targets and old.get(path) != new.get(path)
-            ]
-            wrong = [key for key, number in spelling.items() if new.get(tuple(key.split("."))) != number]
-            if others or wrong:
-                raise ControllerUnfit(
-                    self.name,
-                    found=f"another value at {', '.join(wrong + sorted('.'.join(path) for path in others))}",
-                    expected="the new gains and nothing else changed",
-                    remedy="nothing was written; write these gains as plain numbers in the file",
-                )
-
-    def _compose(self) -> Node:
-        try:
-            root: Node | None = YAML(typ="safe", pure=True).compose(self.text)
-        except (YAMLError, ValueError, RecursionError) as error:
-            raise ControllerUnfit(
-                self.name,
-                found=f"no YAML ({' '.join(str(error).split())[:200]})",
-                expected="one YAML document",
-                remedy="correct the file; nothing was written",
-            ) from error
-        if root is None:
-            raise ControllerUnfit(
-                self.name,
-                found="an empty file",
-                expected="the controller's parameters",
-                remedy="is this the right file?",
-            )
-        return root
-
-    def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
-        node = root
-        walked: KeyPath = ()
-        for step in key.split("."):
-            node = self._child(node, step, key, walked)
-            walked = (*walked, step)
-            # A value that another place refers to by an alias cannot be changed without changing that place too.
-            if references[id(node)] > 1:
-                raise self._unfit(key, f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)", "write it out")
-        if not isinstance(node, ScalarNode):
-            raise self._unfit(key, "a list or mapping", "name the key of a number")
-        quote = node.style or ""
-        end = node.end_mark.index - len(quote)
-        start = end - len(node.value)
-        # An anchor or a tag may stand before the number; an escape within quotes makes its text another than its value.
-        opened = self.text[start - 1 : start] == quote if quote else self._begins(node, start)
-        if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
-            raise self._unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
-        return Scalar(key, float(node.value), node.value, start, end, node.start_mark.line + 1)
-
-    def _begins(self, node: ScalarNode, start: int) -> bool:
-        return start == node.start_mark.index or self.text[start - 1].isspace()
-
-    def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
-        place = ".".join(walked) or "the file"
-        if isinstance(node, SequenceNode) and step.isdecimal() and int(step) < len(node.value):
-            child: Node = node.value[int(step)]
-            return child
-        if not isinstance(node, MappingNode):
-            raise self._unfit(
-                key, f"no key {step!r} in {place}", "correct `controller.gains` of the cell configuration"
-            )
-        found: list[Node] = [value for name, value in node.value if isinstance(name, ScalarNode) and name.value == step]
-        if len(found) > 1:
-            raise self._unfit(key, f"{step!r} {len(found)} times in {place}", "remove all but one")
-        if not found:
-            names = [str(name.value) for name, _ in node.value if isinstance(name, ScalarNode)]
-            if _MERGE in names:
-                raise self._unfit(key, f"no {step!r} of its own in {place}, which merges (<<) another", "write it out")
-            has = ", ".join(names[:12]) or "nothing"
-            raise self._unfit(
-                key,
-                f"no key {step!r} in {place} (it has {has})",
-                "correct `controller.gains` of the cell configuration",
-            )
-        return found[0]
-
-    def _unfit(self, key: str, found: str, remedy: str) -> ControllerUnfit:
-        return ControllerUnfit(
-            f"{self.name}: {key}",
-            found=found,
-            expected="one decimal number of its own",
-            remedy=f"{remedy}; nothing was written",
-        )
 
 
-def decode(content: bytes, name: str) -> ControllerFile:
+def format_of(name: str) -> ControllerFormat:
+    """Format that a file's name tells, a backup's too; YAML where it tells none."""
+    for suffix in reversed(Path(name).suffixes):
+        for known, told in _SUFFIXES:
+            if suffix.lower() == known:
+                return told
+    return ControllerFormat.YAML
+
+
+def decode(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002
     """A controller file from its bytes.
 
+    Args:
+        content: of the file.
+        name: what to call it in messages.
+        format: of the file; None where its name tells.
+
     Raises:
-        ControllerUnfit: they are not UTF-8.
+        ControllerUnfit: the bytes are no text of that format. What is wrong further in, `locate` tells.
     """
-    try:
-        return ControllerFile(name, content.decode())
-    except UnicodeDecodeError as error:
-        raise ControllerUnfit(
-            name,
-            found=f"byte {error.start} that is not UTF-8",
-            expected="YAML in UTF-8",
-            remedy="save the file as UTF-8; nothing was written",
-        ) from error
+    told = format or format_of(name)
+    if told is ControllerFormat.JSON:
+        return json_document(content, name)
+    if told is ControllerFormat.XML:
+        return xml_document(content, name)
+    if told is ControllerFormat.DCF:
+        return dcf_document(content, name)
+    return yaml_document(content, name)
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a controller file.
+    """Content of a controller file; a pipe or device is not waited for.
 
     Raises:
-        ControllerUnfit: there is none, it is no regular file, or it cannot be read.
+        ControllerUnfit: there is none, it is no regular file, is too large, or cannot be read.
     """
     try:
+        # Looked at before it is opened: opening a pipe waits for its other end.
         if path.is_file():
-            return path.read_bytes()
-        found = "something that is no regular file" if path.exists() else "no such file"
+            content = _bounded(path)
+            if content is not None:
+                return content
+            found = f"more than {MAX_BYTES >> 20} MiB"
+        else:
+            found = "something that is no regular file" if path.exists() else "no such file"
     except OSError as error:
         found = (error.strerror or type(error).__name__).lower()
     raise ControllerUnfit(
         str(path),
         found=found,
-        expected="the controller's YAML file",
+        expected="the controller's file",
         remedy="correct `controller.file` of the cell configuration, or give --to FILE",
     )
 
 
-def _count_references(node: Node, references: Counter[int]) -> None:
-    """Count from how many places each node is reached: more than once means an alias."""
-    references[id(node)] += 1
-    if references[id(node)] > 1:
-        return
-    if isinstance(node, MappingNode):
-        for name, value in node.value:
-            _count_references(name, references)
-            _count_references(value, references)
-    elif isinstance(node, SequenceNode):
-        for child in node.value:
-            _count_references(child, references)
-
-
-def _leaves_1_2(file: ControllerFile) -> dict[KeyPath, str]:
-    return _leaves(file._compose())
-
-
-def _leaves_1_1(file: ControllerFile) -> dict[KeyPath, str]:
-    try:
-        return _leaves(yaml.compose(file.text, Loader=yaml.SafeLoader))
-    except yaml.YAMLError as error:
-        raise ControllerUnfit(
-            file.name,
-            found=f"no YAML 1.1 ({' '.join(str(error).split())[:200]})",
-            expected="one YAML document that readers of both YAML 1.1 and 1.2 understand",
-            remedy="correct the file; nothing was written",
-        ) from error
-
-
-def _leaves(root: Any) -> dict[KeyPath, str]:
-    """Every scalar of a tree by its path, and the size of every list and mapping.
-
-    The two parsers have unrelated node classes whose parts have the same names. A node that an alias repeats is
-    followed once: it is the same text.
-    """
-    leaves: dict[KeyPath, str] = {}
-    seen: set[int] = set()
-    waiting: list[tuple[KeyPath, Any]] = [((), root)]
-    while waiting:
-        path, node = waiting.pop()
-        if id(node) in seen:
-            leaves[path] = "*"
-        elif isinstance(node.value, str):
-            leaves[path] = node.value
-        elif type(node).__name__ == "SequenceNode":
-            leaves[*path, "[]"] = str(len(node.value))
-            waiting.extend(((*path, str(position)), child) for position, child in enumerate(node.value))
-        else:
-            leaves[*path, "{}"] = str(len(node.value))
-            for position, (name, value) in enumerate(node.value):
-                step = name.value if isinstance(name.value, str) else f"? {position}"
-                waiting.append(((*path, step), value))
-        seen.add(id(node))
-    return leaves
+def _bounded(path: Path) -> bytes | None:
+    """The content, None where it has no end: the size that the file system tells is not believed."""
+    with path.open("rb") as stream:
+        content = stream.read(MAX_BYTES + 1)
+    return content if len(content) <= MAX_BYTES else None

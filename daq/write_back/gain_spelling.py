@@ -4,8 +4,46 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 
 _EXPONENT = re.compile(r"([eE])[-+]?([0-9]+)$")
+_INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)|0[xX][0-9a-fA-F]+")
+
+
+@dataclass(frozen=True, slots=True)
+class IntegerStyle:
+    """Integers of a type in decimal, or in hexadecimal as two's complement.
+
+    Attributes:
+        bits: of the type.
+        lowest, highest: what is allowed.
+    """
+
+    bits: int
+    lowest: int
+    highest: int
+
+    def read(self, text: str) -> int:
+        """The integer.
+
+        Raises:
+            ValueError: it is none, is ambiguous (a leading zero is octal to CiA 306), or has too many bits.
+        """
+        if not _INTEGER.fullmatch(text):
+            raise ValueError(text)
+        value = int(text, 0)
+        if text[:2] in ("0x", "0X") and self.lowest < 0 and value >> (self.bits - 1) == 1:
+            value -= 1 << self.bits
+        if not -(1 << (self.bits - 1)) <= value < 1 << self.bits:
+            raise ValueError(text)
+        return value
+
+    def spell(self, value: int, like: str) -> str:
+        """As text; in hexadecimal with at least as many digits, and in that case, where `like` is."""
+        if like[:2] not in ("0x", "0X"):
+            return str(value)
+        digits = f"{value % (1 << self.bits):0{len(like) - 2}x}"
+        return like[:2] + (digits if re.search("[a-f]", like[2:]) else digits.upper())
 
 
 def spell(value: float, std: float, like: str = "") -> str:

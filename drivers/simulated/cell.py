@@ -19,12 +19,13 @@ from drivers.simulated.effects import build_effect
 from drivers.simulated.effects.lag import Lag
 from drivers.simulated.errors import SpecInvalid
 from drivers.simulated.fault import FaultKind, FaultSpec
-from drivers.simulated.node import NmtCommand, Node
+from drivers.simulated.node import GAIN, STORE, NmtCommand, Node
 from drivers.simulated.plant import Plant
 from drivers.simulated.readings import Readings, take
 from drivers.simulated.spec import CellSpec
 from drivers.simulated.sync_gate import Cycles, SyncGate
 from drivers.simulated.tuning import tuned
+from drivers.socketcand import SocketcandBus
 from drivers.split_bus import SplitBus
 
 SYNC_ID = 0x080
@@ -87,6 +88,7 @@ class SimulatedCell:
         self._wires, there = _wires(bus, ids)
         self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
         self._gate = SyncGate(len(self._wires))
+        _refuse_unsayable(spec.faults, bus)
         self._disturbance = Disturbance(spec.faults)
         for index, node in enumerate(self.nodes):
             node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
@@ -98,6 +100,10 @@ class SimulatedCell:
                 node.produce_sync()
             if self._disturbance.active(FaultKind.NO_GUARD, index):
                 node.lose_guard()
+            if self._disturbance.active(FaultKind.REFUSES_WRITE, index):
+                node.refuse(GAIN)
+            if self._disturbance.active(FaultKind.REFUSES_SAVE, index):
+                node.refuse(STORE)
         self._by_id = {node.node_id: node for node in self.nodes}
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -311,6 +317,21 @@ def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], t
     if alone:
         raise SpecInvalid(f"node {', '.join(map(str, alone))} is on none of the buses {bus.address}")
     return tuple(map(str, bus.address.parts)), there
+
+
+def _refuse_unsayable(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
+    """An error frame that a bus cannot carry would end the cell in the middle of somebody's run."""
+    hub = (
+        any(part.address.interface == "socketcand" for part in bus.address.parts)
+        if isinstance(bus, SplitBus)
+        else isinstance(bus, SocketcandBus)
+    )
+    unsayable = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
+    if hub and unsayable:
+        raise SpecInvalid(
+            f"the faults {', '.join(unsayable)} are error frames, which the socketcand protocol does not have: "
+            "leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
+        )
 
 
 def _compile(spec: CellSpec) -> None:

@@ -16,7 +16,8 @@ class FaultKind(Enum):
     SECOND_MASTER (somebody else's SYNC, whole cell), SDO_MASTER (somebody else's SDO requests to the axis),
     SYNC_PRODUCER (the axis sends a SYNC by itself), BUS_OFF (an error frame of this end; then nobody hears or is heard,
     whole cell); and from power-on for ever: REFUSES_NMT (it does not go to OPERATIONAL), REFUSES_MAPPING (its TPDOs
-    cannot be mapped), OTHER_SERIAL (an exchanged amplifier), NO_GUARD (it has no 1016h).
+    cannot be mapped), OTHER_SERIAL (an exchanged amplifier), NO_GUARD (it has no 1016h), REFUSES_WRITE (its gain 2003h
+    cannot be written), REFUSES_SAVE (1010h does not store).
 
     Once: EMERGENCY (an EMCY of the code `value`, and FAULT), FOLLOWING_ERROR, FALLS_BACK (PRE-OPERATIONAL with EMCY
     8130h), REBOOTS (reset: boot-up message, settings lost), LOSES_POWER (SWITCH ON DISABLED by itself, as STO does),
@@ -38,6 +39,8 @@ class FaultKind(Enum):
     REFUSES_MAPPING = "refuses-mapping"
     OTHER_SERIAL = "other-serial"
     NO_GUARD = "no-guard"
+    REFUSES_WRITE = "refuses-write"
+    REFUSES_SAVE = "refuses-save"
     SECOND_MASTER = "second-master"
     SDO_MASTER = "sdo-master"
     SYNC_PRODUCER = "sync-producer"

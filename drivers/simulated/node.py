@@ -29,6 +29,8 @@ from drivers.simulated.spec import AxisSpec
 Send = Callable[[int, bytes], None]
 
 NOT_STORED = 0x08000020
+NOT_IN_THIS_STATE = 0x08000022
+GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
 
 
 class NmtState(IntEnum):
@@ -95,7 +97,13 @@ class Node:
         self._heard_wall_s: float | None = None
         self._toggle = 0
         self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
+        self._refused: set[int] = set()
         self.obeys_nmt = True
+
+    @property
+    def saved(self) -> Stored:
+        """What it will have after the next power-on."""
+        return self._saved
 
     # -- NMT and error control -------------------------------------------------------------------------------------
 
@@ -173,6 +181,10 @@ class Node:
         """Become an amplifier without consumer heartbeat."""
         for key in ((0x1016, 0), (0x1016, 1)):
             del self._dictionary[key]  # its value stays zero: it watches nobody
+
+    def refuse(self, index: int) -> None:
+        """Become an amplifier that lets nobody write an object, as if it were always busy."""
+        self._refused.add(index)
 
     def beat(self, now_us: int, wall_s: float) -> None:
         """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
@@ -279,7 +291,10 @@ class Node:
         if not entry.writable:
             raise SdoAbort(READ_ONLY)
         value = entry.decode(data)
-        if index in (0x1010, 0x1011):
+        # Drives write their memory with the power stage off.
+        if index in self._refused or (index == STORE and self.drive.powered):
+            raise SdoAbort(NOT_IN_THIS_STATE)
+        if index in (STORE, LOAD_DEFAULTS):
             self._store(index, value)
         elif index == 0x1003:
             self._history.clear()
@@ -287,10 +302,10 @@ class Node:
             self._set((index, subindex), value)
 
     def _store(self, index: int, value: Value) -> None:
-        if value != (SAVE if index == 0x1010 else LOAD):
+        if value != (SAVE if index == STORE else LOAD):
             raise SdoAbort(NOT_STORED)
         # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
-        self._saved = self._stored() if index == 0x1010 else self._defaults
+        self._saved = self._stored() if index == STORE else self._defaults
 
     # -- inside ----------------------------------------------------------------------------------------------------
 

@@ -90,6 +90,8 @@ class Entry:
 
 Dictionary = dict[tuple[int, int], Entry]
 
+_REAL32, _REAL32_BITS = struct.Struct("<f"), struct.Struct("<I")
+
 SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
 
@@ -122,6 +124,10 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x1018, 3): Entry(Kind.U32, axis.revision),
         (0x1018, 4): Entry(Kind.U32, axis.serial),
         (0x1019, 0): Entry(Kind.U8),
+        # The maker's own: the joint drive gain that somebody entered. Nobody reads it but a master.
+        (0x2003, 0): Entry(Kind.U8, 2),
+        (0x2003, 1): Entry(Kind.I32, round(1000 * axis.entered_gain_nm_per_a), writable=True),
+        (0x2003, 2): Entry(Kind.U32, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0], writable=True),
         (0x6007, 0): Entry(Kind.I16, 1, writable=True, lowest=0, highest=3),
         (0x603F, 0): Entry(Kind.U16, mappable=transmit),
         (0x6040, 0): Entry(Kind.U16, writable=True, mappable=receive),

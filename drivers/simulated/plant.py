@@ -116,6 +116,14 @@ class Plant:
             if shut:
                 self._bound[row] += brake_nm
 
+    def mount(self, spec: CellSpec) -> None:
+        """Exchange the mounted body for that of another description of the same cell, which then weighs at once.
+
+        Where the joints are, what they are warm from and all else stays.
+        """
+        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+        self._data = self._model.createData()
+
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
         """Positions of each joint that show how its inertia varies, so many a joint.
 

@@ -59,6 +59,7 @@ class AxisSpec:
         noise_correlation_s: correlation time of that noise (first-order); 0 is white.
         dialect: whose objects tell its current.
         toggle_bit: of statusword 6041h, which it inverts with every SYNC; None for an amplifier without.
+        entered_gain_nm_per_a: what somebody has entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); it is not used.
     """
 
     node_id: int
@@ -80,6 +81,7 @@ class AxisSpec:
     noise_correlation_s: float
     dialect: Dialect = Dialect.CIA402
     toggle_bit: int | None = None
+    entered_gain_nm_per_a: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,9 @@ from ruamel.yaml import YAML
 from daq.errors import ControllerUnfit
 from daq.write_back.apply import apply, propose
 from daq.write_back.audit import AuditAction, read
-from daq.write_back.controller_file import ControllerFile, decode
+from daq.write_back.controller_file import decode
 from daq.write_back.gain_spelling import spell
+from daq.write_back.yaml_document import YamlDocument
 from ident.calibration import Gain
 from tests.daq.calibrations import demo_calibration
 
@@ -210,7 +211,7 @@ def test_digits_follow_the_uncertainty_and_the_habit_of_the_file(gain: float, st
 )
 def test_a_number_that_cannot_be_changed_alone_is_refused(text: str, key: str, says: str) -> None:
     with pytest.raises(ControllerUnfit) as caught:
-        ControllerFile("robot.yaml", text).locate((key,))
+        YamlDocument("robot.yaml", text).locate((key,))
     assert says in str(caught.value)
     assert "robot.yaml" in str(caught.value)
 
@@ -231,12 +232,12 @@ def test_bytes_that_are_no_utf8_are_refused() -> None:
     ],
 )
 def test_the_second_look_finds_any_other_change(other: str) -> None:
-    before = ControllerFile("robot.yaml", "a: 1.0\nb: 1.0  # kept\n")
+    before = YamlDocument("robot.yaml", "a: 1.0\nb: 1.0  # kept\n")
     with pytest.raises(ControllerUnfit, match="another value at"):
-        ControllerFile("robot.yaml", other).check_against(before, {"a": "2.5"})
+        YamlDocument("robot.yaml", other).check_against(before, {"a": "2.5"})
     before.with_values({"a": "2.5"}).check_against(before, {"a": "2.5"})
 
 
 def test_a_bomb_of_aliases_is_no_danger() -> None:
     text = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]\n" for i in range(1, 60)) + "gain: 1.0\n"
-    assert "gain: 2.5000\n" in ControllerFile("robot.yaml", text).with_values({"gain": "2.5000"}).text
+    assert "gain: 2.5000\n" in YamlDocument("robot.yaml", text).with_values({"gain": "2.5000"}).text

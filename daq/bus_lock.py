@@ -1,0 +1,111 @@
+"""One mover a bus: a lock that every recording and every job takes before it says anything to the drives.
+
+The locks are those of flock(2) on files in a folder of the system: they end with their process, however it ends. They
+keep out other programs of drivegain on this computer; somebody else's master is heard on the bus itself (BusBusy).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import stat
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from daq.configuration.cell import Bus, Cell
+from daq.errors import BusTaken, OutputFailed
+
+SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
+"""Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
+VIRTUAL = "virtual"
+"""python-can's bus within one process: a bus of that name in another process is another bus."""
+
+
+@contextmanager
+def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
+    """Keep all buses of a cell for oneself.
+
+    Args:
+        cell: its file; one without a bus needs no lock.
+        folder: of the lock files; the first folder of SHARED_FOLDERS that everybody may write into, when None.
+
+    Raises:
+        BusTaken: another recording or job has one of them.
+        OutputFailed: the lock file cannot be made.
+    """
+    where = folder or _shared_folder()
+    # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
+    buses = sorted({lock_name(bus): bus for bus in cell.buses}.items())
+    with ExitStack() as held:
+        for name, bus in buses:
+            held.enter_context(_held(where / name, bus))
+        yield
+
+
+def lock_name(bus: Bus) -> str:
+    """Of a bus's lock file: by its interface and channel, and of a hub by its host and port."""
+    parts = [bus.interface, bus.channel]
+    if bus.interface == "socketcand":
+        parts += [bus.host, str(bus.port)]
+    elif bus.interface == VIRTUAL:
+        parts.append(str(os.getpid()))
+    return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
+
+
+def _shared_folder() -> Path:
+    for folder in SHARED_FOLDERS:
+        with suppress(OSError):
+            if folder.stat().st_mode & stat.S_IWOTH:
+                return folder
+    return SHARED_FOLDERS[-1]
+
+
+@contextmanager
+def _held(lock: Path, bus: Bus) -> Iterator[None]:
+    """The file is removed at the end: whoever opened it just before sees by the inode that it has no name any more."""
+    while True:
+        try:
+            descriptor = _open(lock)
+        except OSError as error:
+            raise OutputFailed.of(lock, error) from error
+        try:
+            _take(descriptor, lock, bus)
+            if _is_at(descriptor, lock):
+                try:
+                    yield
+                finally:
+                    # In a shared folder it stays where another user made it.
+                    with suppress(OSError):
+                        lock.unlink()
+                return
+        finally:
+            os.close(descriptor)
+
+
+def _open(lock: Path) -> int:
+    """To read is enough to lock; and to open another user's file in a shared folder, O_CREAT must not be asked for."""
+    while True:
+        with suppress(FileNotFoundError):
+            return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        with suppress(FileExistsError):
+            return os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+
+
+def _take(descriptor: int, lock: Path, bus: Bus) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise BusTaken(
+            f"bus {bus.interface}:{bus.channel}",
+            found=f"another recording or job of drivegain on it (it holds {lock})",
+            expected="one at a time: two of them would move one robot",
+            remedy=f"wait for its end; `fuser {lock}` shows its process",
+        ) from error
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    return False

@@ -1,0 +1,246 @@
+"""The drives of a cell written with the gains of a calibration, and back again.
+
+The drives are written by drivers/parameter_write.py: without power, read back, saved, all of them or none. What stood
+there is on the disk before the first is touched (drive_record.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from daq.configuration.cell import Cell
+from daq.errors import BackupMissing, ControllerChanged, ControllerUnfit
+from daq.write_back.audit import AuditAction
+from daq.write_back.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
+from daq.write_back.drive_record import DriveNote, DriveRecord, read_record, read_records, record_folder, write_record
+from daq.write_back.one_writer import only_writer
+from daq.write_back.written_down import Chronicle
+from drivers.axis import Axis
+from drivers.network import CanopenNetwork
+from drivers.parameter import Parameter
+from drivers.parameter_write import (
+    ParameterChange,
+    ParameterValue,
+    ParameterWrite,
+    Saving,
+    read_parameters,
+    write_parameters,
+)
+
+_BEGINS_AND_ENDS = {
+    AuditAction.APPLY_BEGUN: AuditAction.APPLIED,
+    AuditAction.ROLLBACK_BEGUN: AuditAction.ROLLED_BACK,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class DrivesWritten:
+    """What was done to the drives.
+
+    Attributes:
+        target: what the audit calls them.
+        record: file with what stood there before.
+        changes: one a drive.
+        source: record that was gone back to; None for a calibration.
+    """
+
+    target: str
+    record: Path
+    changes: tuple[ParameterChange, ...]
+    source: Path | None = None
+
+
+def apply_to_drives(
+    proposal: DriveProposal,
+    network: CanopenNetwork,
+    now: datetime,
+    *,
+    saving: Saving = Saving.KNOWN,
+    audit: Path | None = None,
+    who: str = "",
+) -> DrivesWritten:
+    """Make a proposed change.
+
+    Drives that have these gains already are told to save them: that they stand in RAM does not say that they stay.
+
+    Args:
+        proposal: without refusals.
+        network: as in `propose_to_drives`.
+        now: for the record's name and the audit.
+        saving: whether the drives keep it.
+        audit, who: as in `daq.write_back.apply.apply`.
+
+    Raises:
+        CalibrationRefused: a gate is closed, with every one of them.
+        ControllerChanged: something else stands in the drives than when the change was worked out.
+        ControllerBusy: another drivegain writes them.
+        AuditUnusable: what is done could not be written down.
+        DriverError: see `drivers.parameter_write.write_parameters`.
+        OSError: the record could not be written; nothing was written to the drives.
+    """
+    if proposal.refusals:
+        Chronicle(audit, who, now).refusal(Path(drives_of(proposal.cell)), proposal.refusals, proposal.evidence)
+        raise refused(proposal)
+    details = {"drives": _documented(proposal.base, proposal.writes), **proposal.evidence}
+    with only_writer(_made(proposal.folder)):
+        return _write(
+            network, proposal.cell, proposal.folder, proposal.base, proposal.writes, saving, now,
+            begun=AuditAction.APPLY_BEGUN, audit=audit, who=who, details=details,
+        )  # fmt: skip
+
+
+def roll_back_drives(
+    declared: Cell,
+    network: CanopenNetwork,
+    now: datetime,
+    *,
+    saving: Saving = Saving.KNOWN,
+    audit: Path | None = None,
+    who: str = "",
+) -> DrivesWritten:
+    """Put back what stood in the drives before the last write that changed them, whole or cut off by a kill.
+
+    What it replaces is recorded too, so that a second way back undoes the first.
+
+    Raises:
+        BackupMissing: there is no record of such a write.
+        ControllerUnfit: its record was changed, or is of another cell.
+        ControllerChanged: a drive was exchanged, or somebody has changed a gain since.
+        ControllerBusy, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
+    """
+    folder = record_folder(declared)
+    with only_writer(_made(folder)):
+        paths = read_records(folder)
+        for path in reversed(paths):
+            record = read_record(path)
+            base = read_parameters(network, _recorded(declared, network, record))
+            # A writer that was killed before its first write leaves a record of what still stands.
+            if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
+                continue
+            _check_untouched(record, base)
+            writes = tuple(
+                ParameterWrite(value.axis, note.parameter, note.old)
+                for value, note in zip(base, record.drives, strict=True)
+            )
+            details = {"drives": _documented(base, writes), "restored": str(path)}
+            written = _write(
+                network, declared.name, folder, base, writes, saving, now,
+                begun=AuditAction.ROLLBACK_BEGUN, audit=audit, who=who, details=details,
+            )  # fmt: skip
+            return DrivesWritten(written.target, written.record, written.changes, path)
+    raise BackupMissing(
+        drives_of(declared.name),
+        found=f"{len(paths)} records of what stands there now" if paths else f"no record in {folder}",
+        expected="the record of a write that changed them",
+        remedy="nothing was written",
+    )
+
+
+def _write(
+    network: CanopenNetwork,
+    cell: str,
+    folder: Path,
+    base: tuple[ParameterValue, ...],
+    writes: tuple[ParameterWrite, ...],
+    saving: Saving,
+    now: datetime,
+    *,
+    begun: AuditAction,
+    audit: Path | None,
+    who: str,
+    details: Mapping[str, object],
+) -> DrivesWritten:
+    records: list[Path] = []
+
+    def begin(found: tuple[ParameterValue, ...]) -> None:
+        if digest(found) != digest(base):
+            raise ControllerChanged(
+                drives_of(cell),
+                found="other values in the drives, or other drives",
+                expected="those that the change was worked out for",
+                remedy="look at a new dry run; nothing was written",
+            )
+        records.append(write_record(folder, cell, now, who, _notes(found, writes)))
+
+    target = Path(drives_of(cell))
+    before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
+    ended = _BEGINS_AND_ENDS[begun]
+    with Chronicle(audit, who, now).of_write(begun, ended, target, before, after, {"saving": saving.value, **details}):
+        changes = write_parameters(network, writes, saving, begin)
+    return DrivesWritten(str(target), records[0], changes)
+
+
+def _recorded(declared: Cell, network: CanopenNetwork, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
+    axes = {(axis.name, axis.node_id): axis for axis in network.axes}
+    strangers = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
+    if record.cell != declared.name or strangers:
+        raise ControllerUnfit(
+            str(record.path),
+            found=f"a write to cell {record.cell!r}"
+            + (f", with {', '.join(strangers)} that this cell has not" if strangers else ""),
+            expected=f"one to the drives of cell {declared.name!r}",
+            remedy="nothing was written; has the cell file been changed since?",
+        )
+    return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
+
+
+def _check_untouched(record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
+    """Refuse where going back would lose what somebody else did."""
+    for value, note in zip(base, record.drives, strict=True):
+        told = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
+        if told != (note.vendor_id, note.product_code, note.serial):
+            raise ControllerChanged(
+                f"{note.axis} (node {note.node_id})",
+                found=f"another drive, with serial number {value.identity.serial}",
+                expected=f"the one that was written, with {note.serial}",
+                remedy="nothing was written; calibrate again after an exchange",
+            )
+        if value.word not in (note.old, note.new):
+            raise ControllerChanged(
+                f"{note.axis}, {note.parameter}",
+                found=f"{value.value:.9g}",
+                expected=f"{note.parameter.value(note.new):.9g} as drivegain wrote it, or "
+                f"{note.parameter.value(note.old):.9g} as before",
+                remedy=f"nothing was written: somebody has changed it since; {record.path} has the old values",
+            )
+
+
+def _notes(found: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> tuple[DriveNote, ...]:
+    return tuple(
+        DriveNote(
+            value.axis.name,
+            value.axis.node_id,
+            value.identity.vendor_id,
+            value.identity.product_code,
+            value.identity.serial,
+            value.parameter,
+            value.word,
+            write.word,
+        )
+        for value, write in zip(found, writes, strict=True)
+    )
+
+
+def _documented(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> list[dict[str, object]]:
+    """For the audit, which takes finite numbers only: the bits are whole."""
+    return [
+        {
+            "axis": value.axis.name,
+            "node_id": value.axis.node_id,
+            "serial": value.identity.serial,
+            "object": str(value.parameter),
+            "type": value.parameter.kind.value,
+            "old": value.word,
+            "new": write.word,
+        }
+        for value, write in zip(base, writes, strict=True)
+    ]
+
+
+def _made(folder: Path) -> Path:
+    """The folder of the records; its lock is beside it."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,113 @@
+"""The demo cell with gains in its simulated drives, for tests of writing there."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import can
+
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import drive_axes
+from daq.configuration.cell_file import load_cell
+from daq.configuration.controller_target import Controller, GainObject
+from daq.configuration.history_place import HistoryPlace
+from daq.configuration.simulation import load_simulation
+from drivers.axis import Axis
+from drivers.bus import BusAddress, open_bus
+from drivers.network import Bounds, CanopenNetwork
+from drivers.parameter import Parameter, ParameterKind
+from drivers.profile import Mapping
+from drivers.sdo import SdoPolicy
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.fault import FaultSpec
+from drivers.simulated.node import Node
+from tests.daq.calibrations import NAMEPLATE
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+WHOLE = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
+REAL = GainObject(Parameter(0x2003, 2, ParameterKind.F32), 1.0)
+
+
+def demo_cell(folder: Path, *objects: GainObject) -> Cell:
+    """The demo cell with its records in a folder, and the gains in these objects, or in 2003h:01 of all drives."""
+    cell = load_cell(CONFIGS / "cells" / "demo.yaml")
+    return replace(
+        cell,
+        controller=Controller(None, (), objects=objects or (WHOLE,) * len(cell.axes)),
+        history=HistoryPlace(folder / "demo.history.sqlite", folder / "demo.audit.jsonl"),
+    )
+
+
+@contextmanager
+def simulated(
+    address: BusAddress, *faults: FaultSpec, entered: tuple[float, ...] = NAMEPLATE
+) -> Iterator[SimulatedCell]:
+    """The demo cell, its drives with gains that somebody entered and faults."""
+    spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
+    axes = tuple(replace(axis, entered_gain_nm_per_a=gain) for axis, gain in zip(spec.axes, entered, strict=True))
+    bus: can.BusABC = open_bus(address)
+    try:
+        with SimulatedCell(replace(spec, axes=axes, faults=faults), bus) as cell:
+            yield cell
+    finally:
+        bus.shutdown()
+
+
+def network_of(cell: Cell, address: BusAddress, mapping: Mapping = Mapping.STORED) -> CanopenNetwork:
+    """To be entered; with short waits, and drives of which it is known that they save so."""
+    return CanopenNetwork(
+        address,
+        tuple(with_mapping(axis, mapping) for axis in drive_axes(cell)),
+        bounds=Bounds(answer_s=1.0, silence_s=0.3, listen_s=0.05),
+        policy=SdoPolicy(0.3, 3),
+    )
+
+
+def with_mapping(axis: Axis, mapping: Mapping) -> Axis:
+    """An axis whose drive does that with mappings when it saves."""
+    save = axis.profile.save
+    assert save is not None
+    return replace(axis, profile=replace(axis.profile, save=replace(save, mapping=mapping)))
+
+
+def entered_gain(node: Node, told: GainObject = WHOLE) -> float:
+    """What stands in a drive now [Nm/A]."""
+    word = int.from_bytes(node.read(told.parameter.index, told.parameter.subindex), "little")
+    return told.parameter.value(word) / told.factor
+
+
+def saved_gain(node: Node) -> float:
+    """What stands there after the next power-on [Nm/A]."""
+    value = node.saved.values[0x2003, 1]
+    assert isinstance(value, int)
+    return value / 1000.0
+
+
+class Listener:
+    """Hears every frame on a virtual bus."""
+
+    def __init__(self, address: BusAddress) -> None:
+        self._bus = open_bus(address)
+
+    def frames(self) -> list[can.Message]:
+        """All since the last call."""
+        heard = []
+        while (message := self._bus.recv(0.0)) is not None:
+            heard.append(message)
+        return heard
+
+    def downloads(self) -> list[tuple[int, int, int]]:
+        """Node, index and subindex of every SDO write since the last call."""
+        return [
+            (frame.arbitration_id - 0x600, *struct.unpack_from("<HB", bytes(frame.data), 1))
+            for frame in self.frames()
+            if 0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1
+        ]
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._bus.shutdown()

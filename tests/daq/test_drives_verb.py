@@ -1,0 +1,188 @@
+"""`drivegain apply --drives` and `rollback --drives`: what a person and a program are told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import typer
+
+from daq.bus_lock import bus_lock
+from daq.calibration_file import encode
+from daq.cli.applier import Applier
+from daq.cli.apply_drives import apply_drives, rollback_drives, saving_of
+from daq.configuration.cell import Bus, Cell
+from daq.errors import BusTaken, CalibrationRefused, UsageError
+from daq.history.store import HistoryStore
+from daq.write_back.audit import AuditAction, read
+from drivers.bus import BusAddress
+from drivers.parameter_write import Saving
+from drivers.sdo import ObjectAccess
+from drivers.simulated.cell import SimulatedCell
+from ident.calibration import Calibration
+from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
+from tests.daq.drives import demo_cell, entered_gain, saved_gain, simulated
+
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+DOER = Applier("Kim", "kim")
+
+
+@pytest.fixture
+def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
+    declared = demo_cell(tmp_path)
+    bus = Bus("the bus", "virtual", request.node.name, 1_000_000, "127.0.0.1", 29536)
+    return replace(
+        declared, folder=tmp_path, buses=(bus,), axes=tuple(replace(axis, bus="the bus") for axis in declared.axes)
+    )
+
+
+@pytest.fixture
+def simulation(cell: Cell) -> Iterator[SimulatedCell]:
+    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+        yield running
+
+
+def _apply(
+    cell: Cell,
+    *,
+    calibration: Calibration | None = None,
+    yes: bool = False,
+    base: str | None = None,
+    as_json: bool = False,
+    saving: Saving = Saving.KNOWN,
+) -> None:
+    calibration = calibration or demo_calibration()
+    assert cell.history is not None
+    apply_drives(
+        cell,
+        Path("cells/demo.yaml"),
+        calibration,
+        now=NOW,
+        doer=DOER,
+        policy=cell.apply,
+        configuration_changed=True,
+        entered_kg={},
+        looked_at=base,
+        appliers=DOER.names,
+        calibration_file=Path("calibration.yaml"),
+        calibration_content=encode(calibration),
+        saving=saving,
+        audit=cell.history.audit,
+        yes=yes,
+        json=as_json,
+    )
+
+
+def _back(cell: Cell, *, as_json: bool = False) -> None:
+    assert cell.history is not None
+    rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, json=as_json)
+
+
+def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
+    _apply(cell)
+    shown = capsys.readouterr().out
+    assert "in the drive" in shown
+    assert "node 4, 2003h:01: -11520 -> -9210" in shown
+    assert "Dry run, nothing was written." in shown
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    base = shown.split("--base ")[1].split()[0]
+
+    _apply(cell, yes=True, base=base)
+    told = capsys.readouterr().out
+    assert "Written to the drives and read back" in told
+    assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
+    _apply(cell)
+    assert "The drives have these gains already" in capsys.readouterr().out
+
+    _back(cell)
+    told = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in told
+    assert "The drives have saved." in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    assert cell.history is not None
+    assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
+        (action, "Kim (login kim)", "drives of cell demo")
+        for action in (
+            AuditAction.APPLY_BEGUN,
+            AuditAction.APPLIED,
+            AuditAction.ROLLBACK_BEGUN,
+            AuditAction.ROLLED_BACK,
+        )
+    ]
+    with HistoryStore(cell.history.store) as store:
+        assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_program_is_told_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
+    _apply(cell, as_json=True)
+    looked = json.loads(capsys.readouterr().out)
+    assert (looked["applied"], looked["refusals"]) == (False, [])
+    assert looked["changes"][3]["new"] == -9.21
+    _apply(cell, as_json=True, yes=True, saving=Saving.RAM)
+    written = json.loads(capsys.readouterr().out)
+    assert (written["applied"], written["saved"]) == (True, False)
+    assert written["base_sha256"] == looked["base_sha256"]
+    assert Path(written["record"]).is_file()
+    _back(cell, as_json=True)
+    assert json.loads(capsys.readouterr().out)["source"] == written["record"]
+
+
+@pytest.mark.parametrize("yes", [False, True])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_closed_gate_is_told_and_nothing_written(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], yes: bool, as_json: bool
+) -> None:
+    calibration = demo_calibration()
+    far = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
+    with pytest.raises(CalibrationRefused, match="J1: found σ"):
+        _apply(cell, calibration=far, yes=yes, as_json=as_json)
+    shown = capsys.readouterr().out
+    if as_json:
+        assert [one["gate"] for one in json.loads(shown)["refusals"]] == ["uncertainty"]
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+
+
+def test_an_interrupt_puts_back_what_was_written(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check = ObjectAccess.read
+    reads = 0
+
+    def interrupted(access: ObjectAccess, entry: object) -> int:
+        nonlocal reads
+        value = check(access, entry)  # type: ignore[arg-type]
+        if access.node_id == 3 and value == 24200:
+            reads += 1
+            if reads == 1:
+                raise KeyboardInterrupt
+        return value
+
+    monkeypatch.setattr(ObjectAccess, "read", interrupted)
+    with pytest.raises(typer.Exit) as caught:
+        _apply(cell, yes=True)
+    assert caught.value.exit_code == 130
+    assert "interrupted: kept: the old values stand again in J1, J2, J3" in capsys.readouterr().err
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_bus_that_somebody_else_has_is_left_alone(cell: Cell) -> None:
+    with bus_lock(cell), pytest.raises(BusTaken):
+        _apply(cell)
+    _apply(cell)
+
+
+def test_the_two_options_of_saving() -> None:
+    assert [saving_of(False, False), saving_of(True, False), saving_of(False, True)] == [
+        Saving.KNOWN,
+        Saving.RAM,
+        Saving.ANY,
+    ]
+    with pytest.raises(UsageError, match="one at most"):
+        saving_of(True, True)
