@@ -20,7 +20,13 @@ CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0
 """How long a server may take nothing; what was sent of a frame by then cannot be taken back."""
 _RECEIVE_BYTES = 1 << 16
-_FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]+) ([0-9]+\.?[0-9]*) ([0-9A-Fa-f]*)|([^>]*)) >")
+LONGEST_BYTES = 4096
+"""Of what may wait for its end; a frame has some 50. A server that never ends a message is none."""
+_LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16
+"""Hexadecimal digits."""
+_SHOWN = 60
+# Possessive, and never past the next '<': what does not match is given up after one look at each byte.
+_FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa-f]*+)|([^<>]*)) >")
 
 
 def send_line(message: can.Message) -> bytes:
@@ -63,6 +69,8 @@ class SocketcandBus(can.BusABC):
     def _expect(self, word: str) -> None:
         # Only up to the first '>': behind the last answer frames of the bus may follow at once.
         while b">" not in self._buffer:
+            if len(self._buffer) > LONGEST_BYTES:
+                raise can.CanInitializationError(self._endless(self._buffer))
             chunk = self._socket.recv(_RECEIVE_BYTES)
             if not chunk:
                 raise can.CanInitializationError(f"{self.channel_info}: closed during the handshake")
@@ -128,8 +136,12 @@ class SocketcandBus(can.BusABC):
                 if other.startswith(b"error"):
                     raise can.CanOperationError(f"{self.channel_info}: {other.decode('ascii', 'replace')}")
                 continue
-            if len(data) % 2:
-                raise can.CanOperationError(f"{self.channel_info}: half a byte in {match.group().decode('ascii')}")
+            if len(data) % 2 or len(data) > _LONGEST_DATA or len(identifier) > _LONGEST_IDENTIFIER:
+                shown = match.group()[:_SHOWN].decode("ascii")
+                raise can.CanOperationError(
+                    f"{self.channel_info}: a frame of {len(identifier)} digits of identifier and {len(data)} of data: "
+                    f"{shown}"
+                )
             self._received.append(
                 can.Message(
                     timestamp=float(seconds),
@@ -140,6 +152,14 @@ class SocketcandBus(can.BusABC):
                 )
             )
         self._buffer = buffer[end:]
+        if len(self._buffer) > LONGEST_BYTES:
+            raise can.CanOperationError(self._endless(self._buffer))
+
+    def _endless(self, buffer: bytes) -> str:
+        return (
+            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, beginning with "
+            f"{buffer[:_SHOWN]!r}: is this a socketcand server?"
+        )
 
     def shutdown(self) -> None:
         super().shutdown()

@@ -12,6 +12,7 @@ from ident.dataset import Dataset
 from ident.effects import EFFECTS, UNNAMED
 from ident.effects.effect import Effect
 from ident.effects.placed import PlacedEffect
+from ident.effects.settings import check_settings
 from ident.effects.torque import at_joints
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.link import LINK_PARAMETERS
@@ -106,7 +107,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     axes = tuple(gain.axis for gain in calibration.gains)
     if accepted.axis not in axes:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
-    placed = PlacedEffect(_rebuilt(accepted), axes.index(accepted.axis))
+    placed = PlacedEffect(_rebuilt(accepted, axes.index(accepted.axis), len(axes)), axes.index(accepted.axis))
     values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
     expected = tuple(column.name for column in placed.columns)
     if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
@@ -115,7 +116,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     return placed, np.array([values[name] for name in expected])
 
 
-def _rebuilt(accepted: AcceptedEffect) -> Effect:
+def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
@@ -123,6 +124,7 @@ def _rebuilt(accepted: AcceptedEffect) -> Effect:
     if not is_dataclass(known) or set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
+    check_settings(accepted.name, accepted.settings, axis, axes)
     # A file knows one kind of number; an order must be whole.
     given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:

@@ -29,6 +29,7 @@ from daq.report.current_signal import actual_current_note
 from daq.report.excitation import advice, cannot_tell, verdict_document
 from daq.report.fit import draw
 from daq.report.gain_table import gain_table, partial_note
+from daq.report.residual_summary import spelt
 from ident.calibration import Calibration
 from ident.comparison import Comparison
 from ident.estimate import Method
@@ -246,7 +247,7 @@ def error_table(fitted: Fit, calibration: Calibration) -> Table:
     rows = [("fit", calibration.relative_error_percent), ("unused", calibration.holdout_error_percent)]
     for name, error in rows:
         if error is not None:
-            table.add_row(name, *(f"{value:.2f}" for value in error.axes), f"{error.total:.2f}")
+            table.add_row(name, *map(spelt, (*error.axes, error.total)))
     return table
 
 

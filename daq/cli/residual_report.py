@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from daq.atomic_file import replace_file
 from daq.cli.verb import json_text
@@ -28,12 +29,14 @@ def check_report(folder: Path | None) -> None:
 
     Raises:
         OutputExists: it holds a file of one of these names that is no earlier report.
-        OutputFailed: it cannot be made.
+        OutputFailed: it cannot be made, or nothing can be written into it.
     """
     if folder is None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
     except OSError as error:
         raise OutputFailed.of(folder, error) from error
     for name, mark in _OURS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,25 +28,47 @@ ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTIO
 """States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
 
 
+FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+IN_FAULT = (
+    "An axis is in fault: its own display or tool says why, or an EMCY in the log of the last run (`drivegain "
+    "explain-emcy`). When the cause is gone, --reset-faults resets it; nothing moves."
+)
+
+
 def scan_verb(
     cell: Annotated[Path, typer.Argument(help="Cell file.")],
     wait: Annotated[float, typer.Option(help="How long to wait for answers [s].", min=0.05, max=60.0)] = 0.5,
+    reset_faults: Annotated[
+        bool,
+        typer.Option(
+            "--reset-faults",
+            help="Reset the fault of every axis that is in FAULT, by 6040h; it stays without power, and nothing moves.",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """List the nodes on the cell's buses with identity, name and state, beside what the cell configuration expects.
 
-    Each bus is searched by itself for every node id, so that an amplifier on the wrong one is found there.
+    Each bus is searched by itself for every node id, so that an amplifier on the wrong one is found there. Nothing is
+    changed but by --reset-faults: find out first why the axis is in fault.
     """
     declared = load_cell(cell)
-    found = {}
+    found, reset = {}, []
     for part in bus_parts(declared):
         axes = tuple(axis for axis in drive_axes(declared) if axis.node_id in part.node_ids)
         with CanopenNetwork(part.address, axes) as network:
             found[part.name] = network.scan(wait_s=wait)
+        faulty = tuple(axis for axis in axes if axis.node_id in _in_fault(found[part.name]))
+        if reset_faults and faulty:
+            with CanopenNetwork(part.address, faulty) as network:
+                network.reset_faults()
+            with CanopenNetwork(part.address, axes) as network:
+                found[part.name] = network.scan(wait_s=wait)
+            reset += [axis.name for axis in faulty]
     rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
         address = str(cell_address(declared))
-        print_json({"bus": address, "nodes": rows, "current": signals(declared)})
+        print_json({"bus": address, "nodes": rows, "reset": reset, "current": signals(declared)})
     else:
         console = Console(soft_wrap=True)
         console.print(scan_table(rows, console.width, several=len(found) > 1))
@@ -53,6 +76,10 @@ def scan_verb(
             if row["enabled"]:
                 name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
                 console.print(Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red"))
+        for name in reset:
+            console.print(Text(f"The fault of {printable(name)} was reset; it has no power."))
+        if any(row["in_fault"] for row in rows):
+            console.print(Text(IN_FAULT, "yellow"))
         note = actual_current_note(declared)
         if note is not None:
             console.print(Text(note, "yellow"))
@@ -83,6 +110,9 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
             verdict = f"belongs on {homes[node_id]}" if node_id in homes else "not configured"
         else:
             verdict = "ok" if expected is None or expected == identity else "other identity"
+        in_fault = node is not None and node.state in FAULTY
+        if in_fault:
+            verdict = "in fault" if verdict == "ok" else f"{verdict}, in fault"
         rows.append(
             {
                 "bus": bus,
@@ -95,10 +125,15 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
                 "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),
                 "state": None if node is None or node.state is None else str(node.state),
                 "enabled": None if node is None or node.state is None else node.state in ENABLED,
+                "in_fault": in_fault,
                 "verdict": verdict,
             }
         )
     return rows
+
+
+def _in_fault(found: Iterable[FoundNode]) -> frozenset[int]:
+    return frozenset(node.node_id for node in found if node.state is State.FAULT)
 
 
 _GAP = 3

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,8 @@ from daq.errors import UsageError
 from drivers.bus import BusAddress, open_answering_bus
 from drivers.hub import Hub
 from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.mounting import MountingCell
+from drivers.simulated.spec import CellSpec
 from drivers.split_bus import BusPart, SplitAddress, open_split_bus
 
 SHIPPED = ("demo", "clean", "seven-axis", "gantry")
@@ -46,13 +49,27 @@ def simulate(
         ),
     ] = None,
     port: Annotated[int, typer.Option(help="Of the hub; 0 takes a free one.", min=0, max=65535)] = 29536,
+    payload_from: Annotated[
+        Path | None,
+        typer.Option(
+            "--payload-from",
+            metavar="FILE",
+            help="File with the name of the mounted body, or none; read anew whenever all axes are without power.",
+        ),
+    ] = None,
 ) -> None:
     """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
 
     It prints the bus to write into the cell file of the other verbs, which then run in a second terminal.
     """
+    if payload is not None and payload_from is not None:
+        raise UsageError(
+            "--payload-from", found="--payload beside it", expected="one of the two", remedy="leave out one of them"
+        )
     shipped = simulation.name in SHIPPED and not simulation.exists()
-    spec = load_simulation(shipped_simulation(simulation.name) if shipped else simulation, payload)
+    truth = shipped_simulation(simulation.name) if shipped else simulation
+    mounted = None if payload_from is None else MountedFile(payload_from, partial(load_simulation, truth), _complain)
+    spec = load_simulation(truth, payload) if mounted is None else mounted.at_power_on()
     if faults is not None:
         shipped = faults.name == SHIPPED_FAULTS and not faults.exists()
         scenario = shipped_simulation(faults.name) if shipped else faults
@@ -68,13 +85,62 @@ def simulate(
         address = SplitAddress(parts) if bus else parts[0].address
         end = open_split_bus(address) if isinstance(address, SplitAddress) else open_answering_bus(address)
         stack.callback(end.shutdown)
-        cell = SimulatedCell(spec, end)
-        typer.echo(
-            f"{len(spec.axes)} amplifiers on {address}, payload {payload or 'none'}, "
-            f"{len(spec.faults) or 'no'} faults; Ctrl-C ends it"
-        )
+        cell = SimulatedCell(spec, end) if mounted is None else MountingCell(spec, end, mounted)
+        what = payload or "none" if payload_from is None else f"as {payload_from} says"
+        faulty = len(spec.faults) or "no"
+        typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
         typer.echo(how_to_reach(parts, spec.sync_period_us))
         cell.serve_forever()
+
+
+class MountedFile:
+    """What a file says is mounted; called, it reads the file again.
+
+    Args:
+        path: its first line is the name of a body, or none; nothing is mounted while there is no such file.
+        load: makes the description of the cell with a body.
+        complain: is told of a name that the simulation does not know; what was mounted stays.
+    """
+
+    def __init__(
+        self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
+    ) -> None:
+        self._path = path
+        self._load = load
+        self._complain = complain
+        self._said: str | None = None
+        self._spec: CellSpec | None = None
+
+    def at_power_on(self) -> CellSpec:
+        """The cell as the file has it now.
+
+        Raises:
+            UsageError: the simulation does not know the body.
+        """
+        self._said = self._read()
+        self._spec = self._load(self._said)
+        return self._spec
+
+    def __call__(self) -> CellSpec | None:
+        """The same object as before where nothing has changed."""
+        said = self._read()
+        if said != self._said:
+            self._said = said
+            try:
+                self._spec = self._load(said)
+            except UsageError as error:
+                self._complain(error)
+        return self._spec
+
+    def _read(self) -> str | None:
+        with suppress(OSError):
+            name = self._path.read_text(encoding="utf-8", errors="replace").partition("\n")[0].strip()
+            return None if name == "none" else name or self._said  # empty while it is being written
+        return None
+
+
+def _complain(error: UsageError) -> None:
+    typer.echo(f"{error}; what was mounted stays", err=True)
 
 
 def nodes_on_buses(said: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:

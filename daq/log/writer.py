@@ -78,7 +78,8 @@ class LogWriter:
     error the `.part` keeps everything up to that moment.
 
     Raises (on entry and later):
-        OutputExists: the log, or a `.part` of the same name, is there already.
+        OutputExists: the log, or a `.part` of the same name, is there already; or at the end, when somebody has put a
+            file there meanwhile: then the `.part` is the whole log.
         OutputFailed: the file system refuses.
     """
 
@@ -226,7 +227,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Finish and rename after success; keep the `.part` after an error, which goes on as it is."""
+        """Finish and take the name after success; keep the `.part` after an error, which goes on as it is."""
         try:
             with self._stream:
                 self.flush()
@@ -236,13 +237,35 @@ class LogWriter:
                 self._mcap.finish()
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
-            self.part.rename(self.path)
+            self._take_name()
             _sync_folder(self.path.parent)
         except (OSError, OutputFailed) as failure:
             if error is not None:  # it came first, and what a stop could not confirm is noted on it
                 error.add_note(f"kept: less than could be, {failure}")
                 return
             raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
+
+    def _take_name(self) -> None:
+        """Give the finished log its name, if nobody has taken it meanwhile: a rename would replace what is there."""
+        try:
+            self.path.hardlink_to(self.part)
+        except FileExistsError as error:
+            raise self._name_taken() from error
+        except OSError:  # a file system without hard links
+            if self.path.exists():
+                raise self._name_taken() from None
+            self.part.rename(self.path)
+        else:
+            self.part.unlink()
+
+    def _name_taken(self) -> OutputExists:
+        return OutputExists(
+            str(self.path),
+            found="a file of that name, which was not there when the recording began",
+            expected="none",
+            remedy=f"nothing was replaced: the whole recording is {self.part}; give it another name without "
+            f"{UNFINISHED}, or move the other file away",
+        )
 
     def _open(self) -> None:
         # Data CRCs protect attachments and metadata too, which stand outside chunks.

@@ -1,4 +1,4 @@
-"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, and reading logs.
+"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, reading logs, and a fleet.
 
 Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
 Each job runs in a child process of its own, and this one stays small: Linux counts what a parent holds to the peak of
@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.bench.fleet import told as fleet_told
 from tests.bench.log_reading import told
 
 OUT = Path("out/bench")
@@ -34,17 +35,19 @@ ENVIRONMENT = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREA
 
 
 def main() -> int:
-    """All four, one after the other."""
+    """All five, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3, help="of the comparison with figaroh; the median counts")
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="samples, of the growth")
     parser.add_argument("--hour", type=int, default=3600, help="seconds of the long log that is read")
+    parser.add_argument("--cells", type=int, default=200, help="of the fleet")
     arguments = parser.parse_args()
     OUT.mkdir(parents=True, exist_ok=True)
     comparison = _comparison(arguments.repeats)
     growth = _growth(tuple(size for size in SIZES if size <= arguments.largest))
     whole_fit = _whole_fit(arguments.repeats)
     log_reading = _log_reading(arguments.hour)
+    fleet = _fleet(arguments.cells, arguments.repeats)
     result = {
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": _machine(),
@@ -52,6 +55,7 @@ def main() -> int:
         "growth": growth,
         "fit": whole_fit,
         "log_reading": log_reading,
+        "fleet": fleet,
     }
     RESULT.write_text(json.dumps(result, indent=2) + "\n")
     _tell(f"\nwritten: {RESULT}")
@@ -133,6 +137,15 @@ def _log_reading(hour_s: int) -> dict[str, Any]:
     _tell("")
     found = _json_of([sys.executable, "-m", "tests.bench.log_reading", "--json", "--hour", str(hour_s)])
     _tell(told(found))
+    return found
+
+
+def _fleet(cells: int, repeats: int) -> dict[str, Any]:
+    _tell(f"\n`drivegain fleet` on {cells} simulated cells, wall time of whole commands")
+    found = _json_of(
+        [sys.executable, "-m", "tests.bench.fleet", "--json", "--cells", str(cells), "--repeats", str(repeats)]
+    )
+    _tell(fleet_told(found))
     return found
 
 

@@ -169,6 +169,47 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         write(tmp_path / "none" / "a.mcap", content(1), samples([[0]]))
 
 
+@pytest.mark.parametrize("links", [True, False], ids=["hard links", "none"])
+def test_a_file_that_appeared_meanwhile_is_not_replaced(
+    tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not links:
+        _without_hard_links(monkeypatch)
+    path = tmp_path / "a.mcap"
+
+    def record() -> None:
+        with LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
+            for sample in samples([[number] for number in range(5)]):
+                log.write(sample)
+            log.conclude(True)
+            path.write_bytes(b"somebody else's")
+
+    with pytest.raises(OutputExists, match=r"a\.mcap\.part") as told:
+        record()
+    assert path.read_bytes() == b"somebody else's"
+    assert "which was not there" in told.value.found
+    path.unlink()
+    (tmp_path / "a.mcap.part").rename(path)
+    log = read_log(path)
+    assert (len(log.samples.cycle), log.partial) == (5, False)
+
+
+def test_a_file_system_without_hard_links_gives_the_name_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _without_hard_links(monkeypatch)
+    path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
+    assert len(read_log(path).samples.cycle) == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def _without_hard_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_self: Path, _target: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")  # as FAT says it (link(2), EPERM)
+
+    monkeypatch.setattr(Path, "hardlink_to", refused)
+
+
 @pytest.mark.parametrize(
     "sample",
     [Sample(0, 0, (1, 2), (1, 2), (0, 0)), Sample(0, 0, (2**31,), (0,), (0,)), Sample(-1, 0, (0,), (0,), (0,))],

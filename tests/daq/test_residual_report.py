@@ -23,6 +23,7 @@ from daq.configuration.cell_file import load_cell
 from daq.effect_words import WORDS, in_words, other_axis, placed_name
 from daq.errors import ExitCode, OutputExists, OutputFailed
 from daq.fit import Fit, calibration_of, fit
+from daq.report.html import page, paragraph, table
 from daq.report.residual_document import residual_document
 from daq.report.residual_page import residual_page
 from daq.report.residual_summary import fell, summary
@@ -302,6 +303,33 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
     occupied.write_text("", encoding="utf-8")
     with pytest.raises(OutputFailed, match="file"):
         check_report(occupied)
+
+
+def test_a_folder_that_takes_no_file_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    # As a file system says it to everybody but root, who may write anywhere.
+    monkeypatch.setattr("daq.cli.residual_report.TemporaryFile", refused)
+    assert main(["residual", "no.mcap", "--report", str(tmp_path)]) == ExitCode.UNEXPECTED
+    assert "permission denied" in capsys.readouterr().err
+    monkeypatch.undo()
+    check_report(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"])
+def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
+    text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen], [[unseen, unseen]])])
+    assert unseen not in text
+    assert f"<h1>a\\u{ord(unseen):04x}b</h1>" in text
+    text.encode()
+
+
+def test_what_is_seen_stays_as_it_is() -> None:
+    assert paragraph("‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext") == "<p>‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext</p>"
 
 
 def test_a_disk_that_fails_leaves_the_old_report(

@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 
 import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from daq.cli import main
 from daq.cli.scan import scan_rows, scan_table
 from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import bundle, cell_from_bundle, load_cell
+from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.errors import ExitCode
 from drivers.axis import Identity
+from drivers.bus import open_bus
 from drivers.scan import FoundNode
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.drive import ErrorCode
+from drivers.simulated.power_state import PowerState
 from tests.two_buses import on_two_buses
 
 
@@ -51,7 +60,9 @@ def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled:
     nodes = (_node(1, 0x250), _node(2, statusword))
     rows = scan_rows(cell, nodes, "demo")
     assert [row["enabled"] for row in rows] == [False, enabled, None, None, None, None]
-    assert [row["verdict"] for row in rows] == ["ok", "ok", *["missing"] * 4]
+    in_fault = statusword in {0x0208, 0x020F}
+    assert [row["in_fault"] for row in rows] == [False, in_fault, *[False] * 4]
+    assert [row["verdict"] for row in rows] == ["ok", "in fault" if in_fault else "ok", *["missing"] * 4]
     for width in (40, 80, 200):
         text = _shown(cell, nodes, width)
         assert ("ENABLED" in text) is bool(enabled)
@@ -69,6 +80,33 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> Non
 def test_identity_and_power_are_told_apart(cell: Cell) -> None:
     (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
     assert (row["verdict"], row["enabled"]) == ("other identity", True)
+
+
+def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:
+    (row, *_) = scan_rows(cell, (_node(1, 0x208, serial=9),), "demo")
+    assert row["verdict"] == "other identity, in fault"
+
+
+def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
+    checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = str(checkout / "configs/cells/demo.yaml")
+    spec = load_simulation(shipped_simulation("clean"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
+        simulated.nodes[2].drive.fail(ErrorCode.FOLLOWING_ERROR)
+        assert main(["scan", file]) == ExitCode.OK
+        shown = capsys.readouterr().out
+        assert "in fault" in shown
+        assert "--reset-faults" in shown
+        assert simulated.nodes[2].drive.state is PowerState.FAULT
+        assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
+        told = json.loads(capsys.readouterr().out)
+        assert told["reset"] == ["J3"]
+        assert [node["verdict"] for node in told["nodes"]] == ["ok"] * 6
+        assert [node.drive.state for node in simulated.nodes] == [PowerState.SWITCH_ON_DISABLED] * 6
+        # Asked of a cell without a fault it does nothing.
+        assert main(["scan", file, "--reset-faults"]) == ExitCode.OK
+        assert "was reset" not in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -9,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from daq.configuration.yaml_file import StrictModel, parse_yaml, read_model
-from daq.errors import ConfigurationError, SchemaMismatch, YamlInvalid
+from daq.configuration.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationError, ConfigurationMissing, SchemaMismatch, YamlInvalid
 
 
 class _Limits(StrictModel):
@@ -122,3 +124,39 @@ def test_any_bytes_give_a_document_or_a_named_error(data: bytes) -> None:
         read_model(parse_yaml(data, "file.yaml"), _File)
     except ConfigurationError as error:
         assert error.subject.startswith("file.yaml")
+
+
+def test_a_pipe_or_a_device_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    # Opened for reading as usual, the one would be waited for, and the other never end.
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ConfigurationMissing, match="a pipe, a device or a socket"):
+            read_bytes(path)
+
+
+def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "large.yaml"
+    with path.open("wb") as stream:
+        stream.truncate(2**40)  # a hole: it would fill the memory, not the disk
+    with pytest.raises(ConfigurationMissing, match=f"more than {MAX_BYTES} bytes"):
+        read_bytes(path)
+    with path.open("wb") as stream:
+        stream.truncate(MAX_BYTES)
+    assert len(read_bytes(path)) == MAX_BYTES
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationMissing, match="directory"):
+        read_bytes(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])
+def test_an_integer_that_nothing_can_hold_is_told(text: str) -> None:
+    with pytest.raises(YamlInvalid):
+        _read(f"axes:\n  - {{name: J1, limits: {{velocity_deg_s: {text}}}}}\n")
+
+
+@given(st.integers(-(2**64) + 1, 2**64 - 1))
+def test_every_other_integer_is_what_was_written(value: int) -> None:
+    written = f"0x{value:x}" if value >= 0 else str(value)
+    assert parse_yaml(f"a: {written}".encode(), "x").tree == {"a": value}

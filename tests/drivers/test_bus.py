@@ -146,6 +146,55 @@ def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pyt
     end.shutdown()
 
 
+ENDLESS = {
+    "nothing": b"x" * 100_000,
+    "beginnings": b"< " * 50_000,
+    "a frame": b"< frame 123 1.0 " + b"0" * 100_000,
+    "digits": b"< frame 123 " + b"1" * 100_000,
+    "an identifier": b"< frame " + b"1" * 100_000,
+}
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_a_server_that_never_ends_a_message_is_told_and_not_parsed_ever_slower(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    with theirs:
+        theirs.sendall(ENDLESS[kind])
+        with pytest.raises(can.CanOperationError, match=r"without the end of a message.*socketcand server"):
+            for _ in range(100):
+                end.recv(WAIT_S)
+    end.shutdown()
+
+
+def test_a_handshake_without_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi" + b" " * 100_000)
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    with theirs, pytest.raises(can.CanInitializationError, match="without the end of a message"):
+        SocketcandBus("can0", HOST, 1)
+
+
+@pytest.mark.parametrize("said", ["< frame 123456789 1.0 00 >", "< frame 123 1.0 000000000000000000 >"])
+def test_a_frame_that_no_bus_carries_is_told(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    with theirs:
+        theirs.sendall(said.encode())
+        with pytest.raises(can.CanOperationError, match="a frame of"):
+            end.recv(WAIT_S)
+    end.shutdown()
+
+
 def test_remote_frames_are_refused_where_the_protocol_has_none() -> None:
     with Hub(("can0",)) as hub:
         end = open_bus(hub.address())

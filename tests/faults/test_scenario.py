@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -18,7 +19,9 @@ from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode
 from daq.log.reader import read_log
 from drivers.bus import open_bus
 from drivers.event import EventKind
+from drivers.hub import Hub
 from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.errors import SpecInvalid
 from drivers.simulated.fault import FaultKind, FaultSpec
 from drivers.simulated.power_state import PowerState
 from drivers.simulated.spec import CellSpec
@@ -182,3 +185,21 @@ def test_a_wrong_scenario_file_is_refused_with_its_line(
 def test_the_help_of_simulate_shows_how_to_give_a_scenario(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == ExitCode.OK
     assert "drivegain simulate demo --payload disc --faults faults-example" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "times",
+    ["at_s: 1e308", "at_s: 1, for_s: 1e300", "at_cycle: 18446744073709551615", "at_s: 0, cycles: 1000000000001"],
+)
+def test_a_time_that_no_cell_lives_to_see_is_told(times: str, tmp_path: Path) -> None:
+    path = tmp_path / "scenario.yaml"
+    path.write_text(f"faults:\n  - {{fault: silent, axis: J1, {times}}}\n", encoding="utf-8")
+    with pytest.raises(SchemaMismatch, match="less than or equal to"):
+        load_scenario(path, 6, 1000)
+
+
+@pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.ERROR_PASSIVE])
+def test_a_fault_that_the_hub_cannot_carry_is_told_before_anybody_moves(kind: FaultKind) -> None:
+    spec = replace(load_simulation(shipped_simulation("clean")), faults=(FaultSpec(kind, at_cycle=5),))
+    with Hub(("can0",)) as hub, open_bus(hub.address()) as bus, pytest.raises(SpecInvalid, match=kind.value):
+        SimulatedCell(spec, bus)

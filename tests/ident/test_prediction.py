@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -12,9 +13,12 @@ from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.dataset import Dataset, differentiate, planned
+from ident.effects import EFFECTS, UNNAMED
+from ident.effects.abscissa import Abscissa
 from ident.effects.cogging import Cogging
 from ident.effects.load_friction import LoadFriction
 from ident.effects.placed import PlacedEffect
+from ident.effects.settings import check_settings
 from ident.effects.spring import Spring
 from ident.effects.stribeck import Stribeck
 from ident.effects.warm_up import WarmUp
@@ -222,6 +226,42 @@ STIFFNESS = Parameter("spring stiffness 3", 1.0, 0.0, "Nm/rad")
 def test_an_effect_that_does_not_exist_is_refused(effect: AcceptedEffect, words: str) -> None:
     with pytest.raises(EffectRefused, match=words):
         placed_effect(effect, _calibration(GAINS, ()))
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("coupling", {"other_axis": 99, "sense": 1}, "other_axis = 99; it is the number of another of the 6 axes"),
+        ("coupling", {"other_axis": 3, "sense": 1}, "other_axis = 3"),
+        ("coupling", {"other_axis": 0, "sense": 1}, "other_axis = 0"),
+        ("coupling", {"other_axis": 2.5, "sense": 1}, "other_axis = 2.5"),
+        ("coupling", {"other_axis": 4, "sense": 0}, "sense = 0"),
+        ("inertial-coupling", {"other_axis": -1}, "other_axis = -1"),
+        ("stribeck", {"speed_rad_s": 0.0}, "speed_rad_s = 0; it lies between"),
+        ("stribeck", {"speed_rad_s": np.nan}, "finite"),
+        ("nonlinear-viscous", {"exponent": -2.0}, "exponent = -2"),
+        ("nonlinear-viscous", {"exponent": np.inf}, "finite"),
+        ("load-friction", {"speed_exponent": -1}, "speed_exponent = -1"),
+        ("cogging", {"order": -3}, "order = -3"),
+        ("cogging", {"order": 1e9}, "order = 1e"),
+        ("warm-up", {"time_constant_s": -20.0, "whole_session": 0}, "time_constant_s = -20"),
+        ("warm-up", {"time_constant_s": 20.0, "whole_session": 7}, "whole_session = 7"),
+        ("smooth-velocity", {"lower": 1.0, "upper": 1.0, "signed": 0, "other_axis": 0}, "must not be empty"),
+        ("smooth-velocity", {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 2}, "no other axis"),
+        ("smooth-other-velocity", {"lower": 0.0, "upper": 1.0, "signed": 0, "other_axis": 0}, "other_axis = 0"),
+    ],
+)
+def test_settings_that_no_effect_has_are_refused(name: str, settings: dict[str, float], words: str) -> None:
+    with pytest.raises(EffectRefused, match=words):
+        placed_effect(AcceptedEffect(name, "J3", settings, (), 1.0, 1.0), _calibration(GAINS, ()))
+
+
+def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -> None:
+    for effect in (*chain.from_iterable(EFFECTS), *UNNAMED):
+        given_ = dict(effect.settings)
+        if effect.abscissa is Abscissa.OTHER_VELOCITY:
+            given_["other_axis"] = given_["other_axis"] or 2
+        check_settings(effect.name, given_, 0, 12)
 
 
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:
