@@ -1,0 +1,112 @@
+"""`drivegain install-units`: let systemd or cron run the cell's scheduled recalibration. A dry run at first."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daq.atomic_file import replace_file
+from daq.cli.verb import Verb
+from daq.configuration.cell_file import load_cell
+from daq.errors import OutputExists, OutputFailed, UsageError
+from daq.recalibration.preflight import section_of, target_of
+from daq.recalibration.units import MARK, Installation, Unit, cron_line, next_commands, units_of
+
+SYSTEM, OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
+
+
+def install_units(
+    cell: Annotated[Path, typer.Option(help="Cell file with `recalibration`.")],
+    to: Annotated[
+        Path | None,
+        typer.Option("--to", help="Folder of the units; /etc/systemd/system, or the user's, where it is not given."),
+    ] = None,
+    user: Annotated[bool, typer.Option("--user", help="Units of this user, not of the system.")] = False,
+    schedule: Annotated[
+        str, typer.Option(help="When: weekly, daily, or a calendar expression of systemd such as 'Sun 03:00'.")
+    ] = "weekly",
+    cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Write the units; without it they are only shown.")] = False,
+) -> None:
+    """Make a service and a timer for `drivegain recalibrate`; nothing is enabled, the last lines say how to.
+
+    The timer never makes up for a date that it missed, and the job's interlock is asked before every motion.
+    """
+    declared = load_cell(cell)
+    section, _ = section_of(declared), target_of(declared)
+    wanted = Installation(cell.resolve(), program(), schedule, user, owner_of(cell.resolve()))
+    if cron:
+        typer.echo(cron_line(wanted))
+        return
+    folder = to or (Path.home() / OF_USER if user else SYSTEM)
+    units = units_of(declared, section, wanted)
+    for unit in units:
+        require_ours(folder / unit.name)
+    if yes:
+        _write(folder, units)
+    for unit in units:
+        typer.echo(f"Written: {folder / unit.name}" if yes else f"# {folder / unit.name}\n{unit.text}")
+    typer.echo("Then:" if yes else "Dry run, nothing was written. To write this, repeat the command with --yes; then:")
+    for command in next_commands(wanted, units[1], folder):
+        typer.echo(f"  {command}")
+
+
+def program() -> Path:
+    """The command that a timer must call, where it is.
+
+    Raises:
+        UsageError: drivegain is not installed as a command.
+    """
+    beside = Path(sys.executable).parent / "drivegain"
+    found = beside if beside.exists() else shutil.which("drivegain")
+    if found is None:
+        raise UsageError(
+            "drivegain",
+            found=f"no such command beside {sys.executable} and none on the path",
+            expected="an installed drivegain: a timer must find it",
+            remedy="install it (`pip install .`), then repeat this",
+        )
+    return Path(found).absolute()
+
+
+def owner_of(path: Path) -> str:
+    """Name of a file's owner, or the number of one without a name."""
+    try:
+        return path.owner()
+    except KeyError:
+        return str(path.stat().st_uid)
+
+
+def require_ours(path: Path) -> None:
+    """Refuse to replace a file that this verb has not made.
+
+    Raises:
+        OutputExists: it is somebody else's.
+    """
+    try:
+        ours = not path.exists() or path.read_text(encoding="utf-8", errors="replace").startswith(MARK)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    if not ours:
+        raise OutputExists(
+            str(path),
+            found="a unit that drivegain did not make",
+            expected="no such file, or one of an earlier `install-units`",
+            remedy="name another folder with --to, or move it away",
+        )
+
+
+def _write(folder: Path, units: tuple[Unit, ...]) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for unit in units:
+            replace_file(folder / unit.name, unit.text.encode())
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+
+
+INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units --cell cells/demo.yaml --schedule weekly")

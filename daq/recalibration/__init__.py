@@ -1,0 +1,1 @@
+"""The scheduled recalibration: preflight, record, fit, decide, propose or apply, report."""

@@ -1,0 +1,63 @@
+"""From a session's logs to its calibration and its report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from daq.calibration_file import load, save
+from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, DataError, OutputFailed
+from daq.fit import calibration_of
+from daq.recalibration import session as sessions
+from daq.recalibration.journal import Journal, Level
+from daq.recalibration.recording import Cellside, log_of
+from daq.recalibration.session import CALIBRATION, REPORT, Fitted, Outcome, Session, digest_of
+from daq.report.fit import start_of
+from daq.report.residual_summary import summary
+from ident.calibration import Calibration
+from ident.errors import IdentificationError
+
+
+def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Session, Calibration]:
+    """Fit the logs, close the loop, and write calibration and report; nothing where that was done before.
+
+    Raises:
+        DataError, IdentificationError: the recordings cannot be used; the session is over.
+        OutputFailed: the file system refuses.
+    """
+    done = calibration_of_session(session)
+    if done is not None:
+        return session, done
+    logs = [log_of(session, run.name) for run in side.section.runs if not run.holdout]
+    unseen = [log_of(session, run.name) for run in side.section.runs if run.holdout]
+    journal.say(Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen])
+    try:
+        fitted = side.tools.fit(logs, holdout=unseen)
+        closed = side.tools.close_loop(fitted, side.section.seed, lambda step: journal.say(Level.INFO, step))
+        changed = side.tools.account(start_of(closed), closed.steps)
+    except (DataError, IdentificationError):
+        # The same logs would end in the same way: the next job records others.
+        sessions.save(replace(session, state=session.state.with_(outcome=Outcome.UNFIT)))
+        raise
+    calibration = calibration_of(closed, side.tools.now())
+    path, report = session.folder / CALIBRATION, session.folder / REPORT
+    try:
+        save(calibration, path)
+        report.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    side.tools.save_report(closed, changed, calibration, report)
+    fit = Fitted(calibration_sha256=digest_of(path) or "", sentences=summary(closed, changed))
+    for sentence in fit.sentences:
+        journal.say(Level.INFO, "found", text=sentence)
+    return sessions.save(replace(session, state=session.state.with_(fitted=fit))), calibration
+
+
+def calibration_of_session(session: Session) -> Calibration | None:
+    """The calibration that the state speaks of, None where there is none or where the file is another one."""
+    path, fitted = session.folder / CALIBRATION, session.state.fitted
+    if fitted is None or digest_of(path) != fitted.calibration_sha256:
+        return None
+    try:
+        return load(path)
+    except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
+        return None

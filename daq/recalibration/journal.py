@@ -1,0 +1,121 @@
+"""What a job says while it runs: one line an event, for a person, a program or the system's journal.
+
+Under systemd a line is JSON behind ``<N>``, its priority (sd-daemon(3)). That is chosen before the journal's own
+protocol because it is one write to the stream that we were given: no socket that may be full or absent, no limit of a
+datagram, and the order of everything else that goes to that stream is kept. ``journalctl -p err`` finds what is wrong,
+and ``journalctl -o cat | jq`` reads the fields.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import Enum, IntEnum
+from typing import TextIO
+
+
+class Level(IntEnum):
+    """Priorities of syslog (RFC 5424, table 2)."""
+
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
+class Form(Enum):
+    """Who reads the lines."""
+
+    TEXT = "text"
+    """A person at a terminal."""
+    JSON = "json"
+    """A program."""
+    JOURNAL = "journal"
+    """systemd-journald, which takes the priority off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Journal:
+    """Where events go.
+
+    Attributes:
+        stream: that lines are written to.
+        form: of the lines.
+        now: wall clock with time zone.
+        session, step: of what is said from here on.
+    """
+
+    stream: TextIO
+    form: Form
+    now: Callable[[], datetime]
+    session: str = ""
+    step: str = ""
+
+    def within(self, *, session: str | None = None, step: str | None = None) -> Journal:
+        """The same journal, in a session or a step of it."""
+        return replace(
+            self,
+            session=self.session if session is None else session,
+            step=self.step if step is None else step,
+        )
+
+    def say(self, level: Level, event: str, /, **fields: object) -> None:
+        """Write one event.
+
+        Args:
+            level: how much it matters.
+            event: what happened, always in the same words.
+            fields: plain JSON; what JSON has no word for is spelt as text.
+        """
+        at = self.now().isoformat(timespec="milliseconds")
+        if self.form is Form.TEXT:
+            told = ", ".join(f"{name} {_text(value)}" for name, value in fields.items())
+            line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + told if told else ''}"
+        else:
+            known = {"session": self.session, "step": self.step}
+            named = {key: value for key, value in known.items() if value}
+            entry = {"time": at, "level": level.name.lower(), "event": event, **named, **fields}
+            line = json.dumps(_plain(entry), ensure_ascii=False, allow_nan=False, default=str)
+            if self.form is Form.JOURNAL:
+                line = f"<{int(level)}>{line}"
+        # A reader that has gone is no reason to leave a robot half-way through its job.
+        with suppress(OSError, ValueError):
+            self.stream.write(line + "\n")
+            self.stream.flush()
+
+
+def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
+    """What the reader of a stream takes.
+
+    Args:
+        stream: standard error.
+        environment: of this process; systemd names device and inode of the stream that it reads in JOURNAL_STREAM
+            (systemd.exec(5)), so that one which was redirected since is told from it.
+    """
+    if stream.isatty():
+        return Form.TEXT
+    with suppress(OSError, ValueError):
+        found = os.fstat(stream.fileno())
+        if environment.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}":
+            return Form.JOURNAL
+    return Form.JSON
+
+
+def _text(value: object) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return "".join(letter if letter.isprintable() else " " for letter in text)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value

@@ -1,0 +1,220 @@
+"""The recordings of a session: their plans, the warm-up before them, and what is left of those that were cut short."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from daq.configuration.cell import Cell
+from daq.configuration.controller_target import Controller
+from daq.configuration.history_place import HistoryPlace
+from daq.configuration.recalibration import PlannedRun, Recalibration
+from daq.errors import ConfigurationError, LogUnreadable, OutputFailed, RunInvalid
+from daq.log.framing import UNFINISHED
+from daq.plan import Plan
+from daq.plan_file import load_plan, save_plan
+from daq.recalibration.journal import Journal, Level
+from daq.recalibration.release import mount, require_release
+from daq.recalibration.session import RecordedRun, Session, digest_of, save
+from daq.recalibration.tools import Tools
+from daq.record import Recorded
+from daq.salvage import salvage
+from drivers.network import Undisturbed
+from ident.payload import Payload
+
+WARM_UP = "warm-up"
+
+
+@dataclass(frozen=True, slots=True)
+class GainTarget:
+    """The controller whose file a job writes, and where it is written down.
+
+    Attributes:
+        controller: as the cell file has it.
+        file: of it, absolute.
+        history: of the cell.
+    """
+
+    controller: Controller
+    file: Path
+    history: HistoryPlace
+
+
+@dataclass(frozen=True, slots=True)
+class Cellside:
+    """What every recording of a job needs.
+
+    Attributes:
+        file, cell, section: the cell file, what it says, and its `recalibration`.
+        target: what the gains found are compared with, and where they go.
+        tools: the functions of other rooms.
+        who: the job, by a name that a person recognises.
+        undisturbed: keeps signals from the stop of the axes.
+    """
+
+    file: Path
+    cell: Cell
+    section: Recalibration
+    target: GainTarget
+    tools: Tools
+    who: str
+    undisturbed: Undisturbed
+
+
+def log_of(session: Session, name: str) -> Path:
+    """Where the log of a run is."""
+    return session.folder / f"{name}.mcap"
+
+
+def standing_runs(session: Session) -> Session:
+    """The session without the runs whose logs are not what its state says."""
+    runs = tuple(run for run in session.state.runs if digest_of(log_of(session, run.name)) == run.sha256)
+    return replace(session, state=session.state.with_(runs=runs))
+
+
+def record_runs(side: Cellside, session: Session, journal: Journal) -> Session:
+    """Make all recordings that the session does not have yet; its state is written after each of them.
+
+    Raises:
+        MountFailed, NotReleased: before a run; what was recorded until then stands.
+        RunInvalid: its recorder does not stand for a run, however often it was made.
+        DriverError, OutputFailed, ConfigurationError: see `daq.record`.
+    """
+    session = standing_runs(session)
+    made = {run.name for run in session.state.runs}
+    left = [planned for planned in side.section.runs if planned.name not in made]
+    plans = {planned.name: _plan(side, session, planned, journal.within(step="plan")) for planned in left}
+    warm = not left
+    for planned in left:
+        told = journal.within(step=f"record {planned.name}")
+        mount(side.section, planned, side.tools.run)
+        told.say(Level.INFO, "mounted", payload=planned.payload or "none")
+        if not warm:
+            _warm_up(side, session, planned, plans[planned.name], journal.within(step=WARM_UP))
+            warm = True
+        run = _record_valid(side, session, planned, plans[planned.name], told)
+        session = save(replace(session, state=session.state.with_(runs=(*session.state.runs, run))))
+    return session
+
+
+def _plan(side: Cellside, session: Session, planned: PlannedRun, journal: Journal) -> Plan:
+    """Approved moves, or those of the seed; a plan of this session is made once."""
+    if planned.plan_file is not None:
+        return load_plan(planned.plan_file, side.cell)
+    path = session.folder / f"plan-{planned.seed}-{planned.duration_s:g}s.yaml"
+    if path.exists():
+        with suppress(ConfigurationError):  # what was damaged is made again
+            return load_plan(path, side.cell)
+    journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
+    try:
+        save_plan(side.tools.plan(side.cell, seed=planned.seed, duration_s=planned.duration_s), path)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    return load_plan(path, side.cell)  # as a person can read it
+
+
+def _warm_up(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> None:
+    """Make a run's moves without keeping its log until the joints are as warm as the later runs will find them.
+
+    It is recorded all the same: in the same way, with the same supervision.
+    """
+    passes = math.ceil(60.0 * side.section.warm_up_min / plan.duration_s)
+    for number in range(1, passes + 1):
+        journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
+        out = log_of(session, WARM_UP)
+        out.unlink(missing_ok=True)
+        out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+        _record(side, planned, plan, out)
+        out.unlink()
+
+
+def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> RecordedRun:
+    out = log_of(session, planned.name)
+    lost, missing = 0, (0,) * len(side.cell.axes)
+    for attempt in range(1, side.section.retries + 2):
+        _set_aside(out, journal)
+        journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
+        log = (recorded := _record(side, planned, plan, out)).log
+        for warning in recorded.warnings:
+            journal.say(Level.WARNING, "warning of the recorder", text=warning)
+        lost += log.lost_cycles
+        missing = tuple(one + other for one, other in zip(missing, log.missing, strict=True))
+        if log.valid:
+            journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
+            return RecordedRun(
+                name=planned.name,
+                sha256=digest_of(out) or "",
+                attempts=attempt,
+                samples=log.samples,
+                lost_cycles=lost,
+                missing=missing,
+            )
+        journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
+    raise RunInvalid(
+        str(out),
+        found=f"{side.section.retries + 1} recordings, none without losses (the last: {log.reason})",
+        expected="one that its recorder stands for",
+        remedy="see to the bus and to the load of this computer; the next job records this run again",
+    )
+
+
+def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
+    """One recording, after the interlock has said yes to it."""
+    require_release(side.section.interlock, side.tools.run, side.tools.now(), side.section.working_folder)
+    return side.tools.record(
+        side.file,
+        side.cell,
+        plan,
+        out,
+        payload=payload_of(side.cell, planned),
+        entered_kg=planned.mass_kg,
+        operator=side.who,
+        granted_by=f"the policy of cell {side.cell.name} and its interlock, for {side.who}",
+        run_id=str(uuid.uuid4()),
+        free=side.tools.free,
+        undisturbed=side.undisturbed,
+    )
+
+
+def payload_of(cell: Cell, planned: PlannedRun) -> Payload | None:
+    """What a run is declared to carry; that the cell has it was checked before anything moved."""
+    if planned.payload is None:
+        return None
+    return next(payload.payload for payload in cell.payloads if payload.name == planned.payload)
+
+
+def _set_aside(out: Path, journal: Journal) -> None:
+    """What an earlier recording of this name left: a log that the state does not know, or half of one.
+
+    Raises:
+        UsageError: somebody still writes it.
+        OutputFailed: the file system refuses.
+    """
+    part = out.with_name(out.name + UNFINISHED)
+    try:
+        if out.exists():
+            aside = next(_free_names(out, "aside"))
+            out.rename(aside)
+            journal.say(Level.NOTICE, "set aside", log=aside.name)
+        if part.exists():
+            aside = next(_free_names(out, "partial"))
+            try:
+                salvage(part, aside)
+                part.unlink()
+            except LogUnreadable as error:
+                aside = part.rename(aside.with_name(aside.name + UNFINISHED))
+                journal.say(Level.NOTICE, "nothing to salvage", found=error.found)
+            journal.say(Level.NOTICE, "half a recording kept as partial", log=aside.name)
+    except OSError as error:
+        raise OutputFailed.of(out, error) from error
+
+
+def _free_names(out: Path, kind: str) -> Iterator[Path]:
+    for number in range(1, 1000):
+        path = out.with_name(f"{out.stem}-{kind}-{number}{out.suffix}")
+        if not path.exists() and not path.with_name(path.name + UNFINISHED).exists():
+            yield path

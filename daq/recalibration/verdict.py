@@ -1,0 +1,179 @@
+"""What becomes of a calibration: nothing, a proposal for a person, or the controller's new gains."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from daq.atomic_file import replace_file
+from daq.calibration_file import read
+from daq.configuration.apply_policy import Applier
+from daq.errors import OutputFailed
+from daq.recalibration import session as sessions
+from daq.recalibration.journal import Journal, Level
+from daq.recalibration.past import Past
+from daq.recalibration.recording import Cellside
+from daq.recalibration.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, digest_of
+from daq.write_back.apply import Proposal
+from daq.write_back.audit import AuditAction, append
+from daq.write_back.controller_write import Written, sha256
+from daq.write_back.gates import Gate
+from daq.write_back.link import followed
+from ident.calibration import Calibration
+from ident.drift import FALSE_ALARM, decide
+
+PROPOSAL, DIFF = "proposal.json", "proposal.diff"
+
+
+def settle(side: Cellside, session: Session, calibration: Calibration, past: Past, journal: Journal) -> Session:
+    """Compare a calibration with the gains in the controller, and do what follows from it; the state has the outcome.
+
+    Raises:
+        CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
+        ControllerChanged, ControllerBusy, ControllerUnfit, AuditUnusable, OutputFailed: see `daq.write_back.apply`.
+    """
+    session = _written_before(session, past, journal)
+    if session.state.outcome is not None:
+        return session
+    path, now = session.folder / CALIBRATION, side.tools.now()
+    content = read(path)
+    proposal = side.tools.propose(side.cell, calibration, now=now, calibration_file=path, calibration_content=content)
+    decision = judge(proposal, calibration, past)
+    journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
+    after = sha256(proposal.after_content)
+    target = Target(file=str(proposal.file), base_sha256=proposal.base_sha256, after_sha256=after)
+    _write_proposal(session, proposal, after)
+    # Before anything is written: whoever finds this state after a kill sees by the file's digest whether it was.
+    session = sessions.save(replace(session, state=session.state.with_(decision=decision, target=target)))
+    closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
+    if closed:
+        for refusal in closed:
+            journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
+        sessions.save(_with_outcome(session, Outcome.REFUSED))
+        _apply(side, proposal, now)  # which refuses it, and writes that down
+    if proposal.after_content == proposal.before_content or not any(gain.differs for gain in decision.gains):
+        return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
+    if proposal.refusals or by_a_person(side):
+        _propose(side, session, target, journal)
+        return sessions.save(_with_outcome(session, Outcome.PROPOSED))
+    written = _apply(side, proposal, now)
+    if written is not None:
+        journal.say(
+            Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
+        )
+    past.note_applied()
+    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+
+
+def _apply(side: Cellside, proposal: Proposal, now: datetime) -> Written | None:
+    try:
+        return side.tools.apply(proposal, now, audit=side.target.history.audit, who=side.who)
+    except OSError as error:
+        raise OutputFailed.of(proposal.file, error) from error
+
+
+def by_a_person(side: Cellside) -> bool:
+    """Whether a person applies: by the cell's policy, and wherever drives are written to."""
+    return side.cell.apply.by is Applier.PERSON or bool(side.target.controller.objects)
+
+
+def judge(proposal: Proposal, calibration: Calibration, past: Past) -> Decision:
+    """Whether any gain differs from the controller's by more than chance (`ident.drift.decide`).
+
+    An axis differs by itself where its probability among all of them says so.
+    """
+    units = {gain.axis: gain.unit for gain in calibration.gains}
+    # What is no number is refused by a gate of its own.
+    changes = [change for change in proposal.changes if all(map(math.isfinite, (change.old, change.new, change.std)))]
+    in_force, dispersion = past.stds_in_force({change.axis: change.old for change in changes}), past.dispersions()
+    stds = [in_force[change.axis] for change in changes]
+    found = decide(
+        tuple(change.axis for change in changes),
+        [change.old for change in changes],
+        stds,
+        [change.new for change in changes],
+        [change.std for change in changes],
+        dispersion=[dispersion[change.axis] for change in changes],
+    )
+    gains = tuple(
+        JudgedGain(
+            axis=change.axis,
+            unit=units[change.axis],
+            old=change.old,
+            old_std=old_std,
+            new=change.new,
+            new_std=change.std,
+            change_percent=_finite(told.percent),
+            drift_sigma=_finite(told.sigmas),
+            differs=found.differs and probability <= FALSE_ALARM,
+        )
+        for change, old_std, told, probability in zip(changes, stds, found.changes, found.adjusted, strict=True)
+    )
+    return Decision(gains=gains, remark=found.words)
+
+
+def _written_before(session: Session, past: Past, journal: Journal) -> Session:
+    """A job that was killed behind its write has written all the same: it is noted, and never done twice."""
+    target = session.state.target
+    if target is None or target.base_sha256 == target.after_sha256:
+        return session
+    if digest_of(Path(target.file)) != target.after_sha256:
+        return session
+    journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
+    past.note_applied()
+    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+
+
+def _propose(side: Cellside, session: Session, target: Target, journal: Journal) -> None:
+    append(
+        side.target.history.audit,
+        AuditAction.PROPOSED,
+        at=side.tools.now(),
+        who=side.who,
+        subject=str(followed(side.target.file)),
+        details={
+            "session": session.state.session,
+            "calibration_sha256": digest_of(session.folder / CALIBRATION) or "",
+            "sha256_before": target.base_sha256,
+            "sha256_after": target.after_sha256,
+        },
+    )
+    journal.say(Level.NOTICE, "proposed: a person must apply it", folder=str(session.folder))
+
+
+def _write_proposal(session: Session, proposal: Proposal, after_sha256: str) -> None:
+    """The change as a person and a program read it, beside the calibration."""
+    document = {
+        "file": str(proposal.file),
+        "base_sha256": proposal.base_sha256,
+        "after_sha256": after_sha256,
+        "changes": [
+            {
+                "axis": change.axis,
+                "key": change.key,
+                "old": _finite(change.old),
+                "new": _finite(change.new),
+                "std": _finite(change.std),
+                "unit": change.unit,
+                "change_percent": _finite(change.change_percent),
+            }
+            for change in proposal.changes
+        ],
+        "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
+    }
+    try:
+        replace_file(session.folder / PROPOSAL, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode())
+        replace_file(session.folder / DIFF, proposal.diff.encode())
+    except OSError as error:
+        raise OutputFailed.of(session.folder / PROPOSAL, error) from error
+
+
+def _with_outcome(session: Session, outcome: Outcome) -> Session:
+    return replace(session, state=session.state.with_(outcome=outcome))
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

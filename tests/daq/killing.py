@@ -1,0 +1,72 @@
+"""A child process that is killed at the system call that somebody chooses, by a small tracer (Linux, ptrace(2))."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+from collections.abc import Callable
+
+import pytest
+
+_TRACEME, _SYSCALL, _SETOPTIONS = 0, 24, 0x4200
+_TRACESYSGOOD, _EXITKILL = 0x1, 0x100000
+_SYSCALL_STOP = signal.SIGTRAP | 0x80
+_FAILED, _NOT_PERMITTED = 70, 77
+
+_ptrace = ctypes.CDLL(None, use_errno=True).ptrace
+_ptrace.argtypes = (ctypes.c_long, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p)
+_ptrace.restype = ctypes.c_long
+
+
+def killed_at(number: int, work: Callable[[], object]) -> bool:
+    """Do some work in a child and kill it (SIGKILL) as it asks for its n-th system call, which is not made any more.
+
+    Args:
+        number: n, from 1; the calls of `work` and the child's own end are counted.
+        work: with nothing left to import or to prepare.
+
+    Returns:
+        whether it was killed; False where the child had fewer calls to make and came to its end.
+    """
+    child = os.fork()
+    if child == 0:
+        _be_traced(work)
+    _, status = os.waitpid(child, 0)
+    if os.WIFEXITED(status) and os.WEXITSTATUS(status) == _NOT_PERMITTED:
+        pytest.skip("ptrace is not permitted here: nobody can be killed at a chosen system call")
+    try:
+        _ask(_SETOPTIONS, child, _TRACESYSGOOD | _EXITKILL)
+        stops = 0
+        while True:
+            _ask(_SYSCALL, child, 0)
+            _, status = os.waitpid(child, 0)
+            if not os.WIFSTOPPED(status):
+                assert os.WIFEXITED(status)
+                assert os.WEXITSTATUS(status) == 0, "the work itself failed"
+                return False
+            assert os.WSTOPSIG(status) == _SYSCALL_STOP
+            stops += 1  # one as a call begins, one as it ends
+            if stops == 2 * number - 1:
+                return True
+    finally:
+        if not os.WIFEXITED(status):
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+
+
+def _be_traced(work: Callable[[], object]) -> None:
+    code = _FAILED
+    try:
+        if _ptrace(_TRACEME, 0, None, None) != 0:
+            os._exit(_NOT_PERMITTED)
+        os.kill(os.getpid(), signal.SIGSTOP)
+        work()
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def _ask(request: int, child: int, data: int) -> None:
+    if _ptrace(request, child, None, data) != 0:
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))

@@ -1,0 +1,273 @@
+"""A cell of one's own for each test: its files, its clock, its commands, and the simulated cell on a virtual bus."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from daq.cli.residual_report import save_report
+from daq.cli.simulate import MountedFile
+from daq.configuration.cell import Cell
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation
+from daq.fit import Fit
+from daq.plan import Plan, plan
+from daq.plan_file import save_plan
+from daq.recalibration.job import recalibrate
+from daq.recalibration.journal import Form, Journal
+from daq.recalibration.report import Conclusion
+from daq.recalibration.session import Session, sessions
+from daq.recalibration.tools import Tools
+from daq.record import Clocks, Recorded, record
+from daq.resources import shipped_configurations
+from daq.write_back.audit import AuditEntry, read, verify
+from drivers.bus import open_bus
+from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.fault import FaultSpec
+from drivers.simulated.mounting import MountingCell
+from drivers.simulated.power_state import PowerState
+from drivers.simulated.spec import CellSpec
+
+BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
+WHO = "the test's job"
+RUNS: tuple[dict[str, Any], ...] = (
+    {"name": "bare-1"},
+    {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59},
+    {"name": "unused", "payload": "disc", "mass_kg": 4.59, "holdout": True},
+)
+
+
+@cache
+def _cell(path: Path, _content: bytes) -> Cell:
+    return load_cell(path)
+
+
+class TestClock:
+    """A wall clock that goes on by a second whenever it is asked, and further when it is told."""
+
+    __test__ = False
+
+    def __init__(self, at: datetime = BEGAN) -> None:
+        self.at = at
+
+    def __call__(self) -> datetime:
+        self.at += timedelta(seconds=1)
+        return self.at
+
+    def go_on(self, **by: float) -> None:
+        self.at += timedelta(**by)
+
+
+@dataclass
+class Rig:
+    """One cell.
+
+    Attributes:
+        folder: with `cells`, `controllers` and `robots`.
+        clock: of the job.
+        tools: that the job gets.
+        said: the journal's lines.
+    """
+
+    folder: Path
+    clock: TestClock
+    tools: Tools
+    said: io.StringIO = field(default_factory=io.StringIO)
+
+    @property
+    def cells(self) -> Path:
+        return self.folder / "cells"
+
+    @property
+    def cell_file(self) -> Path:
+        return self.cells / "demo.yaml"
+
+    @property
+    def cell(self) -> Cell:
+        return _cell(self.cell_file, self.cell_file.read_bytes())
+
+    @property
+    def controller(self) -> Path:
+        return self.folder / "controllers" / "demo.yaml"
+
+    @property
+    def closed(self) -> Path:
+        """The interlock's command looks for it."""
+        return self.cells / "closed"
+
+    @property
+    def sessions(self) -> tuple[Session, ...]:
+        return sessions(self.cells / "recalibration")
+
+    @property
+    def session(self) -> Session:
+        """The only one."""
+        (only,) = self.sessions
+        return only
+
+    @property
+    def audit(self) -> tuple[AuditEntry, ...]:
+        path = self.cells / "demo.audit.jsonl"
+        assert verify(path).holds
+        return read(path)
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """The journal."""
+        return [json.loads(line) for line in self.said.getvalue().splitlines()]
+
+    @property
+    def backups(self) -> list[Path]:
+        return sorted(self.controller.parent.glob("*.bak"))
+
+    def job(self, **further: Any) -> Conclusion:
+        journal = Journal(self.said, Form.JSON, lambda: self.clock.at)
+        return recalibrate(self.cell_file, self.cell, self.tools, journal, who=WHO, lock_folder=self.folder, **further)
+
+
+def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = None, **section: Any) -> Rig:
+    """A cell's files, and tools with a clock of their own.
+
+    Args:
+        folder: empty; its name makes the bus's.
+        plan_file: of all runs.
+        policy: instead of one in which the job applies.
+        section: of `recalibration`, instead of what is here.
+    """
+    shipped = shipped_configurations()
+    for part in ("controllers", "robots"):
+        shutil.copytree(shipped / part, folder / part)
+    (folder / "cells").mkdir()
+    document = yaml.safe_load((shipped / "cells" / "demo.yaml").read_text(encoding="utf-8"))
+    document["bus"]["channel"] = f"recalibration {folder.parent.name} {folder.name}"
+    document["policy"] = policy or {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
+    document["recalibration"] = {
+        "runs": [{"plan_file": str(plan_file), **run} for run in RUNS],
+        "interlock": {"command": ["test", "-e", "closed"]},
+        "mount": {"command": ["sh", "-c", 'echo "$1" > mounted', "mount"]},
+        "warm_up_min": 0,
+        "min_free_mb": 100,
+        "metrics": ".",
+        **section,
+    }
+    # As JSON, which is YAML without aliases.
+    (folder / "cells" / "demo.yaml").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    (folder / "cells" / "closed").touch()
+    clock = TestClock()
+    tools = Tools(
+        save_report=save_report,
+        record=partial(record, clocks=Clocks(wall_ns=lambda: int(clock.at.timestamp()) * 10**9)),
+        free=lambda _: 10**12,
+        now=clock,
+        monotonic_s=lambda: clock().timestamp(),
+    )
+    return Rig(folder, clock, tools)
+
+
+@contextmanager
+def serving(
+    rig: Rig, *faults: FaultSpec, toggle_bit: int | None = None, seed: int = 1, spec: CellSpec | None = None
+) -> Iterator[SimulatedCell]:
+    """The simulated cell of a rig, powered on, with what its mount command has mounted."""
+    load = partial(load_simulation, shipped_configurations() / "simulation" / "demo.yaml")
+    mounted = MountedFile(rig.cells / "mounted", load, lambda error: None)
+    truth = replace(spec or mounted.at_power_on(), faults=faults, seed=seed)
+    truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
+    bus = open_bus(bus_address(rig.cell))
+    try:
+        with MountingCell(truth, bus, mounted) as cell:
+            yield cell
+    finally:
+        bus.shutdown()
+
+
+def powerless(cell: SimulatedCell) -> bool:
+    """Whether no axis has power, as the simulator knows it."""
+    powered = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.SWITCHED_ON)
+    return not any(node.drive.state in powered for node in cell.nodes)
+
+
+def make_plan(cell: Cell, path: Path, *, seed: int, duration_s: float, moves: int | None = None) -> Path:
+    """A plan for tests: not the best one."""
+    made: Plan = plan(
+        cell, seed=seed, duration_s=duration_s, exchanges=100, largest_condition=1e6, largest_std_percent=100.0
+    )
+    save_plan(replace(made, moves=made.moves[:moves]), path)
+    return path
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a whole real job has made, for tests of what comes after the recordings.
+
+    Attributes:
+        plan_file: of its runs.
+        logs: by their runs' names.
+        recorded: what the recorder told of each.
+        fitted, closed: before and after the loop.
+    """
+
+    plan_file: Path
+    logs: dict[str, Path]
+    recorded: dict[str, Recorded]
+    fitted: Fit
+    closed: Fit
+
+    def tools(self, rig: Rig, **factors: float) -> Tools:
+        """Recorder and fit that know the result already: with the rig's cell, at the rig's time.
+
+        Args:
+            rig: whose tools they are.
+            factors: by which gains have changed since, by axis.
+        """
+
+        def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **_: object) -> Recorded:
+            shutil.copyfile(self.logs[out.stem], out)
+            return replace(self.recorded[out.stem], path=out)
+
+        def in_this_cell(fit: Fit) -> Fit:
+            sources = tuple(
+                replace(source, recording=replace(source.recording, controller_sha256=None))
+                if source.recording is not None
+                else source
+                for source in fit.sources
+            )
+            here = replace(fit, cell=replace(fit.cell, digest=rig.cell.digest), sources=sources)
+            return with_gains(here, factors) if here.steps else here
+
+        return replace(
+            rig.tools,
+            save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
+            drives=lambda _cell, _undisturbed: None,
+            record=copied,
+            fit=lambda _logs, **_: in_this_cell(self.fitted),
+            close_loop=lambda _fit, _seed, _told: in_this_cell(self.closed),
+        )
+
+
+def with_gains(fit: Fit, factors: dict[str, float]) -> Fit:
+    """A closed fit whose gains have changed by these factors."""
+    last = fit.steps[-1]
+    estimate = last.after.estimate
+    factor = np.array([factors.get(axis, 1.0) for axis in fit.cell.axis_names])
+    after = replace(last.after, estimate=replace(estimate, gains=estimate.gains * factor))
+    return replace(fit, steps=(*fit.steps[:-1], replace(last, after=after)))
+
+
+def made_rig(folder: Path, made: Made, **section: Any) -> Rig:
+    """A rig whose recordings are copies of those that were made."""
+    rig = make_rig(folder, made.plan_file, **section)
+    rig.tools = made.tools(rig)
+    return rig

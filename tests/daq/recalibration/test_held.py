@@ -1,0 +1,320 @@
+"""What holds a job: interlock, mount, another job, time, signals, room, clock; and that the next one takes it up."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from contextlib import suppress
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.bus_lock import bus_lock
+from daq.cli.interrupt import interruptible
+from daq.configuration.recalibration import Command, Interlock, InterlockFile
+from daq.errors import (
+    BusTaken,
+    ClockWentBack,
+    ConfigurationInconsistent,
+    DiskSpaceShort,
+    ExitCode,
+    MountFailed,
+    NotReleased,
+    TimeBoundReached,
+    exit_code,
+)
+from daq.recalibration.command import Finished, run_command
+from daq.recalibration.job import preview
+from daq.recalibration.journal import Form, Journal
+from daq.recalibration.release import require_release
+from daq.recalibration.session import Outcome
+from daq.recalibration.time_bound import time_bound
+from daq.record import Recorded
+from daq.write_back.audit import AuditAction
+from drivers.errors import MotionRefused
+from drivers.simulated.power_state import PowerState
+from tests.daq.recalibration.rig import BEGAN, Made, Rig, made_rig, make_rig, powerless, serving
+
+
+def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
+    """The job is held by that; nothing was written but where it is told."""
+    before = rig.controller.read_bytes()
+    with pytest.raises(kind) as caught:
+        rig.job()
+    assert rig.controller.read_bytes() == before
+    assert exit_code(kind) == code
+    assert rig.session.state.outcome is Outcome.STOPPED
+    assert rig.session.state.exit_code == code
+    assert rig.audit[-1].action is AuditAction.RECALIBRATION_ENDED
+    assert rig.audit[-1].details["exit_code"] == code
+    return caught.value
+
+
+def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.closed.unlink()
+    asked = []
+    rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
+    held(rig, NotReleased, ExitCode.NOT_RELEASED)
+    assert asked == []
+    assert not (rig.cells / "mounted").exists()
+    # The door is closed: the next job takes the session up.
+    rig.closed.touch()
+    assert rig.job().outcome is Outcome.APPLIED
+    assert rig.session.state.attempt == 2
+
+
+def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: Path, one_move: Path) -> None:
+    """In the simulated cell: whoever mounts the payload leaves the door open."""
+    left_open = {"command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]}
+    rig = make_rig(tmp_path / "cell", one_move, mount=left_open)
+    with serving(rig) as cell:
+        held(rig, NotReleased, ExitCode.NOT_RELEASED)
+        assert powerless(cell)
+        moved_s = cell.plant.time_s
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    assert not (rig.session.folder / "loaded-1.mcap.part").exists()
+    assert moved_s < 10.0
+
+
+def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, mount={"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]})
+    error = held(rig, MountFailed, ExitCode.JOB_HELD)
+    assert "disc" in str(error)
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    first = rig.session.state.runs[0]
+    (rig.cells / "changer").touch()
+    recorded = []
+    copied = rig.tools.record
+
+    def noting(*given: Any, **further: Any) -> Recorded:
+        recorded.append(given[3].stem)
+        found: Recorded = copied(*given, **further)
+        return found
+
+    rig.tools = replace(rig.tools, record=noting)
+    assert rig.job().outcome is Outcome.APPLIED
+    assert recorded == ["loaded-1", "unused"]
+    assert rig.session.state.runs[0] == first
+
+
+def test_two_jobs_at_once_are_one(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
+        rig.job()
+    assert rig.sessions == ()
+    assert exit_code(BusTaken) == ExitCode.BUS_TAKEN
+    assert rig.job().outcome is Outcome.APPLIED
+    assert not list(rig.folder.glob("*.lock"))
+
+
+def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> None:
+    """A bus across processes; the other one is killed."""
+    rig = made_rig(tmp_path / "cell", made)
+    shared = replace(
+        rig.cell, buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
+    )
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException), bus_lock(shared, rig.folder):
+            os.write(tell, b"x")
+            signal.pause()
+        os._exit(0)
+    try:
+        assert os.read(told, 1) == b"x"
+        with pytest.raises(BusTaken), bus_lock(shared, rig.folder):
+            pass
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(told)
+        os.close(tell)
+    with bus_lock(shared, rig.folder):
+        pass
+
+
+def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    powered = []
+    with serving(rig) as cell:
+
+        def room(_folder: Path) -> int:
+            # Asked ten times a second of recorded time: in the middle of the first move the bound is reached.
+            if any(node.drive.state is PowerState.OPERATION_ENABLED for node in cell.nodes):
+                powered.append(True)
+                if len(powered) == 3:
+                    signal.raise_signal(signal.SIGALRM)
+            return 10**12
+
+        rig.tools = replace(rig.tools, free=room)
+        held(rig, TimeBoundReached, ExitCode.TIME_BOUND)
+        assert powerless(cell)
+    assert len(powered) == 3
+    assert (rig.session.folder / "bare-1.mcap.part").exists()
+
+
+def test_an_alarm_does_not_cut_a_stop_short() -> None:
+    with time_bound(60.0) as undisturbed:
+        with undisturbed():
+            signal.raise_signal(signal.SIGALRM)
+            # It comes again.
+            left_s, _ = signal.getitimer(signal.ITIMER_REAL)
+            assert 0.0 < left_s <= 1.0
+        with pytest.raises(TimeBoundReached):
+            signal.raise_signal(signal.SIGALRM)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+
+
+def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    asked = []
+    with serving(rig) as cell:
+
+        def room(_folder: Path) -> int:
+            asked.append(True)
+            if len(asked) == 5:
+                signal.raise_signal(signal.SIGTERM)
+            return 10**12
+
+        rig.tools = replace(rig.tools, free=room)
+        before = rig.controller.read_bytes()
+        with interruptible() as undisturbed, pytest.raises(KeyboardInterrupt):
+            rig.job(undisturbed=undisturbed)
+        assert powerless(cell)
+    assert rig.controller.read_bytes() == before
+    assert rig.session.state.outcome is Outcome.INTERRUPTED
+    assert rig.session.state.exit_code == ExitCode.INTERRUPTED
+    assert rig.audit[-1].details["outcome"] == "interrupted"
+
+
+def test_a_disk_that_is_full_is_told_of_before_and_during_a_run(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move, min_free_mb=1000)
+    rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
+    error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
+    assert "min_free_mb" in str(error)
+    rooms = iter((10**12, 10**12, 10**12, 10**12))
+    rig.tools = replace(rig.tools, free=lambda _: next(rooms, 10**6))
+    with serving(rig) as cell:
+        held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
+        assert powerless(cell)
+
+
+def test_a_clock_that_went_back_is_an_alarm(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    assert rig.job().outcome is Outcome.APPLIED
+    rig.clock.at = BEGAN - timedelta(days=3)
+    with pytest.raises(ClockWentBack, match="2026-01-02"):
+        rig.job()
+    assert len(rig.sessions) == 1
+    assert exit_code(ClockWentBack) == ExitCode.JOB_HELD
+
+
+def test_nothing_moves_without_the_cells_own_leave(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy={"motion": "ask"})
+    with pytest.raises(MotionRefused, match="policy"):
+        rig.job()
+    assert rig.sessions == ()
+    assert not (rig.cells / "demo.audit.jsonl").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [("payload", "anvil", "disc"), ("mass_kg", 4.7, r"4.59 kg ± 0.005")],
+)
+def test_a_run_whose_payload_is_not_the_cells_is_refused(
+    tmp_path: Path, made: Made, key: str, value: object, message: str
+) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    text = rig.cell_file.read_text(encoding="utf-8")
+    document = json.loads(text)
+    document["recalibration"]["runs"][1][key] = value
+    rig.cell_file.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        rig.job()
+    assert rig.sessions == ()
+
+
+def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
+    path = tmp_path / "interlock"
+    file = InterlockFile(path, "closed", 5.0)
+    interlock = Interlock(Command(("some", "program"), 1.0), file)
+
+    def ask(code: int | None = 0, later_s: float = 0.0) -> None:
+        now = BEGAN + timedelta(seconds=later_s)
+        require_release(interlock, lambda *_: Finished(code, "said"), now, tmp_path)
+
+    with pytest.raises(NotReleased, match="no such file"):
+        ask()
+    path.write_text("closed\nand more\n")
+    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    for later_s in (-5.0, 0.0, 4.9):
+        ask(later_s=later_s)
+    for later_s in (-6.0, 6.0, 3600.0):
+        with pytest.raises(NotReleased, match="an age of"):
+            ask(later_s=later_s)
+    for code in (1, None, -9):
+        with pytest.raises(NotReleased, match="said"):
+            ask(code)
+    for text in ("open\n", "", "closed?\n"):
+        path.write_text(text)
+        os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+        with pytest.raises(NotReleased, match="in its first line"):
+            ask()
+
+
+def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    ended = run_command(Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0), ("disc",), tmp_path)
+    assert ended.code == 3
+    assert ended.said == f"disc in {tmp_path.resolve()}"
+    assert run_command(Command(("no such program",), 10.0), (), tmp_path).code is None
+    slow = run_command(Command(("sh", "-c", "sleep 60 & echo $! > pid; wait"), 0.2), (), tmp_path)
+    assert slow == Finished(None, "not ended within 0.2 s")
+    started = Path("/proc") / (tmp_path / "pid").read_text().strip() / "stat"
+    # Gone, or ended and waiting for its parent to look.
+    assert not started.exists() or ") Z " in started.read_text()
+
+
+def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, warm_up_min=5)
+    before = sorted(rig.folder.rglob("*"))
+    journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    seen = preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+    assert "a new session" in seen.remark
+    assert seen.steps[0] == "warm up for 5 min"
+    assert "mount disc, record loaded-1" in seen.steps
+    assert sorted(rig.folder.rglob("*")) == before
+    rig.closed.unlink()
+    with pytest.raises(NotReleased):
+        preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+
+
+def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, warm_up_min=0.25)
+    made_of, copied = [], rig.tools.record
+
+    def noting(*given: Any, **further: Any) -> Recorded:
+        made_of.append(given[3].stem)
+        if given[3].stem == "warm-up":
+            given[3].touch()
+            return made.recorded["bare-1"]
+        found: Recorded = copied(*given, **further)
+        return found
+
+    asked = []
+
+    def asking(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
+        asked.append(command.arguments[0])
+        return run_command(command, further, folder)
+
+    rig.tools = replace(rig.tools, record=noting, run=asking)
+    assert rig.job().outcome is Outcome.APPLIED
+    # 15 s in passes of a plan of about 6 s.
+    assert made_of == ["warm-up"] * 3 + ["bare-1", "loaded-1", "unused"]
+    assert asked == ["test", "sh", "test", "test", "test", "test", "sh", "test", "sh", "test"]
+    assert not list(rig.session.folder.glob("warm-up*"))

@@ -1,0 +1,186 @@
+"""A job that is killed (-9) at any step, and the next one, which goes on: what was found is applied exactly once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import warnings
+from collections.abc import Callable
+from dataclasses import fields, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.history.store import HistoryStore
+from daq.recalibration.session import Outcome
+from daq.recalibration.tools import Tools
+from daq.write_back.audit import AuditAction
+from tests.daq.recalibration.rig import Made, Rig, made_rig
+
+CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"})
+"""What a job hands its work to: between two of these calls it reads and writes its own files."""
+
+
+EFFECTS = ("record", "save_report", "apply")
+FREQUENT = {"now": 4, "run": 2}
+
+
+class Kill:
+    """Counts the calls of a job's tools, and kills the process at one of them: before it, or behind it."""
+
+    def __init__(self, at: int | None = None, *, behind: bool = False) -> None:
+        self.calls: list[str] = []
+        self._at, self._behind = at, behind
+
+    def tools(self, tools: Tools) -> Tools:
+        return replace(tools, **{name: self._called(name, getattr(tools, name)) for name in CALLED})
+
+    def _called(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **further: Any) -> Any:
+            mine = len(self.calls) == self._at
+            self.calls.append(name)
+            if mine and not self._behind:
+                os.kill(os.getpid(), signal.SIGKILL)
+            found = function(*given, **further)
+            if mine:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return found
+
+        return call
+
+
+def killed_job(rig: Rig, kill: Kill) -> None:
+    """The job in a process of its own, which does not survive it."""
+    with warnings.catch_warnings():
+        # Of threads of the test runner, which the child never meets.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        try:
+            replace(rig, tools=kill.tools(rig.tools)).job()
+        finally:
+            os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+
+
+def applied_once(rig: Rig) -> None:
+    """By all that tells of it."""
+    session = rig.session
+    assert session.state.outcome is Outcome.APPLIED
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLIED) <= 1
+    assert actions.count(AuditAction.APPLY_BEGUN) == 1
+    assert actions[0] is AuditAction.RECALIBRATION_BEGUN
+    assert actions[-1] is AuditAction.RECALIBRATION_ENDED
+    assert len(rig.backups) == 1
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        assert len(store.events()) == len(store.entries()) == 1
+    assert rig.job().outcome is Outcome.NOT_DUE
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory: pytest.TempPathFactory, made: Made) -> list[str]:
+    """Those of a job that nobody kills."""
+    rig = made_rig(tmp_path_factory.mktemp("counted") / "cell", made, metrics=None)
+    kill = Kill()
+    assert replace(rig, tools=kill.tools(rig.tools)).job().outcome is Outcome.APPLIED
+    return kill.calls
+
+
+def test_every_step_is_among_the_calls(calls: list[str]) -> None:
+    assert set(calls) == set(CALLED)
+    assert calls.count("record") == 3
+    assert calls.count("run") >= 6
+
+
+@pytest.mark.parametrize("behind", [False, True], ids=["before", "behind"])
+def test_a_job_that_is_killed_at_any_call_is_finished_by_the_next(
+    tmp_path: Path, made: Made, calls: list[str], behind: bool
+) -> None:
+    """Before each call, and behind each that has an effect: what it made is there, and the state does not know it.
+
+    Of the questions after the time every fourth is enough, and of the cell's commands every second.
+    """
+    few = {at for name, step in FREQUENT.items() for at in [k for k, one in enumerate(calls) if one == name][::step]}
+    chosen = [at for at, name in enumerate(calls) if (name in EFFECTS if behind else name not in FREQUENT or at in few)]
+    for at in chosen:
+        name = calls[at]
+        rig = made_rig(tmp_path / f"{at}-{name}", made, metrics=None)
+        before = rig.controller.read_bytes()
+        killed_job(rig, Kill(at, behind=behind))
+        begun = bool(rig.sessions)
+        whole = rig.controller.read_bytes()
+        rig.clock.go_on(minutes=10)
+        # Killed as the very last thing it was done already.
+        outcome = rig.job().outcome
+        if outcome is not Outcome.NOT_DUE:
+            assert outcome is Outcome.APPLIED, f"{at} {name}"
+            assert rig.session.state.attempt == 1 + begun
+        assert rig.controller.read_bytes() != before
+        if whole != before:
+            assert rig.controller.read_bytes() == whole
+        applied_once(rig)
+
+
+def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    whole = made.logs["loaded-1"].read_bytes()
+    copied = rig.tools.record
+
+    def dies(*given: Any, **further: Any) -> Any:
+        out = given[3]
+        if out.stem == "loaded-1":
+            out.with_name(out.name + ".part").write_bytes(whole[: len(whole) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+        return copied(*given, **further)
+
+    rig.tools = replace(rig.tools, record=dies)
+    killed_job(rig, Kill())
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    rig.tools = replace(rig.tools, record=copied)
+    assert rig.job().outcome is Outcome.APPLIED
+    names = {path.name for path in rig.session.folder.iterdir()}
+    assert "loaded-1-partial-1.mcap" in names
+    assert "loaded-1.mcap.part" not in names
+    applied_once(rig)
+
+
+def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    killed_job(rig, Kill(_nth_call(rig, made, "fit")))
+    log = rig.session.folder / "bare-1.mcap"
+    log.write_bytes(log.read_bytes()[:-1] + b"\0")
+    assert rig.job().outcome is Outcome.APPLIED
+    assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
+    assert rig.session.state.runs[-1].name == "bare-1"
+
+
+def test_a_session_that_is_too_old_or_of_another_configuration_is_not_taken_up(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, resume_within_h=2)
+    killed_job(rig, Kill(_nth_call(rig, made, "fit")))
+    shutil.copytree(rig.folder, tmp_path / "copy")
+    rig.clock.go_on(hours=3)
+    assert rig.job().outcome is Outcome.APPLIED
+    old, new = rig.sessions
+    assert old.state.outcome is None
+    assert new.began - old.began > timedelta(hours=2)
+    other = replace(rig, folder=tmp_path / "copy")
+    other.clock.go_on(hours=-2)
+    other.cell_file.write_text(other.cell_file.read_text() + "\n# another comment\n")
+    other.tools = made.tools(other)
+    assert other.job().outcome is Outcome.APPLIED
+    assert len(other.sessions) == 2
+
+
+def _nth_call(rig: Rig, made: Made, name: str) -> int:
+    """The first call of that name in a job of such a rig."""
+    twin = made_rig(rig.folder.with_name("twin"), made)
+    kill = Kill()
+    replace(twin, tools=kill.tools(twin.tools)).job()
+    shutil.rmtree(twin.folder)
+    return kill.calls.index(name)

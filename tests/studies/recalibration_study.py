@@ -1,0 +1,115 @@
+"""Whole jobs week after week, recordings included, on a simulated cell: quiet weeks, a gain that falls, faults between.
+
+    python -m tests.studies.recalibration_study [--weeks 8] [--seconds 12]
+
+Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 % in the middle of the
+time; in one week a drive fails, in another the door is open. What is printed: outcome, drift in σ, and the truth beside
+what the controller has.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from daq.cli.simulate import MountedFile
+from daq.configuration.cell_bus import bus_address
+from daq.configuration.cell_file import load_cell
+from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.errors import DaqError
+from daq.resources import shipped_configurations
+from drivers.bus import open_bus
+from drivers.errors import DriverError
+from drivers.simulated.fault import FaultKind, FaultSpec
+from drivers.simulated.mounting import MountingCell
+from drivers.simulated.spec import CellSpec
+from ident.errors import IdentificationError
+from tests.daq.recalibration.rig import RUNS, Rig, make_plan, make_rig
+
+AXIS, LOSS = 3, 0.94
+FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)
+
+
+def truth(name: str | None, factor: float) -> CellSpec:
+    """The demonstration's cell, with that much of the gain of J4 left."""
+    spec = load_simulation(shipped_simulation("demo"), name)
+    axes = tuple(
+        replace(axis, gain_nm_per_a=axis.gain_nm_per_a * (factor if index == AXIS else 1.0))
+        for index, axis in enumerate(spec.axes)
+    )
+    return replace(spec, axes=axes)
+
+
+def one_job(rig: Rig, factor: float, seed: int, *faults: FaultSpec) -> str:
+    """A job with the cell as it is now; its outcome, or the error that ended it."""
+    mounted = MountedFile(rig.cells / "mounted", partial(truth, factor=factor), lambda error: None)
+    spec = replace(mounted.at_power_on(), faults=faults, seed=seed)
+    bus = open_bus(bus_address(rig.cell))
+    try:
+        with MountingCell(spec, bus, mounted):
+            return rig.job().outcome.value
+    except (DaqError, DriverError, IdentificationError) as error:
+        return type(error).__name__
+    finally:
+        bus.shutdown()
+
+
+def told(rig: Rig, factor: float) -> str:
+    """Of J4: drift and gain found, beside the truth and the controller's gain."""
+    state = rig.sessions[-1].state
+    if state.decision is None:
+        return ""
+    gain = state.decision.gains[AXIS]
+    true = truth(None, factor).axes[AXIS].gain_nm_per_a
+    drift = "-" if gain.drift_sigma is None else f"{gain.drift_sigma:+.1f}"
+    return f"{drift:>6} σ   found {gain.new:.3f} ± {gain.new_std:.3f}   was {gain.old:.3f}   truth {true:.3f}"
+
+
+def study(weeks: int, seconds: float, folder: Path) -> int:
+    """Run it; 1 where a quiet week was written, or the loss was not."""
+    shipped = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    plans = [make_plan(shipped, folder / f"{seed}.yaml", seed=seed, duration_s=seconds) for seed in (10, 11, 12)]
+    runs = [
+        {**RUNS[0], "plan_file": str(plans[0])},
+        {**RUNS[1], "plan_file": str(plans[0])},
+        {**RUNS[0], "name": "bare-2", "plan_file": str(plans[1])},
+        {**RUNS[1], "name": "loaded-2", "plan_file": str(plans[1])},
+        {**RUNS[2], "plan_file": str(plans[2])},
+    ]
+    policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
+    rig = make_rig(folder / "cell", plans[0], policy=policy, runs=runs, every_h=160, resume_within_h=36)
+    wrong = []
+    for week in range(weeks):
+        factor = LOSS if week >= weeks // 2 else 1.0
+        expected = "applied" if week in (0, weeks // 2) else "unchanged"
+        if week == 1:
+            rig.closed.unlink()
+        outcome = one_job(rig, factor, week, *((FAULT,) if week == 2 else ()))
+        print(f"week {week}: {outcome:12} {told(rig, factor)}", flush=True)  # noqa: T201
+        rig.closed.touch()
+        if week in (1, 2):
+            rig.clock.go_on(days=1)
+            outcome = one_job(rig, factor, 100 + week)
+            print(f"  next day: {outcome:12} {told(rig, factor)}", flush=True)  # noqa: T201
+        wrong += [week] if outcome != expected else []
+        rig.clock.go_on(days=7)
+    print(f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}")  # noqa: T201
+    return int(bool(wrong))
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--weeks", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=12.0)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        return study(chosen.weeks, chosen.seconds, Path(folder))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
