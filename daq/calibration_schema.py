@@ -94,7 +94,7 @@ class CalibrationDocument(StrictModel):
     holdout_error_percent: RelativeErrorEntry | None
     condition: float
     rows: int
-    filter: dict[str, float | list[float]]
+    filter: dict[str, int | float | list[float]]
     effects: tuple[EffectEntry, ...]
     sources: tuple[SourceEntry, ...]
     configuration_sha256: str

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from daq.bus_lock import bus_lock
 from daq.cli.interrupt import interruptible
 from daq.cli.progress import progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
@@ -65,7 +66,7 @@ def record_verb(
     if allowed_by is not None and not enable_motion:
         typer.echo(f"motion is allowed by {allowed_by} (its file says so): the axes move now", err=True)
     try:
-        with interruptible() as undisturbed, progress_bar("recording") as told:
+        with bus_lock(declared), interruptible() as undisturbed, progress_bar("recording") as told:
             done = record(
                 cell,
                 declared,

@@ -64,8 +64,8 @@ class Processes:
             ConfigurationMissing: dask.distributed is not installed.
         """
         distributed, dask = dask_distributed(), import_module("dask")
-        # On this machine alone: who reaches a scheduler can run anything on its workers. Its HTTP server cannot be left
-        # out, only its dashboard; of its usual port another fleet would have to be warned.
+        # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard is left out;
+        # its HTTP server cannot be, and takes a free port: on the usual one it would warn of any other cluster.
         with (
             dask.config.set({TRIMMING: None}),
             distributed.LocalCluster(

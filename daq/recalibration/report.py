@@ -82,8 +82,10 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
             f"drivegain apply {calibration} --cell {cell} --yes --base {base}",
         ]
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
-        file = shlex.quote(session.state.target.file)
-        return ["let the controller load the file", f"to undo it: drivegain rollback --to {file}"]
+        return [
+            "let the controller load the file",
+            f"to undo it: drivegain rollback --cell {shlex.quote(str(cell_file))}",
+        ]
     return {
         Outcome.REFUSED: ["see why the gate is closed; the next job records anew"],
         Outcome.UNFIT: ["see what is wrong with the recordings (`drivegain info LOG`); the next job records anew"],

@@ -57,16 +57,9 @@ def parse(content: bytes, name: str) -> ParsedXml:
     Raises:
         ControllerUnfit: it is no XML, or has a document type.
     """
-    reader = _Reader()
+    reader = _Reader(name)
     try:
         reader.read(content)
-    except _DocumentType as error:
-        raise ControllerUnfit(
-            name,
-            found="a document type (<!DOCTYPE …>)",
-            expected="XML without one: it may define entities and fetch other files",
-            remedy="remove it if the controller does without; nothing was written",
-        ) from error
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise ControllerUnfit(
             name,
@@ -77,14 +70,11 @@ def parse(content: bytes, name: str) -> ParsedXml:
     return ParsedXml(reader.root.children[0], reader.root, reader.encoding)
 
 
-class _DocumentType(Exception):
-    """There is a document type in the file."""
-
-
 class _Reader:
     """What expat tells, as a tree; a way without recursion, however deep the file is."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self._name = name
         self.encoding = _ENCODING_OF_NONE
         self.root = Element("", {}, "", 0, 0)
         self._open = [self.root]
@@ -107,7 +97,12 @@ class _Reader:
         self.encoding = encoding or _ENCODING_OF_NONE
 
     def _document_type(self, *_: object) -> None:
-        raise _DocumentType
+        raise ControllerUnfit(
+            self._name,
+            found="a document type (<!DOCTYPE …>)",
+            expected="XML without one: it may define entities and fetch other files",
+            remedy="remove it if the controller does without; nothing was written",
+        )
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         parent = self._open[-1]
