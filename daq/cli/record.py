@@ -49,7 +49,10 @@ def record_verb(
     ] = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Make the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes."""
+    """Make the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
+
+    A run with losses is kept, marked invalid, and ends with exit code 4: no fit takes it.
+    """
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or getpass.getuser()
@@ -106,6 +109,9 @@ def record_verb(
     else:
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
+    if not log.valid:
+        # The log is kept and told of; a script must not go on with it as if it were good.
+        raise typer.Exit(ExitCode.DATA_UNFIT)
 
 
 def load_lines(cell: Cell) -> tuple[str, ...]:

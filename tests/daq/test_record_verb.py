@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from pathlib import Path
 from typing import NoReturn
@@ -10,7 +11,10 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from daq.log.metadata import RunStatistics
+from daq.record import Recorded
 from drivers.errors import DriverError, HeartbeatLost, SampleLost
+from drivers.stream import StreamStatistics
 
 
 @pytest.fixture
@@ -33,6 +37,30 @@ def _failing(error: DriverError, part: Path | None) -> object:
         raise error
 
     return record
+
+
+@pytest.mark.parametrize(
+    ("valid", "code", "said"),
+    [(True, ExitCode.OK, "complete"), (False, ExitCode.DATA_UNFIT, "INVALID: 2 missing answers; a fit will refuse it")],
+)
+def test_a_recording_with_losses_is_told_of_and_is_no_success(
+    cells: dict[str, str],
+    valid: bool,
+    code: ExitCode,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    counted = RunStatistics(1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers")
+    monkeypatch.setattr(
+        "daq.cli.record.record", lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics())
+    )
+    command = ["record", cells["lockstep"], "plan.yaml", "--out", str(tmp_path / "a.mcap"), "--enable-motion"]
+    assert main(command) == code
+    assert said in capsys.readouterr().out
+    assert main([*command, "--json"]) == code
+    assert json.loads(capsys.readouterr().out)["valid"] is valid
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "my run.mcap"])

@@ -53,7 +53,9 @@ class Job:
 def _say(*arguments: str) -> dict[str, Any]:
     with redirect_stdout(io.StringIO()) as out:
         code = main([*arguments, "--json"])
-    assert code == ExitCode.OK, f"drivegain {' '.join(arguments)} ended with {code}"
+    # A recording with losses is told of and tried again; whoever calls this looks at its "valid".
+    fine = (ExitCode.OK, ExitCode.DATA_UNFIT) if arguments[0] == "record" else (ExitCode.OK,)
+    assert code in fine, f"drivegain {' '.join(arguments)} ended with {code}"
     document: dict[str, Any] = json.loads(out.getvalue())
     return document
 
