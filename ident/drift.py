@@ -25,7 +25,13 @@ FALSE_ALARM = 0.01
 _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
 """How many successive differences the prior is worth, and the pooled estimate beside an axis' own."""
 _FEWEST_DIFFERENCES = 4
+_CUT = 1.5
+"""Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
+_MEAN_OF_CUT = float(1.0 - 2.0 * norm.sf(_CUT) - 2.0 * _CUT * norm.pdf(_CUT) + 2.0 * _CUT**2 * norm.sf(_CUT))
+"""E min(Z², c²) of a standard normal Z."""
 _MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
+_STEPS = 20
+"""Each brings the scale nearer to its end by a factor of two and more, unless outliers are nearly a third."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +134,10 @@ def decide(
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     """How much more repeated calibrations scatter than their σ says, for each axis; never less than 1.
 
-    From differences of successive calibrations, so that a slow drift adds little, by the median of their magnitudes, so
-    that a sudden change adds nothing. All axes together tell more than one does: the estimate of an axis is drawn
-    towards theirs, and that towards DISPERSION, by weights in numbers of differences (as a scaled inverse-χ² prior).
+    From differences of successive calibrations, so that a slow drift adds little; each counts up to 1.5 of their σ
+    (Huber 1964, proposal 2), so that a sudden change adds little too. All axes together tell more than one does: the
+    estimate of an axis is drawn towards theirs, and that towards DISPERSION, by weights in numbers of differences (as a
+    scaled inverse-χ² prior).
 
     Args:
         values, stds: shape (..., axes, n), oldest first; leading dimensions are histories of their own.
@@ -142,14 +149,22 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     count = values.shape[-1] - 1
     if count < _FEWEST_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
-    # Not about their own median, which of few differences is too near to them.
-    away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
-    own = (np.median(away, axis=-1) / _MEDIAN_OF_NORMAL) ** 2
-    all_axes = (np.median(away.reshape(*away.shape[:-2], -1), axis=-1) / _MEDIAN_OF_NORMAL) ** 2
+    # Not about their own centre, which of few differences is too near to them.
+    squares = (np.diff(values) / np.hypot(stds[..., 1:], stds[..., :-1])) ** 2
+    own = _variance(squares)
+    all_axes = _variance(squares.reshape(*squares.shape[:-2], -1))
     total = count * values.shape[-2]
     pooled = (_POOLED_WEIGHT * DISPERSION**2 + total * all_axes) / (_POOLED_WEIGHT + total)
     drawn = (_AXIS_WEIGHT * pooled[..., None] + count * own) / (_AXIS_WEIGHT + count)
     return np.asarray(np.sqrt(np.maximum(drawn, 1.0)))
+
+
+def _variance(squares: FloatArray) -> FloatArray:
+    """s with mean(min(x², c² s)) = s E min(Z², c²) along the last axis, from the median on."""
+    found = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
+    for _ in range(_STEPS):
+        found = np.minimum(squares, _CUT**2 * found[..., None]).mean(axis=-1) / _MEAN_OF_CUT
+    return np.asarray(found)
 
 
 def _ratio(part: float, whole: float) -> float:

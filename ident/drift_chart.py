@@ -1,4 +1,5 @@
-"""A slow drift of one gain over many calibrations: the two-sided tabular CUSUM, and a limit for single points.
+"""A slow drift of one gain over many calibrations: the two-sided tabular CUSUM, with a limit for single points and one
+for the line through all of them.
 
 With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery, Introduction to Statistical
 Quality Control, ch. 9)::
@@ -7,8 +8,8 @@ Quality Control, ch. 9)::
 
 The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while there are fewer, of
 all that came before (Hawkins 1987), so that the zᵢ are independent and the chart watches from the second one on. The
-baseline's own uncertainty is part of the σ of zᵢ. What it cannot see: a drift during the first calibrations becomes
-part of the baseline in part.
+baseline's own uncertainty is part of the σ of zᵢ. A drift during the first calibrations becomes part of the baseline in
+part; `ident.drift_trend`, which needs none, is what sees more of it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ident.drift import DISPERSION
+from ident.drift_trend import line, trend
 
 FloatArray = NDArray[np.float64]
 
@@ -36,12 +38,14 @@ class Chart:
         reference: k [σ]: half the shift that is to be found soonest.
         threshold: h [σ]: how much has to add up.
         single: deviation of one calibration that is an alarm by itself [σ].
+        trend: slope of the line through all calibrations that is an alarm [its σ].
         baseline: number of calibrations that make it.
     """
 
-    reference: float = 1.0
-    threshold: float = 5.8
-    single: float = 5.0
+    reference: float = 1.25
+    threshold: float = 4.6
+    single: float = 5.2
+    trend: float = 4.3
     baseline: int = 12
 
 
@@ -55,6 +59,8 @@ class AlarmKind(Enum):
     """Small deviations to one side have added up (CUSUM)."""
     JUMP = "jump"
     """One calibration is far off by itself (Shewhart)."""
+    TREND = "trend"
+    """All calibrations lie about a line that rises or falls."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +69,7 @@ class Alarm:
 
     Attributes:
         index: of the calibration, from 0.
-        kind: drift where both hold.
+        kind: the first that holds, in the order of `AlarmKind`.
         rose: whether the gain's magnitude rose.
     """
 
@@ -78,13 +84,15 @@ class Drift:
 
     Attributes:
         baseline, baseline_std: what the newest calibrations are compared with, in the unit of the gains: the chart's
-            baseline, up to the onset where there is an alarm.
+            baseline, up to the onset where there is an alarm; where that is a trend, the beginning of the line.
         deviations: z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
         upper, lower: C⁺ and C⁻, shape (n,).
+        trend: t of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
         alarms: in the order of the calibrations.
-        onset: index of the last calibration before the change that the last alarm tells of; None without alarm.
-        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset if fewer)
-            [% of the baseline's magnitude].
+        onset: index of the last calibration before the change that the last alarm tells of, the first calibration for a
+            trend; None without alarm.
+        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset if fewer);
+            where the last alarm is a trend, along the line [% of the baseline's magnitude].
         change_sigmas: the same over its σ.
     """
 
@@ -93,6 +101,7 @@ class Drift:
     deviations: FloatArray
     upper: FloatArray
     lower: FloatArray
+    trend: FloatArray
     alarms: tuple[Alarm, ...]
     onset: int | None
     change_percent: float
@@ -102,6 +111,11 @@ class Drift:
     def alarmed(self) -> bool:
         """Whether the newest calibration raises an alarm."""
         return bool(self.alarms) and self.alarms[-1].index == len(self.deviations) - 1
+
+    @property
+    def steady(self) -> bool:
+        """Whether the change is told along the line."""
+        return bool(self.alarms) and self.alarms[-1].kind is AlarmKind.TREND
 
 
 def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION, chart: Chart = CHART) -> Drift:
@@ -123,28 +137,27 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
         raise ValueError("expected finite gains with σ > 0")
     sign = 1.0 if values.sum() > 0 else -1.0
     deviations, upper, lower = path(sign * values, stds, dispersion, chart)
-    lines = enumerate(zip(deviations, upper, lower, strict=True))
-    alarms = tuple(_alarm(i, *found, chart) for i, found in lines if _beyond(*found, chart))
+    slopes = trend(sign * values, stds, dispersion)
+    found = [_alarm(*one, chart) for one in enumerate(zip(deviations, upper, lower, slopes, strict=True))]
+    alarms = tuple(alarm for alarm in found if alarm is not None)
     onset = _onset(alarms[-1], upper, lower) if alarms else None
-    last = len(values) - 1
-    # What came after the onset is no part of what it is compared with.
-    first = max(1, min(last if onset is None else onset + 1, chart.baseline))
-    newest = max(1, min(_RECENT, len(values) - first))
-    baseline, baseline_std = _mean(values[:first], stds[:first])
-    recent, recent_std = _mean(values[-newest:], stds[-newest:])
-    if baseline == 0:
+    if alarms and alarms[-1].kind is AlarmKind.TREND:
+        change = _along_line(values, stds)
+    else:
+        change = _newest(values, stds, onset, chart)
+    if change.baseline == 0:
         raise ValueError("expected gains other than zero")
-    change = (recent - baseline) * sign if last else 0.0
     return Drift(
-        baseline=baseline,
-        baseline_std=dispersion * baseline_std,
+        baseline=change.baseline,
+        baseline_std=dispersion * change.baseline_std,
         deviations=deviations,
         upper=upper,
         lower=lower,
+        trend=slopes,
         alarms=alarms,
         onset=onset,
-        change_percent=100.0 * change / abs(baseline),
-        change_sigmas=change / (dispersion * math.hypot(recent_std, baseline_std)),
+        change_percent=100.0 * sign * change.change / abs(change.baseline),
+        change_sigmas=sign * change.change / (dispersion * change.change_std),
     )
 
 
@@ -174,6 +187,34 @@ def path(
     return deviations, upper, lower
 
 
+@dataclass(frozen=True, slots=True)
+class _Comparison:
+    """Then and now, in the unit of the gains, with σ of the fits."""
+
+    baseline: float
+    baseline_std: float
+    change: float
+    change_std: float
+
+
+def _newest(values: FloatArray, stds: FloatArray, onset: int | None, chart: Chart) -> _Comparison:
+    """The newest calibrations against the baseline."""
+    last = len(values) - 1
+    # What came after the onset is no part of what it is compared with.
+    first = max(1, min(last if onset is None else onset + 1, chart.baseline))
+    newest = max(1, min(_RECENT, len(values) - first))
+    baseline, baseline_std = _mean(values[:first], stds[:first])
+    recent, recent_std = _mean(values[-newest:], stds[-newest:])
+    change = recent - baseline if last else 0.0
+    return _Comparison(baseline, baseline_std, change, math.hypot(recent_std, baseline_std))
+
+
+def _along_line(values: FloatArray, stds: FloatArray) -> _Comparison:
+    """The end of the line against its beginning."""
+    found, steps = line(values, stds), len(values) - 1
+    return _Comparison(found.start, found.start_std, steps * found.slope, steps * found.slope_std)
+
+
 def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
     """Weighted by 1/σ², and its σ."""
     weights = 1.0 / stds**2
@@ -181,17 +222,20 @@ def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
     return float(weights @ values) / total, math.sqrt(1.0 / total)
 
 
-def _beyond(z: float, upper: float, lower: float, chart: Chart) -> bool:
-    return max(upper, lower) > chart.threshold or abs(z) > chart.single
-
-
-def _alarm(index: int, z: float, upper: float, lower: float, chart: Chart) -> Alarm:
+def _alarm(index: int, found: tuple[float, float, float, float], chart: Chart) -> Alarm | None:
+    z, upper, lower, slope = found
     if max(upper, lower) > chart.threshold:
         return Alarm(index, AlarmKind.DRIFT, bool(upper > lower))
-    return Alarm(index, AlarmKind.JUMP, bool(z > 0))
+    if abs(z) > chart.single:
+        return Alarm(index, AlarmKind.JUMP, bool(z > 0))
+    if abs(slope) > chart.trend:
+        return Alarm(index, AlarmKind.TREND, bool(slope > 0))
+    return None
 
 
 def _onset(alarm: Alarm, upper: FloatArray, lower: FloatArray) -> int:
     """The last calibration where the sum that has the alarm was zero (Page's estimate of the change point)."""
+    if alarm.kind is AlarmKind.TREND:
+        return 0
     line = (upper if alarm.rose else lower)[: alarm.index + 1]
     return int(np.flatnonzero(line == 0.0)[-1])

@@ -113,9 +113,9 @@ def gain_table(all_series: Sequence[Series]) -> Table:
 
 
 def axis_table(series: Series) -> Table:
-    """Every calibration of one gain, with the two sums that are watched."""
+    """Every calibration of one gain, with the two sums and the slope that are watched."""
     table = _table("fitted (UTC)")
-    headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −")
+    headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("alarm", no_wrap=True)
@@ -131,6 +131,7 @@ def axis_table(series: Series) -> Table:
             "-" if point.change is None else f"{abs(point.change.sigmas):.1f}",
             f"{stretch.drift.upper[place]:.1f}",
             f"{stretch.drift.lower[place]:.1f}",
+            f"{stretch.drift.trend[place]:+.1f}",
             "-" if alarm is None else alarm.kind.value,
             printable(_applied(point.entry, None)),
         )
@@ -153,6 +154,7 @@ def describe(
             "reference": CHART.reference,
             "threshold": CHART.threshold,
             "single": CHART.single,
+            "trend": CHART.trend,
             "baseline": CHART.baseline,
         },
         "pattern": pattern_of(all_series).value,

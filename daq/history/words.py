@@ -39,10 +39,17 @@ def alarm_words(series: Series) -> str | None:
     drift, onset = series.drift, series.onset
     if drift is None or onset is None or not drift.alarmed:
         return None
-    kind = drift.alarms[-1].kind
-    how = f"since {onset:%Y-%m-%d}" if kind is AlarmKind.DRIFT else f"at once, since {onset:%Y-%m-%d}"
-    moved = "rose" if drift.change_percent > 0 else "fell"
-    return f"gain of {series.axis} {moved} {abs(drift.change_percent):.1f} % {how}, {abs(drift.change_sigmas):.1f} σ"
+    rose, since = drift.change_percent > 0, f"since {onset:%Y-%m-%d}"
+    percent, sigmas = f"{abs(drift.change_percent):.1f} %", f"{abs(drift.change_sigmas):.1f} σ"
+    moved = "rose" if rose else "fell"
+    match drift.alarms[-1].kind:
+        case AlarmKind.DRIFT:
+            told = f"{moved} {percent} {since}"
+        case AlarmKind.JUMP:
+            told = f"{moved} {percent} at once, {since}"
+        case AlarmKind.TREND:
+            told = f"{'rises' if rose else 'falls'} steadily {since}, {percent} until now"
+    return f"gain of {series.axis} {told}, {sigmas}"
 
 
 def pattern_of(all_series: Sequence[Series]) -> Pattern:

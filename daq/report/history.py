@@ -1,4 +1,4 @@
-"""The picture of a history: each gain over time with its baseline, and beneath it what its deviations add up to."""
+"""The picture of a history: each gain over time with its baseline, and beneath it what raises alarms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _COLUMNS = 2
 
 
 def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:
-    """Draw gains ± 2σ, those that a controller had filled, alarms, and the CUSUM with its threshold.
+    """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
 
     Args:
         path: of the picture, .png or .svg.
@@ -40,12 +40,15 @@ def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart:
         band, column = divmod(number, columns)
         above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
         _draw_gains(above, series)
-        _draw_sums(beneath, series, chart)
+        _draw_limits(beneath, series, chart)
     for unused in range(len(all_series), columns * bands):
         for row in range(2):
             places[(2 * (bands - 1) + row) * columns + unused % columns].set_axis_off()
     _date(places, [_days(point.entry.created) for series in all_series for point in series.points])
-    legend_below(figure, places[0], places[columns])
+    upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
+    legend_below(figure, *upper)
+    # One legend for both kinds of panels would be wider than the picture of one axis.
+    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=_once(places[columns]))
     _save(figure, path)
 
 
@@ -65,20 +68,32 @@ def _draw_gains(place: Axes, series: Series) -> None:
         low, high = (drift.baseline + sign * _SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
         place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
         place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
+        if drift.steady:
+            reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
+            place.plot(ends, [drift.baseline, reached], color=ORANGE, linewidth=1.2, label="steady change")
     for noted in series.acknowledged:
         place.axvline(_days(noted.since), color=PURPLE, linestyle=":", linewidth=1.2, label="change acknowledged")
     place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
 
 
-def _draw_sums(place: Axes, series: Series, chart: Chart) -> None:
+def _draw_limits(place: Axes, series: Series, chart: Chart) -> None:
     place.axhline(0.0, color=GREY, linewidth=0.8)
     for sign in (-1.0, 1.0):
-        place.axhline(sign * chart.threshold, color=ORANGE, linestyle="--", linewidth=1.0, label="threshold h")
+        place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
     for stretch in series.stretches:
         times = [_days(point.entry.created) for point in series.points[stretch.began : stretch.ended]]
-        place.step(times, stretch.drift.upper, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
-        place.step(times, -stretch.drift.lower, where="mid", color=BLUE, linewidth=1.4)
-    place.set_ylabel("CUSUM [σ]", fontsize=8)
+        drift = stretch.drift
+        for sums in (drift.upper, -drift.lower):
+            place.step(times, sums / chart.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
+        place.plot(times, drift.trend / chart.trend, color=PURPLE, linewidth=1.0, label="trend")
+        place.plot(times, drift.deviations / chart.single, ".", color=GREY, markersize=4, label="one calibration")
+    place.set_ylabel("over its limit", fontsize=8)
+
+
+def _once(place: Axes) -> list[Any]:
+    """One handle a label."""
+    handles, labels = place.get_legend_handles_labels()
+    return list(dict(zip(labels, handles, strict=True)).values())
 
 
 def _days(at: datetime) -> float:

@@ -37,6 +37,11 @@ def drifting(week: int) -> tuple[float, ...]:
     return (1.0, 1.0, 1.0, 1.0 - 0.06 * min(max(week - 13, 0) / 12.0, 1.0), 1.0, 1.0)
 
 
+def sloping(week: int) -> tuple[float, ...]:
+    """J4 loses 0.2 % a week from the first calibration on."""
+    return (1.0, 1.0, 1.0, 1.0 - 0.002 * week, 1.0, 1.0)
+
+
 def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
     """All gains by their factors from the 15th calibration on."""
     return lambda week: factors if week > 14 else FLAT
@@ -122,6 +127,24 @@ def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsy
     assert 15 <= first <= 18
     assert found["in_force"] == digests[8]
     assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
+
+
+def test_a_drift_from_the_first_day_is_told_as_steady(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 9, sloping)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    told = re.search(r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until now, (\d\.\d) σ", out)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
+    assert "demagnetised" in out
+    found = _json(capsys, str(cell), "--axis", "J4")
+    point = found["axes"][0]["points"][-1]
+    assert point["alarm"] == "trend"
+    assert abs(point["trend_sigmas"]) == pytest.approx(float(told[2]), abs=0.05)
+    assert point["trend_sigmas"] < -found["chart"]["trend"]
+    picture = cell.parent / "history.svg"
+    assert main(["history", str(cell), "--plot", str(picture)]) == 0
+    assert b"steady change" in picture.read_bytes()
 
 
 def test_without_a_drift_there_is_no_alarm(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
