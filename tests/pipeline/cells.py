@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ class Job:
     """A finished job.
 
     Attributes:
-        cell_file, cell: as shipped.
+        cell_file, cell: a copy of the shipped one.
         folder: with plans, logs and calibration.yaml.
         truth: true gain by axis.
     """
@@ -63,9 +64,11 @@ def run_job(name: str, folder: Path, *, seconds: float, pairs: int, seed: int) -
         pairs: of runs, each with a plan of its own.
         seed: of plans and noise.
     """
-    cell_file = shipped_configurations() / "cells" / f"{name}.yaml"
+    # A copy: what is written to a controller leaves an audit and a history beside the cell file.
+    shutil.copytree(shipped_configurations(), folder / "configs")
+    cell_file = folder / "configs" / "cells" / f"{name}.yaml"
     cell = load_cell(cell_file)
-    payload = cell.payloads[0].name
+    payload, mass = cell.payloads[0].name, str(cell.payloads[0].mass_kg)
     logs = []
     for pair in range(pairs):
         plan = folder / f"plan-{pair}.yaml"
@@ -78,7 +81,7 @@ def run_job(name: str, folder: Path, *, seconds: float, pairs: int, seed: int) -
             bus = open_bus(bus_address(cell))
             try:
                 with SimulatedCell(replace(spec, seed=100 * seed + len(logs)), bus):
-                    chosen = [] if mounted is None else ["--payload", mounted]
+                    chosen = [] if mounted is None else ["--payload", mounted, "--mass", mass]
                     moving = ["--enable-motion", "--operator", "test"]
                     _do(["record", str(cell_file), str(plan), "--out", str(logs[-1]), *moving, *chosen])
             finally:
