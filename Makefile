@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-vcan vcan-tools check bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study effects-study tx40-study wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools check bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study effects-study tx40-study wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -25,6 +25,7 @@ help:
 	@echo "make planning-study  planned against random moves (docs/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make drift-study  how soon a drifting gain is told, and how often falsely (docs/history.md); a minute"
+	@echo "make holdout-study  what the hold-out gate sees of wrong gains (docs/write-back.md); a minute"
 	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/robots.md); minutes"
 	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/effects.md); two hours"
 	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/tx40.md); minutes"
@@ -101,6 +102,9 @@ tx40-study: setup
 
 effects-study: setup
 	$(BIN)/python -m tests.studies.effects_study
+
+holdout-study: setup
+	$(BIN)/python -m tests.studies.holdout_study
 
 drift-study: setup
 	$(BIN)/python -m tests.studies.drift_study

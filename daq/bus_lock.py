@@ -19,6 +19,7 @@ from daq.errors import BusTaken, OutputFailed
 
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
+MODE = 0o644
 VIRTUAL = "virtual"
 """python-can's bus within one process: a bus of that name in another process is another bus."""
 
@@ -90,7 +91,10 @@ def _open(lock: Path) -> int:
         with suppress(FileNotFoundError):
             return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
         with suppress(FileExistsError):
-            return os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            made = os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
+            # Whatever the umask says: who cannot open it would not learn that the bus is taken.
+            os.fchmod(made, MODE)
+            return made
 
 
 def _take(descriptor: int, lock: Path, bus: Bus) -> None:

@@ -85,6 +85,7 @@ def as_document(calibration: Calibration) -> dict[str, object]:
         "software": calibration.software,
         "session_began_s": calibration.session_began_s,
         "nameplate_holdout_error_percent": _error_document(calibration.nameplate_holdout_error_percent),
+        "recording_configuration_sha256": calibration.recording_configuration_sha256,
     }
 
 

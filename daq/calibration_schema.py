@@ -102,7 +102,8 @@ class CalibrationDocument(StrictModel):
     software: str
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
-    """Files of earlier versions do not have these two."""
+    recording_configuration_sha256: str | None = None
+    """Files of earlier versions do not have these three."""
 
 
 def _parameter(entry: ParameterEntry) -> Parameter:
@@ -153,4 +154,5 @@ def calibration_of(entries: CalibrationDocument) -> Calibration:
         software=entries.software,
         session_began_s=entries.session_began_s,
         nameplate_holdout_error_percent=_perhaps(entries.nameplate_holdout_error_percent),
+        recording_configuration_sha256=entries.recording_configuration_sha256,
     )

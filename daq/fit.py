@@ -31,6 +31,7 @@ from ident.relative_error import RelativeError, of_squares
 from ident.run import Run
 from ident.search import Finding
 from ident.signals import session_began_s
+from ident.system import System
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,30 +306,40 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         software=software(),
         session_began_s=session_began_s(final.trained) if isinstance(final, Evidence) else None,
         nameplate_holdout_error_percent=_nameplate_error(fitted),
+        recording_configuration_sha256=fitted.cell.recording_digest,
     )
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
-    """What the hold-out would be told of with nothing calibrated: the declared model and the nameplate's gains.
+    """What the hold-out would be told of with the nameplate's gains: same model, effects included, parameters refitted.
 
-    ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the scale of its gain, but ‖Y_j‖ does: the total is put together with the
-    ‖Y_j‖ of the calibration, so that a smaller gain alone makes no total smaller.
+    Without the effects, what they tell would be credited to the gains. ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the
+    scale of its gain, but ‖Y_j‖ does: the total is put together with the ‖Y_j‖ of the calibration, so that a smaller
+    gain alone makes no total smaller.
     """
-    before, after = fitted.identification, fitted.final.holdout_error
-    if before.holdout is None or after is None or before.estimate.gains_fixed:
+    final = fitted.final
+    training, unseen = _systems(final)
+    if unseen is None or final.estimate.gains_fixed:
         return None
     nameplate = np.array([axis.nameplate_gain for axis in fitted.cell.axes])
-    method = Method.ML if before.estimate.method is Method.TLS else before.estimate.method  # tls corrects gains
+    method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method  # tls corrects gains
     try:
-        held = estimate_with(method, before.system, nameplate)
+        held = estimate_with(method, training, nameplate)
     except (IdentificationError, np.linalg.LinAlgError):
         return None
-    axes = held.relative_error(before.holdout).axes
-    gains = np.concatenate((fitted.final.estimate.gains, np.zeros(len(held.parameters) + 1)))
-    size = before.holdout.joints.square_sum(gains)
+    axes = held.relative_error(unseen).axes
+    gains = np.concatenate((final.estimate.gains, np.zeros(len(held.parameters) + 1)))
+    size = unseen.joints.square_sum(gains)
     moved = size > 0.0
     left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
     return RelativeError(axes, of_squares(size, left).total)
+
+
+def _systems(model: Identification | Evidence) -> tuple[System, System | None]:
+    """The equations of the fit, and those that it has not seen; of evidence, with the columns of its effects."""
+    if isinstance(model, Identification):
+        return model.system, model.holdout
+    return model.training.system(), None if model.holdout is None else model.holdout.system()
 
 
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:

@@ -112,6 +112,7 @@ def record(
     free: FreeBytes = free_bytes,
     undisturbed: Undisturbed = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
+    before_motion: Callable[[], None] = lambda: None,
 ) -> Recorded:
     """Make a plan's moves and log every sample.
 
@@ -130,6 +131,8 @@ def record(
         free: room on the disk of a folder.
         undisturbed: keeps signals from the stop of the axes.
         progress: told the moves done and their number.
+        before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it
+            raises leaves the axes without power and no file.
 
     Raises:
         UsageError: the mass from the scale is not the payload's; nothing has moved and no file was made.
@@ -149,10 +152,25 @@ def record(
         warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
+        rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
+        # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
+        # the schedule of the recording's waits for nobody, and what follows here takes many periods.
+        if producer is not None:
+            producer.start()
+        start_counts = _standing(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
+        permission = MotionPermission(granted_by, motor_limits(cell, scale))
+        moves = motor_moves(cell, plan, scale, start_counts)
+        check_moves(start_counts, moves, permission, cell.axis_names)
+        room = DiskRoom(out, free)
+        longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
+        room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
+        short: DiskSpaceShort | None = None
+        # Not behind the first SYNC of the recording's stream: its schedule would not wait for the answer.
+        before_motion()
         started_ns = clocks.monotonic_ns()
         run = RunInfo(
             run_id=run_id,
-            rate_hz=1e6 / _sync(cell).period_us,
+            rate_hz=rate_hz,
             payload=payload,
             operator=operator,
             software=software(),
@@ -162,24 +180,7 @@ def record(
             entered_kg=entered_kg,
             controller_sha256=controller_digest(cell),
         )
-        # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
-        # the schedule of the recording's waits for nobody, and what follows here takes many periods.
-        if producer is not None:
-            producer.start()
-        pacing = _pacing(cell, run, clocks, producer)
-        asking = SyncStream(network, pacing)
-        start = until_complete(asking)[-1]
-        asking.check()
-        network.check_feedback(start)
-        permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        start_counts = start.position_counts
-        moves = motor_moves(cell, plan, scale, start_counts)
-        check_moves(start_counts, moves, permission, cell.axis_names)
-        content = LogContent(run, bundle(cell_file), readback, cell.axis_names)
-        room = DiskRoom(out, free)
-        duration_s = duration_of(moves, start_counts, run.rate_hz) + ALLOWANCE_S
-        room.require(largest_log_bytes(cell.axis_names, run.rate_hz, duration_s, content.files))
-        short: DiskSpaceShort | None = None
+        content = LogContent(run, files, readback, cell.axis_names)
         with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
             done = 0
 
@@ -190,12 +191,12 @@ def record(
                     done += 1
                     progress(done, len(moves))
 
-            stream = SyncStream(network, pacing, keep)
+            stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), keep)
             for sample in until_complete(stream):
                 log.write(sample)
             with closing(execute(network, stream, moves, permission)) as samples:
                 try:
-                    keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * run.rate_hz)))
+                    keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * rate_hz)))
                 except DiskSpaceShort as error:
                     short = error
             stream.read_on(LATE_LOSSES_S)
@@ -262,6 +263,15 @@ def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
     while samples[-1].missing:
         samples.append(next(stream))  # the stream's own bound on incomplete cycles in a row ends this
     return tuple(samples)
+
+
+def _standing(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
+    """Where the axes are, as their PDOs and their objects both say [counts]."""
+    asking = SyncStream(network, pacing)
+    start = until_complete(asking)[-1]
+    asking.check()
+    network.check_feedback(start)
+    return start.position_counts
 
 
 def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
@@ -338,9 +348,9 @@ def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManage
     return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
 
 
-def _pacing(cell: Cell, run: RunInfo, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
+def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
     sync = _sync(cell)
-    period_ns, start_ns, clock = sync.period_us * 1000, run.started_wall_ns, clocks.monotonic_ns
+    period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
     if producer is not None:
         in_kernel = isinstance(producer, KernelProducer)
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)

@@ -10,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.atomic_file import replace_file
+from daq.configuration.yaml_file import MAX_BYTES
 from daq.errors import (
     CalibrationMissing,
     ConfigurationInconsistent,
@@ -28,6 +29,7 @@ from daq.minisign import (
     parse_secret_key,
     parse_signature,
 )
+from daq.regular_file import read_regular
 
 SUFFIX = ".minisig"
 _NAME = re.compile(r"[^\W_][\w.-]{0,63}")
@@ -97,7 +99,7 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
     path = signature_path(file, _checked(name))
     key = _secret_key(secret_key, password)
     content = _read_signed(file)
-    if path.exists() and not path.read_bytes().startswith(UNTRUSTED.encode()):
+    if _is_in_the_way(path):
         raise OutputExists(
             str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
         )
@@ -142,7 +144,7 @@ def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = N
             except (ValueError, OSError) as error:
                 raise SignatureInvalid(
                     str(path),
-                    found=str(error),
+                    found=_spelled(error),
                     expected=f"the signature of {name} for {file.name} as it is now",
                     remedy=f"have {name} look at the calibration and sign it again, or remove the signature",
                 ) from error
@@ -214,23 +216,35 @@ def _read_key(path: Path) -> str:
 
 
 def _unfit(path: Path, error: Exception) -> SecretKeyUnfit:
-    found = (error.strerror or type(error).__name__).lower() if isinstance(error, OSError) else str(error)
     return SecretKeyUnfit(
         str(path),
-        found=found,
+        found=_spelled(error),
         expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",
         remedy="check the name (the file that ends in .key is the secret one) and the password",
     )
 
 
+def _spelled(error: Exception) -> str:
+    return (error.strerror or type(error).__name__).lower() if isinstance(error, OSError) else str(error)
+
+
+def _is_in_the_way(path: Path) -> bool:
+    """Whether something stands there that is no earlier signature: a pipe, a folder, a file of another kind."""
+    if not path.exists():
+        return False
+    try:
+        return not _text_of(path).startswith(UNTRUSTED)
+    except (OSError, ValueError):
+        return True
+
+
 def _text_of(path: Path) -> str:
-    with path.open("rb") as stream:
-        return stream.read(_LARGEST_BYTES).decode()
+    return read_regular(path, _LARGEST_BYTES).decode()
 
 
 def _read_signed(file: Path) -> bytes:
     try:
-        return file.read_bytes()
+        return read_regular(file, MAX_BYTES)
     except OSError as error:
         raise CalibrationMissing(
             str(file),

@@ -30,6 +30,9 @@ DriverError
 
 from __future__ import annotations
 
+WHILE = "while "
+"""How every note begins that says of an error what the stop, or the giving back, behind it could not confirm."""
+
 
 class DriverError(Exception):
     """Root of the tree; carries the evidence as attributes and says it in its message."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import can
 
-from drivers.errors import DataFrozen, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
+from drivers.errors import WHILE, DataFrozen, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
 from drivers.event import CellEvent, EventKind
 from drivers.frozen import FrozenData
 from drivers.mapping import SETPOINT_PDOS, Direction, layout
@@ -113,11 +113,11 @@ def execute(
             if not problems:
                 network.unguard()
         for problem in problems:
-            error.add_note(f"while stopping: {problem}")
+            error.add_note(f"{WHILE}stopping: {problem}")
         raise
     if problems:
         for problem in problems[1:]:
-            problems[0].add_note(f"while stopping: {problem}")
+            problems[0].add_note(f"{WHILE}stopping: {problem}")
         raise problems[0]
     stream.check()  # what happened during the stop
 
@@ -130,7 +130,7 @@ def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError
             problems: list[DriverError] = end.value
             return problems
         except BaseException as cut:
-            cut.add_note("while stopping: the stop was cut short")
+            cut.add_note(f"{WHILE}stopping: the stop was cut short")
             raise
 
 

@@ -14,6 +14,7 @@ import can
 
 from drivers.axis import Axis, Identity
 from drivers.errors import (
+    WHILE,
     BusBusy,
     DriverError,
     FeedbackDiffers,
@@ -147,13 +148,13 @@ class CanopenNetwork:
             with self.undisturbed():
                 problems = self._give_back() if self._originals else []
         except BaseException as cut:
-            cut.add_note("while closing the network: it was cut short, and not every axis has its settings back")
+            cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")
             raise
         finally:
             self.link.close()
         if error is not None:
             for problem in problems:
-                error.add_note(f"while closing the network: {problem}")
+                error.add_note(f"{WHILE}closing the network: {problem}")
         elif problems:
             for problem in problems[1:]:
                 problems[0].add_note(str(problem))

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Self
 
 from drivers.bus import BusAddress
-from drivers.errors import BusError, DriverError
+from drivers.errors import WHILE, BusError, DriverError
 from drivers.link import SYNC_COB_ID
 from drivers.network import CanopenNetwork
 from drivers.profile import ObjectEntry
@@ -164,7 +164,7 @@ class DriveProducer:
         except DriverError as problem:
             if error is None:
                 raise
-            error.add_note(f"while stopping SYNC: {problem}")
+            error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
         """A drive keeps its period by itself."""

@@ -119,8 +119,11 @@ class Calibration:
         configuration_sha256: of the cell configuration that the logs carry.
         created: ISO 8601 time, given by the caller.
         software: name and version that made it.
-        nameplate_holdout_error_percent: on the same run, of the declared model fitted with the nameplate's gains; its
-            axes are put together with the torques of the calibration. None where there is none to compare.
+        nameplate_holdout_error_percent: on the same run, of the same model, effects included, fitted with the
+            nameplate's gains; its axes are put together with the torques of the calibration. None where there is none
+            to compare.
+        recording_configuration_sha256: of what of that configuration a recording depends on; None in calibrations of
+            earlier versions.
         session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where not all told.
     """
 
@@ -140,3 +143,4 @@ class Calibration:
     software: str
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeError | None = None
+    recording_configuration_sha256: str | None = None

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import norm
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
 _FEWEST_DIFFERENCES = 4
 _CUT = 1.5
 """Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
+_FARTHEST = 1e100
+"""Differences over their σ; farther ones are all the same, and their squares still numbers."""
 _MEAN_OF_CUT = float(1.0 - 2.0 * norm.sf(_CUT) - 2.0 * _CUT * norm.pdf(_CUT) + 2.0 * _CUT**2 * norm.sf(_CUT))
 """E min(Z², c²) of a standard normal Z."""
 _MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
@@ -58,7 +60,6 @@ class ChangeDecision:
         axes: names, as they were given.
         changes: one an axis.
         adjusted: probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
-        joint: probability of the whole vector of changes (χ²), None where the correlation of the errors is unknown.
         words: the same in one sentence.
     """
 
@@ -66,7 +67,6 @@ class ChangeDecision:
     axes: tuple[str, ...]
     changes: tuple[Change, ...]
     adjusted: tuple[float, ...]
-    joint: float | None
     words: str
 
 
@@ -99,20 +99,17 @@ def decide(
     new_std: ArrayLike,
     *,
     dispersion: ArrayLike = DISPERSION,
-    correlation: tuple[ArrayLike, ArrayLike] | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> ChangeDecision:
     """Whether a recalibration changes anything, over all axes together.
 
-    Each axis is looked at by itself, with the probabilities corrected for there being several. Where the correlation
-    of the errors is known, the vector of all changes is tested too (δᵀ Σ⁻¹ δ against χ²), which sees many small
-    changes; the two share the false alarms evenly. A fixed per cent is nowhere asked for.
+    Each axis is looked at by itself, with the probabilities corrected for there being several, however their errors
+    depend on each other. A fixed per cent is nowhere asked for.
 
     Args:
         axes: n names.
         old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
         dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
-        correlation: of the errors of the old and of the new gains, shape (n, n) each; None where unknown.
         false_alarm: share of recalibrations without change in which one is found, at most.
 
     Raises:
@@ -124,11 +121,9 @@ def decide(
         change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
     )
     adjusted = _holm(np.array([change.probability for change in changes]))
-    joint = None if correlation is None else _joint(columns, correlation)
-    probabilities = [float(adjusted.min(initial=1.0))] + ([] if joint is None else [joint])
-    level = false_alarm / len(probabilities)
-    words = _words(axes, changes, adjusted, joint, level)
-    return ChangeDecision(min(probabilities) <= level, axes, changes, tuple(map(float, adjusted)), joint, words)
+    differs = bool(adjusted.min(initial=1.0) <= false_alarm)
+    words = _words(axes, changes, adjusted, false_alarm)
+    return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
@@ -150,7 +145,9 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     if count < _FEWEST_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
     # Not about their own centre, which of few differences is too near to them.
-    squares = (np.diff(values) / np.hypot(stds[..., 1:], stds[..., :-1])) ** 2
+    with np.errstate(over="ignore"):
+        away = 2.0 * (np.abs(np.diff(values / 2.0)) / np.hypot(stds[..., 1:], stds[..., :-1]))
+    squares = np.minimum(away, _FARTHEST) ** 2
     own = _variance(squares)
     all_axes = _variance(squares.reshape(*squares.shape[:-2], -1))
     total = count * values.shape[-2]
@@ -174,18 +171,6 @@ def _ratio(part: float, whole: float) -> float:
     return math.copysign(math.inf, part) if part else 0.0
 
 
-def _joint(columns: list[FloatArray], correlation: tuple[ArrayLike, ArrayLike]) -> float:
-    old, old_std, new, new_std, dispersion = columns
-    covariance = sum(
-        np.outer(dispersion * std, dispersion * std) * np.asarray(matrix, float)
-        for std, matrix in zip((old_std, new_std), correlation, strict=True)
-    )
-    change = new - old
-    return float(
-        chi2.sf(change @ np.linalg.pinv(covariance, hermitian=True) @ change, np.linalg.matrix_rank(covariance))
-    )
-
-
 def _holm(probabilities: FloatArray) -> FloatArray:
     """Adjusted for several tests: the smallest times their number, the next times one less, never falling."""
     order = np.argsort(probabilities)
@@ -195,20 +180,20 @@ def _holm(probabilities: FloatArray) -> FloatArray:
     return adjusted
 
 
-def _words(
-    axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, joint: float | None, level: float
-) -> str:
+def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:
     if not axes:
         return "no gain to compare"
     told = [
-        f"{axis} {change.percent:+.2g} % ({abs(change.sigmas):.1f} σ, p = {p:.2g} among {len(axes)})"
+        f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {len(axes)})"
         for axis, change, p in zip(axes, changes, adjusted, strict=True)
     ]
-    together = "" if joint is None else f"; all together p = {joint:.2g}"
     changed = [text for text, p in zip(told, adjusted, strict=True) if p <= level]
     if changed:
-        return f"changed by more than noise: {', '.join(changed)}{together}"
+        return f"changed by more than noise: {', '.join(changed)}"
     largest = told[int(np.argmax([abs(change.sigmas) for change in changes]))]
-    if joint is not None and joint <= level:
-        return f"no gain alone has changed by more than noise, all together have: the largest is {largest}{together}"
-    return f"no gain has changed by more than noise: the largest change is {largest}{together}"
+    return f"no gain has changed by more than noise: the largest change is {largest}"
+
+
+def _short(sigmas: float) -> str:
+    """A number of a few digits, however many σ it is."""
+    return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"

@@ -28,6 +28,10 @@ FloatArray = NDArray[np.float64]
 
 _RECENT = 3
 """Calibrations that the size of a change is averaged over: enough to tame noise, few enough to be of now."""
+_FINEST = 2.0**-52
+"""σ of the largest gain over itself: no number is written finer."""
+_APART = 1e3
+"""How far σ may lie from the middle one, as a factor: beyond, a weight is all or nothing as it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +139,10 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
         raise ValueError(f"expected as many values as σ, at least one, found shapes {values.shape} and {stds.shape}")
     if not (np.isfinite(values).all() and np.isfinite(stds).all() and (stds > 0).all()):
         raise ValueError("expected finite gains with σ > 0")
+    scale = float(np.abs(values).max())
+    if scale == 0:
+        raise ValueError("expected gains other than zero")
+    values, stds = values / scale, _in_reach(stds, scale)
     sign = 1.0 if values.sum() > 0 else -1.0
     deviations, upper, lower = path(sign * values, stds, dispersion, chart)
     slopes = trend(sign * values, stds, dispersion)
@@ -148,8 +156,8 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
     if change.baseline == 0:
         raise ValueError("expected gains other than zero")
     return Drift(
-        baseline=change.baseline,
-        baseline_std=dispersion * change.baseline_std,
+        baseline=scale * change.baseline,
+        baseline_std=dispersion * scale * change.baseline_std,
         deviations=deviations,
         upper=upper,
         lower=lower,
@@ -187,9 +195,17 @@ def path(
     return deviations, upper, lower
 
 
+def _in_reach(stds: FloatArray, scale: float) -> FloatArray:
+    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes, or leaves nothing of the others."""
+    with np.errstate(over="ignore"):
+        relative = np.clip(stds / scale, _FINEST, 1.0 / _FINEST)
+    middle = float(np.median(relative))
+    return np.asarray(np.clip(relative, middle / _APART, middle * _APART))
+
+
 @dataclass(frozen=True, slots=True)
 class _Comparison:
-    """Then and now, in the unit of the gains, with σ of the fits."""
+    """Then and now, over the scale of the gains, with σ of the fits."""
 
     baseline: float
     baseline_std: float

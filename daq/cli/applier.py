@@ -18,9 +18,6 @@ from daq.history.store import HistoryStore
 _LOG = logging.getLogger("drivegain")
 
 ByOption = Annotated[str | None, typer.Option("--by", help="Who does it, for the audit; you, by default.")]
-AuditOption = Annotated[
-    Path | None, typer.Option("--audit", help="Where it is written down, instead of in the cell's audit.")
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +47,9 @@ def applier(by: str | None) -> Applier:
     return Applier(by or login, login)
 
 
-def audit_of(cell: Cell | None, given: Path | None) -> Path | None:
-    """Where writes are written down; None only where no cell and no file was named."""
-    if given is not None:
-        return given
-    return None if cell is None or cell.history is None else cell.history.audit
+def audit_of(cell: Cell) -> Path | None:
+    """Where the writes of a cell are written down; None only for a cell that was read from a log."""
+    return None if cell.history is None else cell.history.audit
 
 
 def tell_history(cell: Cell, tell: Callable[[HistoryStore], object]) -> None:

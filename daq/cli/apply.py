@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -15,16 +16,21 @@ import typer
 from rich.console import Console
 
 from daq.calibration_file import decode, read
-from daq.cli.applier import Applier, AuditOption, ByOption, applier, audit_of, tell_history
-from daq.cli.apply_drives import DrivesOption, RamOnlyOption, SaveUnknownOption, apply_drives, saving_of
+from daq.cli.applier import Applier, ByOption, applier, audit_of, tell_history
+from daq.cli.apply_drives import apply_drives
+from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
-from daq.errors import CalibrationRefused, OutputFailed, UsageError
+from daq.errors import CalibrationRefused, DaqError, OutputFailed, UsageError
 from daq.history.store import HistoryStore
+from daq.recalibration.past import Past
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
-from daq.write_back.controller_write import Written
+from daq.write_back.audit import told_of
+from daq.write_back.controller_write import Written, sha256
+from daq.write_back.link import followed
 from ident.calibration import Calibration
 
 
@@ -57,7 +63,6 @@ def apply_verb(
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
     save_unknown: SaveUnknownOption = False,
-    audit: AuditOption = None,
     json: JsonOption = False,
 ) -> None:
     """Write identified gains into the controller file: dry run and diff first, --yes to write, with a backup.
@@ -69,7 +74,7 @@ def apply_verb(
     fitted = decode(content, str(calibration))
     policy = tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent)
     masses_kg = entered_masses(payload_mass or (), fitted)
-    book = audit_of(declared, audit)
+    book = audit_of(declared)
     if drives:
         if to is not None:
             raise UsageError(
@@ -107,24 +112,19 @@ def apply_verb(
         calibration_file=calibration,
         calibration_content=content,
     )
+    stds = _stds_in_file(declared, proposal, now)
     if not json:
-        show(proposal, Console())
+        show(proposal, Console(), stds)
     try:
         written = _write(proposal, now, book, doer) if yes else None
     except CalibrationRefused:
         if json:
-            print_json(describe(proposal, None))
+            print_json(describe(proposal, None, stds))
         raise
-    if written is not None:
-        digest, target = hashlib.sha256(content).hexdigest(), str(written.file)
-
-        def enter(store: HistoryStore) -> None:
-            store.add(fitted, digest=digest, at=now)
-            store.applied(digest, at=now, who=str(doer), target=target)
-
-        tell_history(declared, enter)
+    if yes and not proposal.refusals:
+        tell_history(declared, partial(_enter, proposal, written, fitted, content, now, doer, book))
     if json:
-        print_json(describe(proposal, written))
+        print_json(describe(proposal, written, stds))
     if proposal.refusals:
         raise refused(proposal)
     if not json:
@@ -192,6 +192,39 @@ def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier)
         return apply(proposal, now, audit=audit, who=str(doer))
     except OSError as error:
         raise OutputFailed.of(proposal.file, error) from error
+
+
+def _stds_in_file(declared: Cell, proposal: Proposal, now: datetime) -> dict[str, float]:
+    """σ of the gains in the controller's file where the history knows it; a history that cannot be read knows none."""
+    if declared.history is None:
+        return {}
+    try:
+        with Past(declared, declared.history, proposal.file, lambda: now, "") as past:
+            return past.stds_in_force({change.axis: change.old for change in proposal.changes})
+    except DaqError:  # `tell_history` says so, once something is written
+        return {}
+
+
+def _enter(
+    proposal: Proposal,
+    written: Written | None,
+    fitted: Calibration,
+    content: bytes,
+    now: datetime,
+    doer: Applier,
+    audit: Path | None,
+    store: HistoryStore,
+) -> None:
+    """The controller has these gains; also where an earlier command wrote them and was killed before it told so."""
+    digest, target = hashlib.sha256(content).hexdigest(), str(followed(proposal.file))
+    store.add(fitted, digest=digest, at=now)
+    if written is None and store.in_force(target) == digest:
+        return
+    after = sha256(proposal.after_content)
+    told = None if written is None else written.audit_sha256
+    if written is None and audit is not None:
+        told = told_of(audit, target, after)
+    store.applied(digest, at=now, who=str(doer), target=target, audit=told, sha256_after=after)
 
 
 def _say_outcome(

@@ -91,7 +91,7 @@ def history_verb(
         if csv is not None:
             _write_csv(csv, chosen)
         entries = store.entries()
-        checked = verify_history(place, store) if verify else None
+        checked = verify_history(declared, place, store) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:
             document = describe(declared.name, entries, chosen, all_series, store.in_force())
@@ -156,7 +156,7 @@ def _acknowledge(
             remedy='give it: --why "gearbox changed"',
         )
     # Of a drift, only the newest calibration surely shows the gain as it is now.
-    begins = series.points[-1].entry.created if since is None else _day(since)
+    begins = series.points[-1].entry.recorded if since is None else _day(since)
     who = str(applier(by))
     try:
         entry = append(

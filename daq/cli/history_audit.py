@@ -9,9 +9,11 @@ from typing import Any
 from rich.console import Console
 
 from daq.cli.verb import printable
+from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.errors import AuditBroken, HistoryUnreadable
 from daq.history.store import HistoryStore
+from daq.recalibration.session import sessions
 from daq.write_back.audit import AuditVerdict, verify
 
 
@@ -94,6 +96,12 @@ class Checked:
             )
 
 
-def verify_history(place: HistoryPlace, store: HistoryStore) -> Checked:
-    """Check both files. Raises as `daq.write_back.audit.verify` and the store."""
-    return Checked(place.audit, place.store, verify(place.audit, store.audited()), store.integrity())
+def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Checked:
+    """Check both files; what must be in the audit, the history knows, and the sessions of scheduled recalibrations.
+
+    Raises as `daq.write_back.audit.verify` and the store.
+    """
+    past = () if cell.recalibration is None else sessions(cell.recalibration.folder)
+    ends = [session.state.audit_sha256 for session in past]
+    heads = store.audited().union(end for end in ends if end is not None)
+    return Checked(place.audit, place.store, verify(place.audit, heads), store.integrity())

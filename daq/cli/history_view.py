@@ -59,7 +59,7 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
 
 def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], in_force: str | None) -> Table:
     """One row a calibration."""
-    table = _table("fitted (UTC)", "calibration")
+    table = _table("recorded (UTC)", "calibration")
     table.add_column("error %", justify="right", no_wrap=True)
     table.add_column("largest change", justify="right", no_wrap=True)
     table.add_column("alarms", no_wrap=True)
@@ -69,12 +69,12 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], in
         for series in all_series
         for index, point in enumerate(series.points)
     }
-    for entry in entries:
+    for entry in sorted(entries, key=lambda one: one.recorded):
         points = [(s, *changes[s.axis, entry.digest]) for s in all_series if (s.axis, entry.digest) in changes]
         alarms = [s.axis for s, index, _ in points if s.alarm_at(index) is not None]
         error = entry.error_percent if entry.holdout_percent is None else entry.holdout_percent
         table.add_row(
-            f"{entry.created:%Y-%m-%d %H:%M}",
+            f"{entry.recorded:%Y-%m-%d %H:%M}",
             entry.digest[:8],
             f"{error:.2f}",
             _largest([point for _, _, point in points]),
@@ -114,7 +114,7 @@ def gain_table(all_series: Sequence[Series]) -> Table:
 
 def axis_table(series: Series) -> Table:
     """Every calibration of one gain, with the two sums and the slope that are watched."""
-    table = _table("fitted (UTC)")
+    table = _table("recorded (UTC)")
     headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
@@ -125,7 +125,7 @@ def axis_table(series: Series) -> Table:
         place = index - stretch.began
         alarm = series.alarm_at(index)
         table.add_row(
-            f"{point.entry.created:%Y-%m-%d %H:%M}",
+            f"{point.entry.recorded:%Y-%m-%d %H:%M}",
             with_deviation(point.gain.value, point.gain.std),
             "-" if point.change is None else f"{point.change.percent:+.2f}",
             "-" if point.change is None else f"{abs(point.change.sigmas):.1f}",

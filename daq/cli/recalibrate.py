@@ -20,7 +20,7 @@ from daq.recalibration.job import preview, recalibrate
 from daq.recalibration.journal import Form, Journal, Level, form_of
 from daq.recalibration.report import document, text
 from daq.recalibration.tools import Tools
-from drivers.errors import DriverError
+from drivers.errors import WHILE, DriverError
 from ident.errors import IdentificationError
 
 
@@ -43,7 +43,7 @@ def recalibrate_verb(
     try:
         _run(cell, dry_run, json, journal)
     except KeyboardInterrupt as interrupt:
-        notes = [note for note in getattr(interrupt, "__notes__", ()) if note.startswith("while ")]
+        notes = [note for note in getattr(interrupt, "__notes__", ()) if note.startswith(WHILE)]
         journal.say(Level.ERROR, "interrupted", axes="; ".join(notes) or "stopped")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except (DaqError, DriverError, IdentificationError) as error:

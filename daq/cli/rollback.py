@@ -11,13 +11,14 @@ import typer
 from rich.console import Console
 from rich.syntax import Syntax
 
-from daq.cli.applier import AuditOption, ByOption, applier, audit_of, tell_history
-from daq.cli.apply_drives import DrivesOption, RamOnlyOption, SaveUnknownOption, rollback_drives, saving_of
+from daq.cli.applier import ByOption, applier, audit_of, tell_history
+from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
+from daq.cli.rollback_drives import rollback_drives
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
-from daq.write_back.controller_write import Restored, roll_back
+from daq.write_back.controller_write import Restored, roll_back, sha256
 
 
 def rollback(
@@ -31,16 +32,29 @@ def rollback(
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
     save_unknown: SaveUnknownOption = False,
-    audit: AuditOption = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="With --drives: write; without it the way back is only shown.")
+    ] = False,
+    audit: Annotated[
+        Path | None, typer.Option("--audit", help="Where it is written down, where no --cell says it.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Take the last write to a controller file back; what that replaces is backed up too, so a second one undoes it.
 
     A file that somebody has edited since, and a backup that somebody has changed, are refused. With --to alone nothing
-    says where the audit is: give it with --audit, or nothing is written down.
+    says where the audit is: give it with --audit, or nothing is written down. Drives are shown first and written on
+    --yes: what stands in them is in no file that one could look at.
     """
     declared = None if cell is None else load_cell(cell)
-    now, doer, book = datetime.now(UTC), applier(by), audit_of(declared, audit)
+    if declared is not None and audit is not None:
+        raise UsageError(
+            "--audit",
+            found="--cell beside it",
+            expected="one of the two: what is done to a cell's controller is in the cell's audit",
+            remedy="leave --audit out; `history: {audit: ...}` of the cell file says where its audit is",
+        )
+    now, doer, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared)
     if drives:
         if declared is None or to is not None:
             raise UsageError(
@@ -50,7 +64,7 @@ def rollback(
                 remedy="name the cell, and no file",
             )
         saving = saving_of(ram_only, save_unknown)
-        rollback_drives(declared, now=now, doer=doer, saving=saving, audit=book, json=json)
+        rollback_drives(declared, now=now, doer=doer, saving=saving, audit=book, yes=yes, json=json)
         return
     file = _file(declared, cell, to)
     try:
@@ -64,8 +78,16 @@ def rollback(
     except OSError as error:
         raise OutputFailed.of(file, error) from error
     if declared is not None:
-        target = str(done.file)
-        tell_history(declared, lambda store: store.rolled_back(at=now, who=str(doer), target=target))
+        tell_history(
+            declared,
+            lambda store: store.rolled_back(
+                at=now,
+                who=str(doer),
+                target=str(done.file),
+                sha256_after=sha256(done.after),
+                audit=done.audit_sha256,
+            ),
+        )
     diff = _diff(done)
     if json:
         print_json(

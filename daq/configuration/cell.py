@@ -161,6 +161,8 @@ class Cell:
         recalibration: what a scheduled job does; None where there is none, or the cell was read from a log.
         folder: of the cell file; None for a cell that was read from a log.
         digest: sha256 of the cell file and all files it refers to, hex.
+        recording_digest: the same of what they say and a recording or its fit depends on: without comments, and without
+            what becomes of a calibration later (`policy`, `history`, `recalibration`).
     """
 
     name: str
@@ -176,6 +178,7 @@ class Cell:
     clearance: Clearance | None
     folder: Path | None
     digest: str
+    recording_digest: str
     motion: MotionPolicy = MotionPolicy.ASK
     apply: ApplyPolicy = DEFAULT_APPLY_POLICY
     history: HistoryPlace | None = None

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from daq.configuration.apply_policy import max_change_faults
 from daq.configuration.cell import (
     Axis,
     Bus,
@@ -23,8 +25,8 @@ from daq.configuration.drive import drive_from_text
 from daq.configuration.drive_train import ratio_of
 from daq.configuration.history_place import history_place
 from daq.configuration.joint_unit import MILLIMETRE
-from daq.configuration.yaml_file import parse_yaml, read_bytes, read_model
-from daq.errors import ConfigurationMissing
+from daq.configuration.yaml_file import describe, parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing
 from daq.resources import shipped_configurations
 from drivers.axis import Identity
 from drivers.profile import DriveProfile, TapPoint
@@ -79,6 +81,8 @@ def cell_from_bundle(
         for member in (f"{DRIVES}{drive}.yaml",)
     }
     check(document, model, urdf, profiles)
+    if faults := list(max_change_faults(model.policy.apply, [axis.name for axis in model.axes])):
+        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
         name=model.name,
@@ -94,6 +98,7 @@ def cell_from_bundle(
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
+        recording_digest=_recording_digest({name: files[name] for name in used}),
         motion=model.policy.motion,
         apply=model.policy.apply.policy,
         history=None if file is None else history_place(model.history, file),
@@ -108,6 +113,24 @@ def digest(files: Mapping[str, bytes]) -> str:
         total.update(f"{name}\0{len(files[name])}\0".encode())
         total.update(files[name])
     return total.hexdigest()
+
+
+_AFTERWARDS = ("policy", "history", "recalibration")
+"""Keys of a cell file that say what becomes of a calibration; no recording and no fit asks for them."""
+
+
+def _recording_digest(files: Mapping[str, bytes]) -> str:
+    """`digest` of what the files say, not of how: comments, line breaks and the order of keys do not count."""
+    return digest({name: _canonical(name, content) for name, content in files.items()})
+
+
+def _canonical(name: str, content: bytes) -> bytes:
+    if name == URDF:
+        return content
+    tree = parse_yaml(content, name).tree
+    if name == CELL:
+        tree = {key: value for key, value in tree.items() if key not in _AFTERWARDS}
+    return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
 
 
 def _sources(path: Path) -> dict[str, Path]:

@@ -11,7 +11,7 @@ from enum import Enum
 from pathlib import Path
 
 from daq.calibration_file import as_document, decode, encode
-from daq.errors import CalibrationUnreadable, DaqError, ExitCode, LogsDiffer, exit_code
+from daq.errors import CalibrationUnreadable, DaqError, ExitCode, LogsDiffer, LogUnreadable, exit_code
 from daq.fit import calibration_of, close_loop, fit
 from daq.fleet.log_store import StoredLog, at_hand, fingerprint
 from daq.fleet.summary import Summary, summary_of
@@ -90,6 +90,7 @@ def fit_cell(
     with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
         try:
             for seen in (*cell.fit, *cell.holdout):
+                _check_name(seen.log)
                 paths[at_hand(seen.log, Path(folder))] = seen.log
             logs = list(paths)
             fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :])
@@ -101,6 +102,19 @@ def fit_cell(
         except (DaqError, DriverError, IdentificationError) as error:
             return Unfitted(failure_of(error, paths), clock() - begun_s)
     return Fitted(summary_of(calibration), content, clock() - begun_s)
+
+
+def _check_name(log: StoredLog) -> None:
+    """A calibration names its logs: a name that is no text has no place in it."""
+    try:
+        log.name.encode()
+    except UnicodeEncodeError as error:
+        raise LogUnreadable(
+            log.address,
+            found="bytes in its name that are no UTF-8",
+            expected="a name that a calibration can tell",
+            remedy="rename it",
+        ) from error
 
 
 def _check_unchanged(cell: CellLogs) -> None:

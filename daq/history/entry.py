@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
 
-from ident.calibration import Gain
+from ident.calibration import Calibration, Gain, Source
 
 
 class Deed(Enum):
@@ -28,6 +29,7 @@ class Event:
         who: the person or the job.
         target: the controller's file.
         audit: SHA-256 of the entry in the audit that tells of it, None where none was given.
+        sha256_after: of what the target held afterwards, None where none was given.
     """
 
     digest: str | None
@@ -36,6 +38,7 @@ class Event:
     who: str
     target: str
     audit: str | None = None
+    sha256_after: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,8 @@ class Entry:
     Attributes:
         digest: SHA-256 of its file.
         created: when it was fitted, UTC; when it was entered where its own time cannot be read.
+        recorded: when the newest log of its fit was recorded, UTC; as `created` where no log tells.
+        logs: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings.
         entered: when it was entered, UTC.
         cell: name of the cell.
         configuration_sha256: of the cell configuration that its logs carry.
@@ -58,6 +63,8 @@ class Entry:
 
     digest: str
     created: datetime
+    recorded: datetime
+    logs: str
     entered: datetime
     cell: str
     configuration_sha256: str
@@ -73,23 +80,6 @@ class Entry:
     def applied(self) -> bool:
         """Whether a controller ever had its gains."""
         return bool(self.events)
-
-
-@dataclass(frozen=True, slots=True)
-class GainRecord:
-    """One gain of one calibration.
-
-    Attributes:
-        digest: of the calibration.
-        created: of the calibration, UTC.
-        gain: value ± σ, unit, nameplate.
-        applied: whether a controller ever had it.
-    """
-
-    digest: str
-    created: datetime
-    gain: Gain
-    applied: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +101,25 @@ class Acknowledgement:
     who: str
     why: str
     audit: str
+
+
+def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
+    """When the newest log of a fit was recorded, UTC; `otherwise` where none tells."""
+    told = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
+    try:
+        return datetime.fromtimestamp(max(seconds for seconds in told if seconds is not None), UTC)
+    except (ValueError, OverflowError, OSError):
+        return otherwise.astimezone(UTC)
+
+
+def logs_of(calibration: Calibration, digest: str) -> str:
+    """Digest of the logs of a fit, as a set; that of the calibration itself where it names none."""
+    logs = sorted({one.sha256 for one in _fitted(calibration)})
+    return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
+
+
+def _fitted(calibration: Calibration) -> list[Source]:
+    return [one for one in calibration.sources if one.role == "fit"]
 
 
 def utc(text: str, otherwise: datetime) -> datetime:

@@ -15,6 +15,8 @@ _TABLES = """
 CREATE TABLE calibration (
     digest               TEXT NOT NULL PRIMARY KEY,  -- SHA-256 of calibration.yaml
     created              TEXT NOT NULL,              -- ISO 8601, UTC, as all times here
+    recorded             TEXT NOT NULL,              -- newest log of the fit; as created where no log tells
+    logs                 TEXT NOT NULL,              -- SHA-256 of the digests of the fit's logs, sorted
     entered              TEXT NOT NULL,
     cell                 TEXT NOT NULL,
     configuration_sha256 TEXT NOT NULL,
@@ -42,7 +44,8 @@ CREATE TABLE event (
     at     TEXT NOT NULL,
     who    TEXT NOT NULL,
     target TEXT NOT NULL,
-    audit  TEXT                                      -- SHA-256 of the entry in the audit that tells of it
+    audit  TEXT,                                     -- SHA-256 of the entry in the audit that tells of it
+    sha256_after TEXT                                -- of what the target held afterwards, NULL where unknown
 ) STRICT;
 CREATE TABLE acknowledgement (
     number INTEGER PRIMARY KEY AUTOINCREMENT,

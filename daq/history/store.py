@@ -19,7 +19,7 @@ from daq.calibration_file import encode
 from daq.errors import HistoryMixed
 from daq.history import schema
 from daq.history.database import Access, connect, telling, transaction
-from daq.history.entry import Acknowledgement, Deed, Entry, Event, GainRecord, iso, utc
+from daq.history.entry import Acknowledgement, Deed, Entry, Event, iso, logs_of, recorded_at, utc
 from ident.calibration import Calibration, Gain
 
 
@@ -69,9 +69,12 @@ class HistoryStore:
                 return False
             self._check_like(calibration)
             holdout = calibration.holdout_error_percent
+            created = utc(calibration.created, at)
             row = (
                 digest,
-                iso(utc(calibration.created, at)),
+                iso(created),
+                iso(recorded_at(calibration, created)),
+                logs_of(calibration, digest),
                 iso(at),
                 calibration.cell,
                 calibration.configuration_sha256,
@@ -82,7 +85,7 @@ class HistoryStore:
                 calibration.rows,
                 encode(calibration).decode(),
             )
-            connection.execute("INSERT INTO calibration VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            connection.execute("INSERT INTO calibration VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
             connection.executemany(
                 "INSERT INTO gain VALUES (?, ?, ?, ?, ?, ?, ?)",
                 [
@@ -92,7 +95,16 @@ class HistoryStore:
             )
         return True
 
-    def applied(self, digest: str, *, at: datetime, who: str, target: str, audit: str | None = None) -> None:
+    def applied(
+        self,
+        digest: str,
+        *,
+        at: datetime,
+        who: str,
+        target: str,
+        audit: str | None = None,
+        sha256_after: str | None = None,
+    ) -> None:
         """A calibration's gains were written.
 
         Args:
@@ -102,6 +114,7 @@ class HistoryStore:
             target: the controller's file, as the audit names it.
             audit: SHA-256 of the entry in the audit that tells of it; `drivegain history --verify` looks for it there,
                 and so notices an audit whose end was cut off.
+            sha256_after: of what the target holds now, by which a rollback to it is recognised.
 
         Raises:
             ValueError: the calibration was never entered, or the time has no zone.
@@ -110,19 +123,25 @@ class HistoryStore:
         with self._writing() as connection:
             if not connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
                 raise ValueError(f"calibration {digest[:12]}… is not in the history")
-            self._note(connection, Event(digest, Deed.APPLIED, at, who, target, audit))
+            self._note(connection, Event(digest, Deed.APPLIED, at, who, target, audit, sha256_after))
 
-    def rolled_back(self, *, at: datetime, who: str, target: str, audit: str | None = None) -> str | None:
-        """The last write to `target` was taken back: it has the gains again that it had before.
+    def rolled_back(
+        self, *, at: datetime, who: str, target: str, sha256_after: str, audit: str | None = None
+    ) -> str | None:
+        """A write to `target` was taken back: it holds again what it held before.
+
+        Args:
+            at, who, target, audit: as in `applied`.
+            sha256_after: of what the target holds now. What was written with a calibration is recognised by it; what a
+                person has entered in between is in no calibration.
 
         Returns:
             digest of the calibration whose gains these are, None where the history does not know.
         """
         with self._writing() as connection:
-            earlier = [event.digest for event in self.events() if event.target == target]
-            # A rollback exchanges the file with its backup, so a second one brings the first state back.
-            digest = earlier[-2] if len(earlier) > 1 else None
-            self._note(connection, Event(digest, Deed.ROLLED_BACK, at, who, target, audit))
+            same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
+            digest = same[-1].digest if same else None
+            self._note(connection, Event(digest, Deed.ROLLED_BACK, at, who, target, audit, sha256_after))
         return digest
 
     def acknowledge(self, noted: Acknowledgement) -> None:
@@ -137,42 +156,18 @@ class HistoryStore:
         """All calibrations, oldest first by when they were fitted."""
         events = self.events()
         rows = self._rows(
-            "SELECT digest, created, entered, cell, configuration_sha256, method, software, error_percent,"
-            " holdout_percent, rows FROM calibration ORDER BY created, entered, digest"
+            "SELECT digest, created, recorded, logs, entered, cell, configuration_sha256, method, software,"
+            " error_percent, holdout_percent, rows FROM calibration ORDER BY created, entered, digest"
         )
         gains: dict[str, list[Gain]] = {}
         for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
             gains.setdefault(digest, []).append(Gain(*gain))
         with telling(self.path, Access.READ):
-            return tuple(
-                Entry(
-                    digest=digest,
-                    created=_time(created),
-                    entered=_time(entered),
-                    cell=cell,
-                    configuration_sha256=configuration,
-                    method=method,
-                    software=software,
-                    error_percent=error,
-                    holdout_percent=holdout,
-                    rows=count,
-                    gains=tuple(gains.get(digest, ())),
-                    events=tuple(event for event in events if event.digest == digest),
-                )
-                for digest, created, entered, cell, configuration, method, software, error, holdout, count in rows
-            )
-
-    def gains(self) -> tuple[GainRecord, ...]:
-        """All gains of all calibrations, in the order of `entries` and of the axes."""
-        return tuple(
-            GainRecord(entry.digest, entry.created, gain, entry.applied)
-            for entry in self.entries()
-            for gain in entry.gains
-        )
+            return tuple(_entry(row, gains.get(row[0], []), events) for row in rows)
 
     def events(self) -> tuple[Event, ...]:
         """All writes to controllers, oldest first."""
-        rows = self._rows("SELECT digest, deed, at, who, target, audit FROM event ORDER BY number")
+        rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
         with telling(self.path, Access.READ):
             return tuple(Event(row[0], Deed(row[1]), _time(row[2]), *row[3:]) for row in rows)
 
@@ -236,8 +231,16 @@ class HistoryStore:
 
     def _note(self, connection: sqlite3.Connection, event: Event) -> None:
         connection.execute(
-            "INSERT INTO event (digest, deed, at, who, target, audit) VALUES (?, ?, ?, ?, ?, ?)",
-            (event.digest, event.deed.value, iso(event.at), event.who, event.target, event.audit),
+            "INSERT INTO event (digest, deed, at, who, target, audit, sha256_after) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (
+                event.digest,
+                event.deed.value,
+                iso(event.at),
+                event.who,
+                event.target,
+                event.audit,
+                event.sha256_after,
+            ),
         )
 
     def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
@@ -261,3 +264,23 @@ def _time(text: str) -> datetime:
     if found.tzinfo is None:
         raise ValueError(f"{text!r} is a time without its zone")
     return found
+
+
+def _entry(row: tuple[Any, ...], gains: list[Gain], events: tuple[Event, ...]) -> Entry:
+    digest, created, recorded, logs, entered, cell, configuration, method, software, error, holdout, rows = row
+    return Entry(
+        digest=digest,
+        created=_time(created),
+        recorded=_time(recorded),
+        logs=logs,
+        entered=_time(entered),
+        cell=cell,
+        configuration_sha256=configuration,
+        method=method,
+        software=software,
+        error_percent=error,
+        holdout_percent=holdout,
+        rows=rows,
+        gains=tuple(gains),
+        events=tuple(event for event in events if event.digest == digest),
+    )

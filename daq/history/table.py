@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from daq.history.watch import Series
+from daq.report.spreadsheet import inert_row
 
 COLUMNS = (
     "axis",
-    "created",
+    "recorded",
     "gain",
     "std",
     "unit",
@@ -34,6 +35,7 @@ COLUMNS = (
     "method",
     "software",
     "configuration_sha256",
+    "created",
     "entered",
     "digest",
 )
@@ -45,12 +47,12 @@ def rows(series: Series) -> list[dict[str, Any]]:
 
 
 def csv_text(all_series: Sequence[Series]) -> str:
-    """All rows with a header (RFC 4180)."""
+    """All rows with a header (RFC 4180); no text in it is a formula to a spreadsheet."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\r\n")
     writer.writeheader()
     for series in all_series:
-        writer.writerows(rows(series))
+        writer.writerows(map(inert_row, rows(series)))
     return text.getvalue()
 
 
@@ -62,7 +64,7 @@ def _row(series: Series, index: int) -> dict[str, Any]:
     last = entry.events[-1] if entry.events else None
     return {
         "axis": series.axis,
-        "created": entry.created.isoformat(),
+        "recorded": entry.recorded.isoformat(),
         "gain": gain.value,
         "std": gain.std,
         "unit": gain.unit,
@@ -85,6 +87,7 @@ def _row(series: Series, index: int) -> dict[str, Any]:
         "method": entry.method,
         "software": entry.software,
         "configuration_sha256": entry.configuration_sha256,
+        "created": entry.created.isoformat(),
         "entered": entry.entered.isoformat(),
         "digest": entry.digest,
     }

@@ -55,7 +55,8 @@ class Series:
     Attributes:
         axis, unit: of the gain.
         dispersion: how much more repeated calibrations scatter than σ says; it is in every σ that is told here.
-        points: oldest first; calibrations that held the gain fixed are left out, they know nothing of it.
+        points: oldest recording first, one for the same logs; calibrations that held the gain fixed are left out, they
+            know nothing of it.
         stretches: between changes that were explained, oldest first.
         watching: whether the last of them goes on; not where no calibration came since the last explanation.
         acknowledged: changes that were explained, oldest first.
@@ -86,10 +87,10 @@ class Series:
 
     @property
     def onset(self) -> datetime | None:
-        """When the last calibration before the change was made; None without alarm."""
+        """When the last calibration before the change was recorded; None without alarm."""
         if self.drift is None or self.drift.onset is None:
             return None
-        return self.points[self.began + self.drift.onset].entry.created
+        return self.points[self.began + self.drift.onset].entry.recorded
 
     def stretch_at(self, index: int) -> Stretch:
         """The stretch that a point is in, by its index in `points`."""
@@ -107,26 +108,45 @@ def watch(
     """One series an axis, in the order of the axes.
 
     Args:
-        entries: oldest first, of one cell, with gains of the same axes and units.
+        entries: of one cell, with gains of the same axes and units.
         acknowledgements: oldest first.
         chart: limits.
     """
     if not entries:
         return ()
-    found = [
-        [
-            (entry, gain)
-            for entry in entries
-            for gain in entry.gains
-            if gain.axis == axis and gain.std > 0 and gain.value
-        ]
-        for axis in (gain.axis for gain in entries[-1].gains)
-    ]
+    found = [_known(entries, gain.axis) for gain in entries[-1].gains]
     factors = _dispersions(found)
     return tuple(
         _series(gain.axis, gain.unit, known, factor, [a for a in acknowledgements if a.axis == gain.axis], chart)
         for gain, known, factor in zip(entries[-1].gains, found, factors, strict=True)
     )
+
+
+def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
+    """Calibrations that identified the gain of an axis, with it."""
+    known = {
+        entry.digest: gain
+        for entry in entries
+        for gain in entry.gains
+        if gain.axis == axis and gain.std > 0 and gain.value
+    }
+    identified = [entry for entry in entries if entry.digest in known]
+    return [(entry, known[entry.digest]) for entry in of_each_recording(identified)]
+
+
+def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
+    """One calibration for the same logs, in the order in which the logs were recorded.
+
+    What is watched is the robot: the same logs fitted again tell nothing new of it, and logs of last year tell of last
+    year, whenever they were fitted. Of several fits the newest counts that was applied, else the newest.
+
+    Args:
+        entries: of one cell.
+    """
+    chosen: dict[str, Entry] = {}
+    for entry in sorted(entries, key=lambda one: (one.applied, one.created, one.entered)):
+        chosen[entry.logs] = entry
+    return tuple(sorted(chosen.values(), key=lambda one: (one.recorded, one.created, one.entered)))
 
 
 def _series(
@@ -137,7 +157,7 @@ def _series(
     acknowledged: list[Acknowledgement],
     chart: Chart,
 ) -> Series:
-    starts = {sum(entry.created < a.since for entry, _ in known) for a in acknowledged}
+    starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
     bounds = sorted({0, *starts, len(known)})
     stretches = []
     for began, ended in pairwise(bounds):

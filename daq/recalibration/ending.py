@@ -10,16 +10,19 @@ from pathlib import Path
 from daq.atomic_file import replace_file
 from daq.configuration.cell import Cell
 from daq.configuration.recalibration import Recalibration
-from daq.errors import AuditUnusable, DaqError, ExitCode, OutputFailed, exit_code
+from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code
+from daq.history.store import HistoryStore
 from daq.recalibration import session as sessions
 from daq.recalibration.fitting import calibration_of_session
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.metrics import Figures, write_metrics
+from daq.recalibration.past import digests_in_force
 from daq.recalibration.recording import GainTarget
 from daq.recalibration.report import SUMMARY_JSON, SUMMARY_TEXT, Conclusion, document, text
 from daq.recalibration.session import Outcome, Session, SessionState
 from daq.recalibration.tools import Tools
 from daq.write_back.audit import AuditAction, AuditEntry, append
+from drivers.errors import WHILE
 
 CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}
 """Of ends that are no errors; the others are OK."""
@@ -62,7 +65,7 @@ class Ending:
             outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
             code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
             problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-            notes = [note for note in getattr(error, "__notes__", ()) if note.startswith("while ")]
+            notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(WHILE)]
             self._tell(session, outcome, code, "; ".join((problem, *notes)), problem)
         except (DaqError, OSError, StopIteration) as second:
             error.add_note(f"kept: the session's end could not be written down: {second}")
@@ -105,11 +108,21 @@ class Ending:
         self.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
         self._write_summary(conclusion)
         self._write_metrics(conclusion, now)
-        for folder in sessions.remove_old(sessions.sessions(self.section.folder), self.section.keep_sessions):
-            self.journal.say(Level.INFO, "old session removed", folder=str(folder))
+        self._remove_old()
         if unwritten is not None:
             raise unwritten
         return conclusion
+
+    def _remove_old(self) -> None:
+        try:
+            with HistoryStore(self.target.history.store) as store:
+                in_force = digests_in_force(store)
+        except HistoryUnreadable as error:
+            # What a controller rests on is not known: nothing of it may go.
+            self.journal.say(Level.WARNING, "no old session removed", text=str(error))
+            return
+        for folder in sessions.remove_old(sessions.sessions(self.section.folder), self.section.keep_sessions, in_force):
+            self.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
     def _write_summary(self, conclusion: Conclusion) -> None:
         if conclusion.session is None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
 
 from daq.calibration_file import load, save
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, DataError, OutputFailed
-from daq.fit import calibration_of
 from daq.recalibration import session as sessions
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.recording import Cellside, log_of
@@ -38,7 +39,7 @@ def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Ses
         # The same logs would end in the same way: the next job records others.
         sessions.save(replace(session, state=session.state.with_(outcome=Outcome.UNFIT)))
         raise
-    calibration = calibration_of(closed, side.tools.now())
+    calibration = side.tools.calibration(closed, side.tools.now())
     path, report = session.folder / CALIBRATION, session.folder / REPORT
     try:
         save(calibration, path)
@@ -58,6 +59,12 @@ def calibration_of_session(session: Session) -> Calibration | None:
     if fitted is None or digest_of(path) != fitted.calibration_sha256:
         return None
     try:
-        return load(path)
+        return _loaded(path, fitted.calibration_sha256)
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
+
+
+@lru_cache(maxsize=2)
+def _loaded(path: Path, _sha256: str) -> Calibration:
+    """Read once for all that tell of it: a content of that digest stays what it is."""
+    return load(path)

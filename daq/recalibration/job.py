@@ -18,7 +18,7 @@ from daq.recalibration.fitting import calibration_of_session, fit_session
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.past import Past
 from daq.recalibration.preflight import before_motion, due_in, require_clock, section_of, target_of
-from daq.recalibration.recording import Cellside, record_runs, standing_runs
+from daq.recalibration.recording import Cellside, basis_of, record_runs, standing_runs
 from daq.recalibration.report import Conclusion
 from daq.recalibration.session import Outcome, Session
 from daq.recalibration.time_bound import time_bound
@@ -104,7 +104,7 @@ def preview(
         return Preview((), early.remark)
     with bus_lock(cell, lock_folder):
         found = sessions.sessions(section.folder)
-        session = sessions.to_take_up(found, cell.digest, now, section.resume_within_h)
+        session = sessions.to_take_up(found, basis_of(cell, section), now, section.resume_within_h)
         made = () if session is None else tuple(run.name for run in standing_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
@@ -127,6 +127,11 @@ def _go(side: Cellside, session: Session, journal: Journal) -> Session:
     session, calibration = fit_session(side, session, journal.within(step="fit"))
     with Past(side.cell, side.target.history, side.target.file, side.tools.now, side.who) as past:
         past.keep(calibration, session.folder / sessions.CALIBRATION)
+        session = sessions.save(replace(session, state=session.state.with_(watched=past.watched())))
+        for gain in session.state.watched:
+            if gain.alarm:
+                # Slices of a slow drift may each be small enough to be written without anybody.
+                journal.within(step="watch").say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
         return settle(side, session, calibration, past, journal.within(step="decide"))
 
 
@@ -144,10 +149,10 @@ def _not_due(section: Recalibration, now: datetime) -> Conclusion | None:
 
 
 def _taken_up_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
-    found = sessions.sessions(section.folder)
-    session = sessions.to_take_up(found, cell.digest, now, section.resume_within_h)
+    found, basis = sessions.sessions(section.folder), basis_of(cell, section)
+    session = sessions.to_take_up(found, basis, now, section.resume_within_h)
     if session is None:
-        session = sessions.begin(section.folder, cell.name, cell.digest, now)
+        session = sessions.begin(section.folder, basis, now)
         journal.within(session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
         return session
     state = session.state.with_(

@@ -90,6 +90,10 @@ def _tell_session(gauge: _Gauges, state: SessionState, cell: str) -> None:
         lost.labels(cell, run.name).set(run.lost_cycles)
         missing.labels(cell, run.name).set(sum(run.missing))
         attempts.labels(cell, run.name).set(run.attempts)
+    if state.watched:
+        alarm = gauge("drift_alarm", "1 where the chart of all calibrations raises an alarm, else 0.", "axis")
+        for watched in state.watched:
+            alarm.labels(cell, watched.axis).set(float(bool(watched.alarm)))
     if state.decision is not None:
         drift = gauge("gain_drift_sigma", "Change from the gain in the controller, in σ of the change.", "axis")
         in_force = gauge("gain_in_force", "In the controller when the job looked, in Nm or N per A.", "axis", "unit")

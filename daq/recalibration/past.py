@@ -10,11 +10,12 @@ from typing import Self
 
 import numpy as np
 
-from daq.calibration_file import decode
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.history.store import HistoryStore
-from daq.recalibration.session import digest_of
+from daq.history.watch import of_each_recording, watch
+from daq.history.words import alarm_words
+from daq.recalibration.session import WatchedGain, digest_of
 from daq.write_back.link import followed
 from ident.calibration import Calibration
 from ident.drift import DISPERSION, dispersions
@@ -67,33 +68,45 @@ class Past:
         self._digest = digest_of(path) or ""
         self._store.add(calibration, digest=self._digest, at=self._now())
 
-    def note_applied(self) -> None:
-        """The controller has this session's gains; noted once. Raises as `keep`."""
+    def note_applied(self, audit_sha256: str | None = None) -> None:
+        """The controller has this session's gains; noted once. Raises as `keep`.
+
+        Args:
+            audit_sha256: of the audit's entry about the write, where it is known.
+        """
         if self._store.in_force(self._target) != self._digest:
-            self._store.applied(self._digest, at=self._now(), who=self._who, target=self._target)
+            self._store.applied(self._digest, at=self._now(), who=self._who, target=self._target, audit=audit_sha256)
+
+    def watched(self) -> tuple[WatchedGain, ...]:
+        """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
+        series = watch(self._store.entries(), self._store.acknowledgements())
+        return tuple(WatchedGain(axis=one.axis, alarm=alarm_words(one) or "") for one in series)
 
     def stds_in_force(self, gains: dict[str, float]) -> dict[str, float]:
         """σ of gains in the controller's file, by axis.
 
-        That of the calibration which the history has as in force, where the number is still that calibration's; 0 for
-        one that somebody entered by hand, or of which nothing is known: then only the new one's σ counts.
+        That of the calibration which the history has as in force, where the number is still that calibration's; else
+        that of the newest earlier calibration whose number it is, since a write is not always told to the history (a
+        process was killed behind it, a backup was copied back by hand); 0 for a number of no calibration, which
+        somebody entered: then only the new one's σ counts.
 
         Args:
             gains: in the file now, by axis.
         """
-        digest = self._store.in_force(self._target)
-        document = None if digest is None else self._store.document(digest)
-        known = () if document is None else decode(document, f"calibration {digest}").gains
-        stds = {
-            gain.axis: gain.std
-            for gain in known
-            if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std
-        }
-        return {axis: stds.get(axis, 0.0) for axis in gains}
+        in_force = self._store.in_force(self._target)
+        # This session's own calibration is what is judged: a number that happens to be near to it is not it.
+        entries = [one for one in self._store.entries() if one.digest == in_force or one.digest != self._digest]
+        entries.sort(key=lambda entry: entry.digest == in_force)
+        stds = dict.fromkeys(gains, 0.0)
+        for entry in entries:  # the last one that fits counts
+            for gain in entry.gains:
+                if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
+                    stds[gain.axis] = gain.std
+        return stds
 
     def dispersions(self) -> dict[str, float]:
         """How much more this cell's calibrations scatter than their σ says, by axis (`ident.drift.dispersions`)."""
-        entries = [entry for entry in self._store.entries() if entry.digest != self._digest]
+        entries = of_each_recording([entry for entry in self._store.entries() if entry.digest != self._digest])
         rows = [{gain.axis: gain for gain in entry.gains if gain.std > 0} for entry in entries]
         whole = [row for row in rows if set(self._axes) <= row.keys()]
         if not whole:
@@ -102,3 +115,9 @@ class Past:
             np.array([[getattr(row[axis], part) for row in whole] for axis in self._axes]) for part in ("value", "std")
         )
         return dict(zip(self._axes, map(float, dispersions(values, stds)), strict=True))
+
+
+def digests_in_force(store: HistoryStore) -> frozenset[str]:
+    """Digests of the calibrations whose gains some controller has, as far as a history knows."""
+    newest = {event.target: event.digest for event in store.events()}
+    return frozenset(digest for digest in newest.values() if digest is not None)

@@ -7,6 +7,7 @@ from datetime import datetime, timedelta
 from daq.configuration.cell import Cell, MotionPolicy
 from daq.configuration.recalibration import Recalibration
 from daq.errors import ClockWentBack, ConfigurationInconsistent, DiskSpaceShort, OutputFailed
+from daq.payload_mass import agree
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.recording import Cellside, GainTarget
 from daq.recalibration.release import require_release
@@ -60,7 +61,7 @@ def section_of(cell: Cell) -> Recalibration:
                 expected=f"one of the cell's payloads: {', '.join(payloads) or 'there are none'}",
                 remedy="correct the cell file",
             )
-        if abs(run.mass_kg - payload.mass_kg) > payload.mass_tolerance_kg:
+        if not agree(run.mass_kg, payload.mass_kg, payload.mass_tolerance_kg):
             raise ConfigurationInconsistent(
                 f"recalibration.runs[{index}].mass_kg",
                 found=f"{run.mass_kg:g} kg",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import uuid
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from daq.plan import Plan
 from daq.plan_file import load_plan, save_plan
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.release import mount, require_release
-from daq.recalibration.session import RecordedRun, Session, digest_of, save
+from daq.recalibration.session import Basis, RecordedRun, Session, digest_of, save
 from daq.recalibration.tools import Tools
 from daq.record import Recorded
 from daq.salvage import salvage
@@ -68,6 +69,12 @@ class Cellside:
 def log_of(session: Session, name: str) -> Path:
     """Where the log of a run is."""
     return session.folder / f"{name}.mcap"
+
+
+def basis_of(cell: Cell, section: Recalibration) -> Basis:
+    """What a session of this cell rests on now; a plan that is not there is another one."""
+    plans = [digest_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
+    return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
 
 
 def standing_runs(session: Session) -> Session:
@@ -163,8 +170,12 @@ def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: P
 
 
 def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
-    """One recording, after the interlock has said yes to it."""
-    require_release(side.section.interlock, side.tools.run, side.tools.now(), side.section.working_folder)
+    """One recording. The interlock is asked before the drives are, and again right before they get power."""
+
+    def released() -> None:
+        require_release(side.section.interlock, side.tools.run, side.tools.now(), side.section.working_folder)
+
+    released()
     return side.tools.record(
         side.file,
         side.cell,
@@ -177,6 +188,8 @@ def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recor
         run_id=str(uuid.uuid4()),
         free=side.tools.free,
         undisturbed=side.undisturbed,
+        # Waiting for the drives and mapping their PDOs takes seconds, in which somebody may open the cell.
+        before_motion=released,
     )
 
 

@@ -63,6 +63,9 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
             lines += ["", "Residual:", *(f"  {sentence}" for sentence in state.fitted.sentences)]
         if state.decision is not None:
             lines += ["", f"Gains: {state.decision.remark}", *map(_gain_line, state.decision.gains)]
+        drifts = [gain.alarm for gain in state.watched if gain.alarm]
+        if drifts:
+            lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
         lines += ["", f"Folder: {session.folder}"]
         if (session.folder / REPORT / "report.html").exists():
             lines.append(f"Report: {session.folder / REPORT / 'report.html'}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -107,10 +108,17 @@ class Target(StrictModel):
     after_sha256: str
 
 
+class WatchedGain(StrictModel):
+    """What the chart of a gain over all calibrations says (`daq.history.watch`); no words where it raises no alarm."""
+
+    axis: str
+    alarm: str
+
+
 class SessionState(StrictModel):
     """`state.json`; what a step has not made yet is None, or not in the list.
 
-    The digest is that of the audit's entry about the session's end.
+    `plans_sha256` is of the approved plans that runs name, `audit_sha256` of the audit's entry about the session's end.
     """
 
     format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
@@ -118,11 +126,13 @@ class SessionState(StrictModel):
     session: str
     cell: str
     configuration_sha256: str
+    plans_sha256: str = ""
     began: str
     attempt: int = 1
     attempt_began: str
     runs: tuple[RecordedRun, ...] = ()
     fitted: Fitted | None = None
+    watched: tuple[WatchedGain, ...] = ()
     decision: Decision | None = None
     target: Target | None = None
     outcome: Outcome | None = None
@@ -170,7 +180,22 @@ def sessions(folder: Path) -> tuple[Session, ...]:
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
 
 
-def begin(folder: Path, cell: str, configuration_sha256: str, now: datetime) -> Session:
+@dataclass(frozen=True, slots=True)
+class Basis:
+    """What all recordings of a session have in common.
+
+    Attributes:
+        cell: name.
+        configuration_sha256: of its configuration.
+        plans_sha256: of the approved plans that its runs name.
+    """
+
+    cell: str
+    configuration_sha256: str
+    plans_sha256: str
+
+
+def begin(folder: Path, basis: Basis, now: datetime) -> Session:
     """Make the folder of a new session and write its state.
 
     Raises:
@@ -185,7 +210,14 @@ def begin(folder: Path, cell: str, configuration_sha256: str, now: datetime) -> 
     except OSError as error:
         raise OutputFailed.of(folder, error) from error
     at = now.isoformat(timespec="seconds")
-    state = SessionState(session=name, cell=cell, configuration_sha256=configuration_sha256, began=at, attempt_began=at)
+    state = SessionState(
+        session=name,
+        cell=basis.cell,
+        configuration_sha256=basis.configuration_sha256,
+        plans_sha256=basis.plans_sha256,
+        began=at,
+        attempt_began=at,
+    )
     return save(Session(folder / name, state))
 
 
@@ -203,13 +235,14 @@ def save(session: Session) -> Session:
     return session
 
 
-def to_take_up(found: tuple[Session, ...], configuration_sha256: str, now: datetime, within_h: float) -> Session | None:
-    """The newest session, if it waits for its end: of this configuration, and young enough."""
+def to_take_up(found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float) -> Session | None:
+    """The newest session, if it waits for its end: of this configuration, with these plans, and young enough."""
     if not found or found[-1].finished:
         return None
     last = found[-1]
     young = timedelta(0) <= now - last.began <= timedelta(hours=within_h)
-    return last if young and last.state.configuration_sha256 == configuration_sha256 else None
+    its = Basis(last.state.cell, last.state.configuration_sha256, last.state.plans_sha256)
+    return last if young and its == basis else None
 
 
 def last_good(found: tuple[Session, ...]) -> Session | None:
@@ -222,8 +255,13 @@ def last_good(found: tuple[Session, ...]) -> Session | None:
     return good[-1] if good else None
 
 
-def remove_old(found: tuple[Session, ...], keep: int) -> tuple[Path, ...]:
-    """Remove the oldest sessions beyond so many; the last good one stays.
+def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:
+    """Remove the oldest sessions beyond so many; the last good one stays, and so does what a controller rests on.
+
+    Args:
+        found: oldest first.
+        keep: so many of the newest stay.
+        in_force: digests of the calibrations whose gains a controller has: their logs and signatures are its evidence.
 
     Returns:
         what was removed; what the file system does not let go stays.
@@ -231,7 +269,8 @@ def remove_old(found: tuple[Session, ...], keep: int) -> tuple[Path, ...]:
     good = last_good(found)
     removed = []
     for session in found[:-keep]:
-        if session is not good:
+        fitted = session.state.fitted
+        if session is not good and (fitted is None or fitted.calibration_sha256 not in in_force):
             with suppress(OSError):
                 shutil.rmtree(session.folder)
                 removed.append(session.folder)

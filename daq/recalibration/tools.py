@@ -10,7 +10,7 @@ from pathlib import Path
 
 from daq.configuration.cell import Cell
 from daq.disk_space import FreeBytes, free_bytes
-from daq.fit import Fit, close_loop, fit
+from daq.fit import Fit, calibration_of, close_loop, fit
 from daq.plan import Plan, plan
 from daq.recalibration.command import Runner, run_command
 from daq.recalibration.drives import check_drives
@@ -31,8 +31,8 @@ class Tools:
     Attributes:
         save_report: writes the report of a fit into a folder.
         drives: looks at the drives before anything moves.
-        plan, record, fit, close_loop, account, propose, apply: of daq.plan, daq.record, daq.fit, ident.before_after and
-            daq.write_back.apply.
+        plan, record, fit, close_loop, calibration, account, propose, apply: of daq.plan, daq.record, daq.fit,
+            ident.before_after and daq.write_back.apply.
         run: runs a command of the cell's.
         free: tells the room on a disk.
         now: wall clock with time zone.
@@ -45,6 +45,7 @@ class Tools:
     record: Callable[..., Recorded] = record
     fit: Callable[..., Fit] = fit
     close_loop: Callable[..., Fit] = close_loop
+    calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[..., Account] = account
     propose: Callable[..., Proposal] = propose_for
     apply: Callable[..., Written | None] = apply

@@ -10,6 +10,7 @@ from pathlib import Path
 from daq.configuration.cell import Cell
 from daq.configuration.recalibration import Recalibration
 from daq.errors import ExitCode, UsageError
+from daq.write_back.link import followed
 
 MARK = "# Made by `drivegain install-units`, which may replace this file."
 """First line of what is ours; any other file of that name is somebody else's."""
@@ -158,12 +159,12 @@ WantedBy=timers.target
 
 
 def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
-    """Folders that ProtectHome= and ProtectSystem= would lock."""
+    """Folders that ProtectHome= and ProtectSystem= would lock: where files are, and not where links to them are."""
     folders = {cell_file.parent, section.folder.parent, section.folder}
     if cell.controller_path is not None:
-        folders.add(cell.controller_path.parent)
+        folders.add(followed(cell.controller_path).parent)
     if cell.history is not None:
-        folders |= {cell.history.store.parent, cell.history.audit.parent}
+        folders |= {cell.history.store.resolve().parent, cell.history.audit.resolve().parent}
     if section.metrics is not None:
         folders.add(section.metrics)
     # "-": one that is not there yet must not keep the service from starting.

@@ -64,7 +64,7 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         journal.say(
             Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
         )
-    past.note_applied()
+    past.note_applied(None if written is None else written.audit_sha256)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 

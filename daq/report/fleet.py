@@ -10,6 +10,7 @@ from typing import Any
 from daq.fleet.cell_fit import Failure
 from daq.fleet.row import FleetRow
 from daq.fleet.summary import Summary
+from daq.report.spreadsheet import inert, inert_row
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
@@ -31,16 +32,17 @@ LAST_COLUMNS = (
 def fleet_csv(rows: Sequence[FleetRow]) -> str:
     """A line a cell, numbers to the last digit; gain, σ and unit of every axis that any of the cells has.
 
-    What a cell lacks is empty.
+    What a cell lacks is empty. No text in it is a formula to a spreadsheet.
     """
     summaries = [row.result for row in rows if isinstance(row.result, Summary)]
     axes = list(dict.fromkeys(gain.axis for summary in summaries for gain in summary.gains))
     of_axes = [f"{axis} {what}" for axis in axes for what in ("gain", "std", "unit")]
     text = io.StringIO()
-    table = csv.DictWriter(text, (*FIRST_COLUMNS, *of_axes, *LAST_COLUMNS), restval="", lineterminator="\n")
-    table.writeheader()
+    headings = (*FIRST_COLUMNS, *of_axes, *LAST_COLUMNS)
+    table = csv.DictWriter(text, headings, restval="", lineterminator="\n")
+    table.writerow({heading: inert(heading) for heading in headings})
     for row in rows:
-        table.writerow(_line(row))
+        table.writerow(inert_row(_line(row)))
     return text.getvalue()
 
 
@@ -80,11 +82,11 @@ def _document(row: FleetRow) -> dict[str, Any]:
     failure = result if isinstance(result, Failure) else None
     summary = result if isinstance(result, Summary) else None
     return {
-        "cell": row.cell,
+        "cell": _spelt(row.cell),
         "configuration_sha256": row.configuration_sha256 or None,
         "configurations": row.configurations,
-        "fit": list(row.fit),
-        "holdout": list(row.holdout),
+        "fit": [_spelt(name) for name in row.fit],
+        "holdout": [_spelt(name) for name in row.holdout],
         "gains": [] if summary is None else [_gain(gain) for gain in summary.gains],
         "worst": None if summary is None else _gain(summary.worst),
         "error_percent": None if summary is None else summary.error_percent,
@@ -93,10 +95,15 @@ def _document(row: FleetRow) -> dict[str, Any]:
         "partial": None if summary is None else summary.partial,
         "seconds": row.seconds,
         "kept": row.kept,
-        "calibration": None if row.file is None else str(row.file),
+        "calibration": None if row.file is None else _spelt(str(row.file)),
         "exit_code": 0 if failure is None else failure.exit_code,
-        "error": None if failure is None else {"kind": failure.kind, "text": failure.text},
+        "error": None if failure is None else {"kind": failure.kind, "text": _spelt(failure.text)},
     }
+
+
+def _spelt(text: str) -> str:
+    """Bytes of a file's name that are no UTF-8, and so can be in no document, as `\\udcff`."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _measured_on(summary: Summary) -> str:

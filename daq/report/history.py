@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _SIGMAS = 2.0
 _COLUMNS = 2
+_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999
+"""1 January 1 and 31 December 9999: matplotlib draws no dates beyond."""
 
 
 def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:
@@ -44,7 +46,7 @@ def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart:
     for unused in range(len(all_series), columns * bands):
         for row in range(2):
             places[(2 * (bands - 1) + row) * columns + unused % columns].set_axis_off()
-    _date(places, [_days(point.entry.created) for series in all_series for point in series.points])
+    _date(places, [_days(point.entry.recorded) for series in all_series for point in series.points])
     upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
     legend_below(figure, *upper)
     # One legend for both kinds of panels would be wider than the picture of one axis.
@@ -53,12 +55,12 @@ def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart:
 
 
 def _draw_gains(place: Axes, series: Series) -> None:
-    times = [_days(point.entry.created) for point in series.points]
+    times = [_days(point.entry.recorded) for point in series.points]
     values = [point.gain.value for point in series.points]
     widths = [_SIGMAS * series.dispersion * point.gain.std for point in series.points]
     place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
     place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {_SIGMAS:g} σ")
-    held = [(_days(point.entry.created), point.gain.value) for point in series.points if point.entry.applied]
+    held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
     place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
     alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
     place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
@@ -81,7 +83,7 @@ def _draw_limits(place: Axes, series: Series, chart: Chart) -> None:
     for sign in (-1.0, 1.0):
         place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
     for stretch in series.stretches:
-        times = [_days(point.entry.created) for point in series.points[stretch.began : stretch.ended]]
+        times = [_days(point.entry.recorded) for point in series.points[stretch.began : stretch.ended]]
         drift = stretch.drift
         for sums in (drift.upper, -drift.lower):
             place.step(times, sums / chart.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
@@ -112,7 +114,7 @@ def _date(places: list[Axes], days: list[float]) -> None:
     # Of a single day there would be no range to label.
     beside = max(0.5, 0.03 * (max(days) - min(days)))
     for place in places:
-        place.set_xlim(min(days) - beside, max(days) + beside)
+        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
         # At most so many labels as fit beside each other.
         locator = dates.AutoDateLocator(maxticks=7)
         place.xaxis.set_major_locator(locator)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import combinations
 from pathlib import Path
 
 from daq.calibration_file import encode
@@ -17,12 +17,15 @@ from daq.configuration.controller_target import ControllerFormat
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
 from daq.write_back.base_gate import base_refusals
 from daq.write_back.circumstances import Circumstances, circumstances
+from daq.write_back.closed_gates import closed
 from daq.write_back.controller_file import decode, read_bytes
 from daq.write_back.controller_write import Written, sha256, write
+from daq.write_back.evidence import evidence_of
 from daq.write_back.fit_gates import fit_refusals
 from daq.write_back.gain_gates import GainChange, gain_refusals
 from daq.write_back.gates import Refusal
 from daq.write_back.link import followed, require_there
+from daq.write_back.looked_at import change_of, look, other_change
 from daq.write_back.scalar import Scalar, respell
 from daq.write_back.signature_gate import signature_refusals
 from daq.write_back.source_gates import source_refusals
@@ -55,6 +58,11 @@ class Proposal:
     after_content: bytes
     format: ControllerFormat | None = None
     evidence: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def looked_at(self) -> str:
+        """What --base takes from whoever has looked at this change: they want this one and no other."""
+        return change_of(self.before_content, self.after_content)
 
     @property
     def diff(self) -> str:
@@ -113,6 +121,7 @@ def propose_for(
         dict(zip(names, controller.gains, strict=True)),
         cell=declared.name,
         configuration_sha256=None if configuration_changed else declared.digest,
+        recording_configuration_sha256=declared.recording_digest,
         policy=policy or declared.apply,
         held=circumstances(declared, now, entered_kg or {}),
         looked_at=looked_at,
@@ -131,6 +140,7 @@ def propose(
     *,
     cell: str,
     configuration_sha256: str | None = None,
+    recording_configuration_sha256: str | None = None,
     policy: ApplyPolicy | None = None,
     held: Circumstances | None = None,
     looked_at: str | None = None,
@@ -148,9 +158,11 @@ def propose(
         keys: key of each axis's gain in it, by the axis's name.
         cell: name of the cell that the controller drives.
         configuration_sha256: digest of that cell's configuration, None where it is not to be compared.
+        recording_configuration_sha256: of what of it a recording depends on.
         policy: bounds; the default ones when None.
         held: what the logs are held against; what it does not tell is not compared.
-        looked_at: digest of the controller file that somebody has looked at.
+        looked_at: `Proposal.looked_at` of the change that somebody has looked at, or the digest of the controller file
+            alone: then whatever the calibration changes in it.
         appliers: names of whoever applies it; their signatures do not count.
         calibration_file: where signatures are looked for.
         calibration_content: of that file, as it was read.
@@ -173,15 +185,26 @@ def propose(
         _change(gain, scalar, factors.get(gain.axis, 1.0))
         for gain, scalar in zip(calibration.gains, scalars, strict=True)
     )
+    _check_apart(str(file), scalars)
     signed = encode(calibration) if calibration_content is None else calibration_content
+    after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
+    looked = look(looked_at, content)
+    # Who has looked at the file matters where something is lost: not where these gains stand in it already.
+    base = (
+        ()
+        if after.content == content and all(change.spelling for change in changes)
+        else (
+            *base_refusals(calibration, str(file), base_sha256, looked.base_sha256),
+            *other_change(looked, str(file), content, after.content),
+        )
+    )
     refusals = (
-        *fit_refusals(calibration, cell, configuration_sha256, policy),
+        *fit_refusals(calibration, cell, configuration_sha256, policy, recording_configuration_sha256),
         *source_refusals(calibration, policy, held),
-        *base_refusals(calibration, str(file), base_sha256, looked_at),
+        *base,
         *signature_refusals(calibration_file, signed, policy, appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
-    after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
     return Proposal(
         file,
         base_sha256,
@@ -192,7 +215,7 @@ def propose(
         content,
         after.content,
         format,
-        _evidence(calibration, signed, calibration_file),
+        evidence_of(calibration, signed, calibration_file),
     )
 
 
@@ -219,6 +242,7 @@ def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: 
         Chronicle(audit, who, now).refusal(followed(proposal.file), proposal.refusals, details)
         raise refused(proposal)
     if proposal.after_content == proposal.before_content:
+        Chronicle(audit, who, now).nothing_to_do(followed(proposal.file), proposal.before_content, details)
         return None
     spelling = {change.key: change.spelling for change in proposal.changes}
     before = decode(proposal.before_content, str(proposal.file), proposal.format)
@@ -232,17 +256,8 @@ def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: 
 
 
 def refused(proposal: Proposal) -> CalibrationRefused:
-    """The error for a proposal with closed gates; several are listed one a line."""
-    if len(proposal.refusals) == 1:
-        only = proposal.refusals[0]
-        return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
-    listed = "".join(f"\n  {refusal}" for refusal in proposal.refusals)
-    return CalibrationRefused(
-        str(proposal.file),
-        found=f"{len(proposal.refusals)} closed gates{listed}\n ",
-        expected="none",
-        remedy="nothing was written",
-    )
+    """The error for a proposal with closed gates."""
+    return closed(str(proposal.file), proposal.refusals)
 
 
 def _check_axes(calibration: Calibration, keys: Mapping[str, str]) -> None:
@@ -264,6 +279,18 @@ def _check_axes(calibration: Calibration, keys: Mapping[str, str]) -> None:
         )
 
 
+def _check_apart(file: str, scalars: Sequence[Scalar]) -> None:
+    """Two keys may be two names of one place: one axis would get the gain of the other."""
+    for one, other in combinations(scalars, 2):
+        if one.start < other.end and other.start < one.end:
+            raise ControllerUnfit(
+                f"{file}, line {one.line}",
+                found=f"{one.key} and {other.key}, which name the same number",
+                expected="a number of its own for each axis",
+                remedy="correct `controller.gains` of the cell configuration; nothing was written",
+            )
+
+
 def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
     writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
     put = respell(scalar, gain.value, gain.std, factor) if writable else None
@@ -278,20 +305,6 @@ def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
         nameplate=gain.nameplate,
         spelling="" if put is None else put.spelling,
     )
-
-
-def _evidence(calibration: Calibration, content: bytes, file: Path | None) -> dict[str, object]:
-    return {
-        "calibration": {
-            "file": None if file is None else str(file.absolute()),
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "cell": calibration.cell,
-            "created": calibration.created,
-            "software": calibration.software,
-        },
-        "configuration_sha256": calibration.configuration_sha256,
-        "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
-    }
 
 
 def _documented(change: GainChange) -> dict[str, object]:

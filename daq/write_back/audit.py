@@ -18,6 +18,7 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.errors import AuditUnusable
+from daq.folder import fsync_folder
 from daq.write_back.audit_chain import (
     AuditFlaw,
     AuditVerdict,
@@ -41,6 +42,7 @@ __all__ = [
     "append",
     "digest_now",
     "read",
+    "told_of",
     "verify",
 ]
 
@@ -84,7 +86,7 @@ def append(
             raise OSError(28, "No space left on device", str(path))
         os.fsync(descriptor)
         if not content:
-            _fsync_folder(path.resolve().parent)
+            fsync_folder(path.resolve().parent)
         return new[-1]
 
 
@@ -110,6 +112,23 @@ def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
     return judge(_content(path), digest_now, heads)
 
 
+def told_of(path: Path, subject: str, sha256_after: str) -> str | None:
+    """SHA-256 of the newest entry about a write of that content, None where none tells of it.
+
+    Args:
+        path: of the audit.
+        subject: what was written, as the audit names it.
+        sha256_after: digest of the content.
+
+    Raises:
+        AuditUnusable: no regular file, or it cannot be read.
+    """
+    told = [
+        one.sha256 for one in read(path) if (one.subject, one.details.get("sha256_after")) == (subject, sha256_after)
+    ]
+    return told[-1] if told else None
+
+
 def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
     """The last entry, and unfinished lines after it.
 
@@ -125,9 +144,10 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
             raise AuditUnusable(
                 str(path),
                 found=f"line {number} that is not what drivegain wrote",
-                expected="entries that were never changed",
-                remedy="look at it with `drivegain history --verify`, then move this audit away, keep it, and begin "
-                "another; nothing was written",
+                expected="an audit, whose entries were never changed",
+                remedy="if this is another file, correct `history.audit` of the cell file or --audit; if it is the "
+                "audit, look at it with `drivegain history --verify`, then move it away, keep it, and begin another; "
+                "nothing was written",
             )
         unfinished.append(line)
     return None, unfinished[::-1]
@@ -203,11 +223,3 @@ def digest_now(subject: str) -> str | None:
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
     except OSError:
         return None
-
-
-def _fsync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

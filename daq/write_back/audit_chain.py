@@ -196,7 +196,8 @@ class _Chain:
 
 
 def _open_writes(entries: tuple[AuditEntry, ...], digest_now: Callable[[str], str | None]) -> tuple[OpenWrite, ...]:
-    ended = {one.details.get("begun") for one in entries if one.action in _ENDS}
+    # Anybody can write a chain that holds: what is no number names no entry.
+    ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
     return tuple(
         OpenWrite(one, _content_after(one, entries[place + 1 :], digest_now))
         for place, one in enumerate(entries)
@@ -210,6 +211,6 @@ def _content_after(begun: AuditEntry, later: Sequence[AuditEntry], digest_now: C
     # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
     found = digest_now(begun.subject) if witness is None else witness.details.get("sha256_before")
     before, after = begun.details.get("sha256_before"), begun.details.get("sha256_after")
-    if found is None or before is None or after is None:
+    if not isinstance(found, str) or not isinstance(before, str) or not isinstance(after, str):
         return Content.UNKNOWN
     return {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER)

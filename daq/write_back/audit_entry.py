@@ -12,6 +12,9 @@ from typing import Any
 FIRST = "0" * 64
 """What the first entry follows."""
 
+_BEGINNING = b'{"action":"'
+"""Of every line: the keys are sorted."""
+
 
 class AuditAction(Enum):
     """What happened."""
@@ -23,6 +26,8 @@ class AuditAction(Enum):
     ROLLBACK_BEGUN = "rollback begun"
     ROLLED_BACK = "rolled back"
     FAILED = "failed"
+    NOTHING_TO_DO = "nothing to do"
+    """Somebody asked for a write of what stands there already."""
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
     ACKNOWLEDGED = "acknowledged"
@@ -90,7 +95,13 @@ def decode(line: bytes) -> AuditEntry | None:
 
 
 def is_fragment(line: bytes) -> bool:
-    """Whether a line can be the beginning of an entry that a writer did not finish: such a beginning is never JSON."""
+    """Whether a line can be the beginning of an entry that a writer did not finish: such a beginning is never JSON.
+
+    Zeros behind it, or alone, are what a power cut leaves. Any other text is somebody else's file.
+    """
+    begun = line.rstrip(b"\0")
+    if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
+        return False
     try:
         json.loads(line)
     except ValueError:

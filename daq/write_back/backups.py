@@ -7,6 +7,7 @@ controller file since; no other file could be lost, or disagree.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import re
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from daq.atomic_file import replace_file
 from daq.errors import ControllerUnfit
+from daq.folder import fsync_folder
 from daq.write_back.controller_file import read_bytes
 
 _STAMP = "%Y%m%dT%H%M%SZ"
@@ -89,6 +91,17 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
         backup.unlink(missing_ok=True)
         raise
     return backup
+
+
+def put_back(backup: Path, target: Path) -> None:
+    """Give a backup the name of the file again that took its place; it is none any more.
+
+    Raises:
+        OSError: from the file system; a failing fsync of the folder is passed over, as the name is there.
+    """
+    backup.replace(target)
+    with contextlib.suppress(OSError):
+        fsync_folder(target.parent)
 
 
 def short_digest(content: bytes) -> str:

@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from daq.atomic_file import replace_file
 from daq.configuration.controller_target import ControllerFormat
 from daq.errors import BackupMissing, ControllerChanged
 from daq.write_back.audit import AuditAction
-from daq.write_back.backups import Backup, back_up, backups, short_digest
+from daq.write_back.backups import Backup, back_up, backups, put_back, short_digest
 from daq.write_back.controller_file import decode, read_bytes
 from daq.write_back.link import followed
 from daq.write_back.one_writer import only_writer
@@ -30,12 +30,14 @@ class Written:
         file: the file that was replaced, symbolic links followed.
         backup: where its former content is.
         before, after: content.
+        audit_sha256: of the audit's entry that tells of it, for whoever keeps it elsewhere; None without an audit.
     """
 
     file: Path
     backup: Path
     before: bytes
     after: bytes
+    audit_sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,7 @@ class Restored:
         source: the backup that it was restored from.
         backup: where its former content is, None where the file was gone.
         before, after: content; before is empty where the file was gone.
+        audit_sha256: as of `Written`.
     """
 
     file: Path
@@ -54,6 +57,7 @@ class Restored:
     backup: Path | None
     before: bytes
     after: bytes
+    audit_sha256: str | None = None
 
 
 def sha256(content: bytes) -> str:
@@ -85,7 +89,7 @@ def write(
         details: what else the audit shall know.
 
     Raises:
-        ControllerChanged: somebody has changed the file since.
+        ControllerChanged: somebody has changed the file since, or saves it while it is written.
         ControllerBusy: somebody is writing it.
         ControllerUnfit: from `check`, or it cannot be read.
         AuditUnusable: it could not be written down; the old content stands.
@@ -105,8 +109,11 @@ def write(
                     expected=f"{base_sha256[:12]}…, for which the change was shown",
                     remedy="somebody has changed the file: look at a new dry run",
                 )
-        with chronicle.of_write(AuditAction.APPLY_BEGUN, AuditAction.APPLIED, target, before, after, known):
-            return _replace(target, before, after, check, now)
+        written, told = chronicle.of_write(
+            AuditAction.APPLY_BEGUN, AuditAction.APPLIED, target, before, after, known,
+            partial(_replace, target, before, after, check, now),
+        )  # fmt: skip
+        return replace(written, audit_sha256=told)
 
 
 def roll_back(
@@ -148,8 +155,11 @@ def roll_back(
                 _check_unedited(file, before, backup)
         details = {"restored": backup.path.name}
         check = partial(_check_parses, name=str(backup.path), format=format)
-        with chronicle.of_write(AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK, target, before, after, details):
-            return _restore(target, before, after, backup, check, now)
+        restored, told = chronicle.of_write(
+            AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK, target, before, after, details,
+            partial(_restore, target, before, after, backup, check, now),
+        )  # fmt: skip
+        return replace(restored, audit_sha256=told)
 
 
 def _way_back(file: Path, target: Path, before: bytes | None) -> Backup:
@@ -185,9 +195,10 @@ def _restore(
         written = _replace(target, before, after, check, now)
         return Restored(target, source.path, written.backup, before, after)
     try:
-        replace_file(target, after, check=check, like=source.path)
+        replace_file(target, after, check=_last_look(target, None, check), like=source.path)
     except BaseException:  # an interrupt too: what is restored is there whole, or not at all
-        target.unlink(missing_ok=True)
+        if _content(target) == after:  # and not what somebody else has put there
+            target.unlink()
         raise
     return Restored(target, source.path, None, b"", after)
 
@@ -195,15 +206,48 @@ def _restore(
 def _replace(target: Path, before: bytes, after: bytes, check: Callable[[bytes], None], now: datetime) -> Written:
     backup = back_up(target, before, after, now)
     try:
-        replace_file(target, after, check=check)
+        replace_file(target, after, check=_last_look(target, before, check))
+    except ControllerChanged:
+        backup.unlink()
+        raise
     except BaseException:
         # Before the rename the old file still stands; after it (the folder's fsync failed) the backup takes its place.
-        if target.read_bytes() == before:
+        # What somebody else has put there meanwhile stays, and so does the backup.
+        found = _content(target)
+        if found == before:
             backup.unlink()
-        else:
-            backup.replace(target)
+        elif found == after:
+            put_back(backup, target)
         raise
     return Written(target, backup, before, after)
+
+
+def _last_look(target: Path, before: bytes | None, check: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    """What is asked right before the rename: the lock keeps every drivegain out, and no editor.
+
+    Between the question and the rename are two calls of the system; whoever saves just then still loses it.
+    """
+
+    def look(written: bytes) -> None:
+        check(written)
+        found = _content(target)
+        if found != before:
+            raise ControllerChanged(
+                str(target),
+                found="no file any more" if found is None else f"content {sha256(found)[:12]}…",
+                expected="no file, as before" if before is None else f"{sha256(before)[:12]}…, as before this write",
+                remedy="somebody has saved the file meanwhile, and it stands as they did: look at a new dry run",
+            )
+
+    return look
+
+
+def _content(target: Path) -> bytes | None:
+    """Of the file as it is now, None where it is gone."""
+    try:
+        return target.read_bytes()
+    except FileNotFoundError:
+        return None
 
 
 def _check_parses(content: bytes, name: str, format: ControllerFormat | None) -> None:  # noqa: A002

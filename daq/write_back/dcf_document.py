@@ -19,6 +19,7 @@ _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
 _ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
+_TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
 _DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
 _VARIABLE = 7
@@ -95,15 +96,15 @@ class DcfDocument:
         if match is None:
             raise unfit(self.name, key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
         index, subindex = int(match[1], 16), int(match[2] or "0", 16)
-        titles = {f"{index:04x}sub{subindex:x}"} | ({f"{index:04x}"} if subindex == 0 else set())
-        found = [section for section in sections if section.title in titles]
+        found = [section for section in sections if _named(section.title) == (index, subindex)]
         if len(found) > 1:
             lines = " and ".join(str(section.line) for section in found)
             raise unfit(self.name, key, f"it {len(found)} times, on lines {lines}", "remove all but one")
         if not found:
             subs = [s.title for s in sections if s.title.startswith(f"{index:04x}")]
             has = f"it has {', '.join(subs[:12])}" if subs else "it does not have this index at all"
-            raise unfit(self.name, key, f"no section [{'] or ['.join(sorted(titles))}] ({has})", CORRECT_KEY)
+            titles = ([f"{index:04x}"] if subindex == 0 else []) + [f"{index:04x}sub{subindex:x}"]
+            raise unfit(self.name, key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
         return found[0]
 
     def _locate(self, sections: list[_Section], key: str) -> Scalar:
@@ -200,6 +201,12 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
             remedy="save it in one of these; nothing was written",
         )
     return DcfDocument(name, content.decode("latin-1"))
+
+
+def _named(title: str) -> tuple[int, int] | None:
+    """Index and subindex that a title names: `2003sub1` and `2003sub01` are one object; None where it names none."""
+    match = _TITLE.fullmatch(title)
+    return None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
 
 
 def _sections(text: str) -> list[_Section]:

@@ -15,9 +15,11 @@ from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.controller_target import GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
-from daq.write_back.base_gate import base_refusals
 from daq.write_back.circumstances import circumstances
+from daq.write_back.closed_gates import closed
+from daq.write_back.drive_base_gate import drive_base_refusals
 from daq.write_back.drive_record import record_folder
+from daq.write_back.evidence import evidence_of
 from daq.write_back.fit_gates import fit_refusals
 from daq.write_back.gain_gates import GainChange, gain_refusals
 from daq.write_back.gates import Refusal
@@ -115,40 +117,21 @@ def propose_to_drives(
         writes.append(ParameterWrite(value.axis, told.parameter, word))
     signed = encode(calibration) if calibration_content is None else calibration_content
     configuration = None if configuration_changed else declared.digest
-    subject = drives_of(declared.name)
+    subject, folder = drives_of(declared.name), record_folder(declared)
     refusals = (
-        *fit_refusals(calibration, declared.name, configuration, policy),
+        *fit_refusals(calibration, declared.name, configuration, policy, declared.recording_digest),
         *source_refusals(calibration, policy, circumstances(declared, now, entered_kg or {})),
-        # The logs tell the digest of the controller's file, not of what stood in the drives.
-        *(() if looked_at is None else base_refusals(calibration, subject, digest(base), looked_at)),
+        *drive_base_refusals(subject, base, digest(base), folder, looked_at),
         *signature_refusals(calibration_file, signed, policy, appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
-    evidence: dict[str, object] = {
-        "calibration": {
-            "file": None if calibration_file is None else str(calibration_file.absolute()),
-            "sha256": hashlib.sha256(signed).hexdigest(),
-            "created": calibration.created,
-        },
-        "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
-    }
-    return DriveProposal(
-        declared.name, record_folder(declared), base, tuple(writes), tuple(changes), refusals, evidence
-    )
+    evidence = evidence_of(calibration, signed, calibration_file)
+    return DriveProposal(declared.name, folder, base, tuple(writes), tuple(changes), refusals, evidence)
 
 
 def refused(proposal: DriveProposal) -> CalibrationRefused:
-    """The error for a proposal with closed gates; several are listed one a line."""
-    if len(proposal.refusals) == 1:
-        only = proposal.refusals[0]
-        return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
-    listed = "".join(f"\n  {refusal}" for refusal in proposal.refusals)
-    return CalibrationRefused(
-        drives_of(proposal.cell),
-        found=f"{len(proposal.refusals)} closed gates{listed}\n ",
-        expected="none",
-        remedy="nothing was written",
-    )
+    """The error for a proposal with closed gates."""
+    return closed(drives_of(proposal.cell), proposal.refusals)
 
 
 def _objects(declared: Cell) -> tuple[GainObject, ...]:

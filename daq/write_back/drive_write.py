@@ -7,26 +7,25 @@ there is on the disk before the first is touched (drive_record.py).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
-from daq.configuration.cell import Cell
-from daq.errors import BackupMissing, ControllerChanged, ControllerUnfit
+from daq.errors import ControllerChanged
 from daq.write_back.audit import AuditAction
+from daq.write_back.controller_write import sha256
 from daq.write_back.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
-from daq.write_back.drive_record import DriveNote, DriveRecord, read_record, read_records, record_folder, write_record
+from daq.write_back.drive_record import DriveNote, write_record
+from daq.write_back.drive_way_back import DriveWayBack
 from daq.write_back.one_writer import only_writer
 from daq.write_back.written_down import Chronicle
-from drivers.axis import Axis
 from drivers.network import CanopenNetwork
-from drivers.parameter import Parameter
 from drivers.parameter_write import (
     ParameterChange,
     ParameterValue,
     ParameterWrite,
     Saving,
-    read_parameters,
     write_parameters,
 )
 
@@ -44,13 +43,17 @@ class DrivesWritten:
         target: what the audit calls them.
         record: file with what stood there before.
         changes: one a drive.
+        sha256_after: digest of what stands in the drives now, and of which drives they are.
         source: record that was gone back to; None for a calibration.
+        audit_sha256: of the audit's entry that tells of it, for whoever keeps it elsewhere; None without an audit.
     """
 
     target: str
     record: Path
     changes: tuple[ParameterChange, ...]
+    sha256_after: str
     source: Path | None = None
+    audit_sha256: str | None = None
 
 
 def apply_to_drives(
@@ -93,7 +96,7 @@ def apply_to_drives(
 
 
 def roll_back_drives(
-    declared: Cell,
+    way: DriveWayBack,
     network: CanopenNetwork,
     now: datetime,
     *,
@@ -101,42 +104,25 @@ def roll_back_drives(
     audit: Path | None = None,
     who: str = "",
 ) -> DrivesWritten:
-    """Put back what stood in the drives before the last write that changed them, whole or cut off by a kill.
+    """Put back what stood in the drives before a write.
 
     What it replaces is recorded too, so that a second way back undoes the first.
 
+    Args:
+        way: as it was worked out.
+        network, now, saving, audit, who: as in `apply_to_drives`.
+
     Raises:
-        BackupMissing: there is no record of such a write.
-        ControllerUnfit: its record was changed, or is of another cell.
-        ControllerChanged: a drive was exchanged, or somebody has changed a gain since.
+        ControllerChanged: something else stands in the drives than when the way was worked out.
         ControllerBusy, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
     """
-    folder = record_folder(declared)
-    with only_writer(_made(folder)):
-        paths = read_records(folder)
-        for path in reversed(paths):
-            record = read_record(path)
-            base = read_parameters(network, _recorded(declared, network, record))
-            # A writer that was killed before its first write leaves a record of what still stands.
-            if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
-                continue
-            _check_untouched(record, base)
-            writes = tuple(
-                ParameterWrite(value.axis, note.parameter, note.old)
-                for value, note in zip(base, record.drives, strict=True)
-            )
-            details = {"drives": _documented(base, writes), "restored": str(path)}
-            written = _write(
-                network, declared.name, folder, base, writes, saving, now,
-                begun=AuditAction.ROLLBACK_BEGUN, audit=audit, who=who, details=details,
-            )  # fmt: skip
-            return DrivesWritten(written.target, written.record, written.changes, path)
-    raise BackupMissing(
-        drives_of(declared.name),
-        found=f"{len(paths)} records of what stands there now" if paths else f"no record in {folder}",
-        expected="the record of a write that changed them",
-        remedy="nothing was written",
-    )
+    details = {"drives": _documented(way.base, way.writes), "restored": str(way.record.path)}
+    with only_writer(_made(way.folder)):
+        written = _write(
+            network, way.cell, way.folder, way.base, way.writes, saving, now,
+            begun=AuditAction.ROLLBACK_BEGUN, audit=audit, who=who, details=details,
+        )  # fmt: skip
+    return replace(written, source=way.record.path)
 
 
 def _write(
@@ -168,44 +154,11 @@ def _write(
     target = Path(drives_of(cell))
     before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
     ended = _BEGINS_AND_ENDS[begun]
-    with Chronicle(audit, who, now).of_write(begun, ended, target, before, after, {"saving": saving.value, **details}):
-        changes = write_parameters(network, writes, saving, begin)
-    return DrivesWritten(str(target), records[0], changes)
-
-
-def _recorded(declared: Cell, network: CanopenNetwork, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
-    axes = {(axis.name, axis.node_id): axis for axis in network.axes}
-    strangers = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
-    if record.cell != declared.name or strangers:
-        raise ControllerUnfit(
-            str(record.path),
-            found=f"a write to cell {record.cell!r}"
-            + (f", with {', '.join(strangers)} that this cell has not" if strangers else ""),
-            expected=f"one to the drives of cell {declared.name!r}",
-            remedy="nothing was written; has the cell file been changed since?",
-        )
-    return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
-
-
-def _check_untouched(record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
-    """Refuse where going back would lose what somebody else did."""
-    for value, note in zip(base, record.drives, strict=True):
-        told = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
-        if told != (note.vendor_id, note.product_code, note.serial):
-            raise ControllerChanged(
-                f"{note.axis} (node {note.node_id})",
-                found=f"another drive, with serial number {value.identity.serial}",
-                expected=f"the one that was written, with {note.serial}",
-                remedy="nothing was written; calibrate again after an exchange",
-            )
-        if value.word not in (note.old, note.new):
-            raise ControllerChanged(
-                f"{note.axis}, {note.parameter}",
-                found=f"{value.value:.9g}",
-                expected=f"{note.parameter.value(note.new):.9g} as drivegain wrote it, or "
-                f"{note.parameter.value(note.old):.9g} as before",
-                remedy=f"nothing was written: somebody has changed it since; {record.path} has the old values",
-            )
+    changes, told = Chronicle(audit, who, now).of_write(
+        begun, ended, target, before, after, {"saving": saving.value, **details},
+        partial(write_parameters, network, writes, saving, begin),
+    )  # fmt: skip
+    return DrivesWritten(str(target), records[0], changes, sha256(after), audit_sha256=told)
 
 
 def _notes(found: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> tuple[DriveNote, ...]:

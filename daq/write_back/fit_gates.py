@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 
-from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.apply_policy import ApplyPolicy, HoldOut
 from daq.write_back.gates import Gate, Refusal
 from ident.calibration import Calibration
 from ident.relative_error import RelativeError
 
-NOISE = 1.01
-"""Share of the nameplate's error that a calibration may have: where the nameplate is true, the two differ by 0.1 %."""
+NOISE, AXIS_NOISE = 1.01, 1.02
+"""Share of the nameplate's error that a calibration may have, in total and on an axis: where the nameplate is true, the
+two differ by 0.1 % and 0.4 %."""
 
 
 def fit_refusals(
-    calibration: Calibration, cell: str, configuration_sha256: str | None, policy: ApplyPolicy
+    calibration: Calibration,
+    cell: str,
+    configuration_sha256: str | None,
+    policy: ApplyPolicy,
+    recording_configuration_sha256: str | None = None,
 ) -> tuple[Refusal, ...]:
     """Closed gates of the calibration as a whole.
 
@@ -23,23 +28,35 @@ def fit_refusals(
         cell: name of the cell whose controller it goes to.
         configuration_sha256: digest of that cell's configuration now, None where it is not to be compared.
         policy: bounds.
+        recording_configuration_sha256: of what of that configuration a recording depends on (`Cell.recording_digest`).
     """
     closed = []
     if calibration.cell != cell:
         closed.append(
             Refusal(Gate.CELL, "calibration", f"cell {calibration.cell!r}", f"cell {cell!r}", "give its own --cell")
         )
-    if configuration_sha256 is not None and calibration.configuration_sha256 != configuration_sha256:
-        closed.append(
-            Refusal(
-                Gate.CONFIGURATION,
-                "calibration",
-                f"recorded with cell configuration {calibration.configuration_sha256[:12] or 'unknown'}…",
-                f"{configuration_sha256[:12]}…, the cell's configuration now",
-                "record again, or see what changed since and say so with --configuration-changed",
-            )
-        )
+    if configuration_sha256 is not None:
+        closed += _configuration_refusals(calibration, configuration_sha256, recording_configuration_sha256)
     return (*closed, *_error_refusals(calibration, policy), *_effect_refusals(calibration))
+
+
+def _configuration_refusals(calibration: Calibration, whole: str, recording: str | None) -> list[Refusal]:
+    found, expected = calibration.configuration_sha256, whole
+    then = calibration.recording_configuration_sha256
+    # A calibration of an earlier version tells the digest of the whole configuration alone, and is held to it.
+    if then is not None and recording is not None:
+        found, expected = then, recording
+    if found == expected:
+        return []
+    return [
+        Refusal(
+            Gate.CONFIGURATION,
+            "calibration",
+            f"recorded with cell configuration {found[:12] or 'unknown'}…",
+            f"{expected[:12]}…, the cell's configuration now",
+            "record again, or see what changed since and say so with --configuration-changed",
+        )
+    ]
 
 
 def _error_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusal]:
@@ -55,11 +72,11 @@ def _error_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refus
                 Gate.NOT_FINITE, "calibration", "a relative error that is no number", "finite", "fit the logs again"
             ),
         ]
-    return [*still, *_size_refusals(calibration, policy)]
+    return [*still, *_size_refusals(calibration, policy), *_holdout_refusals(calibration, policy)]
 
 
 def _size_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusal]:
-    held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
+    held = calibration.holdout_error_percent
     error = calibration.relative_error_percent if held is None else held
     closed = []
     if error.total > policy.max_error_percent:
@@ -72,7 +89,48 @@ def _size_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusa
                 "the model does not describe this robot: check drive train, roles, payload and units",
             )
         )
-    if held is not None and nameplate is not None and not held.total <= NOISE * nameplate.total:
+    names = [gain.axis for gain in calibration.gains]
+    closed += [
+        Refusal(
+            Gate.ERROR,
+            name,
+            f"a relative error of {number:.1f} % of this axis's torque",
+            f"at most {policy.max_axis_error_percent:g} %",
+            "the model does not describe this axis: check its drive train, drive, current and direction",
+        )
+        for name, number in zip(names, error.axes, strict=False)
+        if number > policy.max_axis_error_percent
+    ]
+    if len(error.axes) < len(names):
+        closed.append(
+            Refusal(
+                Gate.ERROR,
+                "calibration",
+                f"relative errors of {len(error.axes)} axes",
+                f"one of each of the {len(names)} axes",
+                "fit the logs again",
+            )
+        )
+    return closed
+
+
+def _holdout_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusal]:
+    held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
+    if held is None or nameplate is None:
+        if policy.holdout is HoldOut.OPTIONAL:
+            return []
+        found = "no run that was held out" if held is None else "a hold-out that was not compared with the nameplate"
+        return [
+            Refusal(
+                Gate.HOLDOUT,
+                "calibration",
+                found,
+                "a run that puts the gains to the test, as the cell wants (`holdout: required`, or `by: job`)",
+                "fit the logs again, with --holdout for a run that the fit does not see",
+            )
+        ]
+    closed = []
+    if not held.total <= NOISE * nameplate.total:
         closed.append(
             Refusal(
                 Gate.HOLDOUT,
@@ -82,7 +140,25 @@ def _size_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusa
                 "the controller is better off without this calibration: was the payload as declared in every run?",
             )
         )
+    names = [gain.axis for gain in calibration.gains]
+    for name, left, before in zip(names, held.axes, _as_long(nameplate.axes, len(names)), strict=False):
+        # Of an axis at rest there is a refusal already; NaN of the nameplate alone is no figure to be better than.
+        if not math.isnan(left) and not left <= AXIS_NOISE * before:
+            closed.append(
+                Refusal(
+                    Gate.HOLDOUT,
+                    name,
+                    f"{left:.2f} % of this axis's torque in the run that was held out",
+                    f"less than the {before:.2f} % that the nameplate's gains leave of it",
+                    "the axis is better off without this gain: was its drive, or the scale of its current, another one "
+                    "in some of the runs?",
+                )
+            )
     return closed
+
+
+def _as_long(axes: tuple[float, ...], count: int) -> tuple[float, ...]:
+    return (*axes, *(math.nan for _ in range(count - len(axes))))
 
 
 def _effect_refusals(calibration: Calibration) -> list[Refusal]:

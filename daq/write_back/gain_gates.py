@@ -49,11 +49,6 @@ class GainChange:
         """Relative standard deviation [%]; inf for a gain of zero."""
         return _percent(self.std, abs(self.new))
 
-    @property
-    def sigmas(self) -> float:
-        """Change in standard deviations of the identified gain; inf for a gain that was held fixed."""
-        return abs(self.new - self.old) / self.std if self.std else math.inf
-
 
 def gain_refusals(change: GainChange, policy: ApplyPolicy) -> tuple[Refusal, ...]:
     """Closed gates of one gain; a gain that is no number at all closes only that gate."""
@@ -100,6 +95,17 @@ def gain_refusals(change: GainChange, policy: ApplyPolicy) -> tuple[Refusal, ...
                 change.axis,
                 f"a change of {change.change_percent:+.1f} % from the file",
                 f"at most ±{policy.max_change_percent:g} %",
+                "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass",
+            )
+        )
+    bound = policy.max_change.get(change.axis)
+    if bound is not None and abs(change.new - change.old) > bound:
+        closed.append(
+            Refusal(
+                Gate.CHANGE,
+                change.axis,
+                f"a change of {change.new - change.old:+.4g} {change.unit} from the file",
+                f"at most ±{bound:g} {change.unit}",
                 "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass",
             )
         )

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.write_back.scalar import CORRECT_KEY, KeyPath, Scalar, check_leaves, check_text, spliced, unfit
+from daq.write_back.dotted_document import DottedDocument, utf8
+from daq.write_back.scalar import CORRECT_KEY, KeyPath, Leaves, Scalar, unfit
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
@@ -26,51 +27,18 @@ _SPACE = re.compile(r"[ \t\r\n]*")
 
 
 @dataclass(frozen=True, slots=True)
-class JsonDocument:
-    """A JSON file as it was read; a number is named by its dotted path (`drives.J1.gain`, `gains.0`).
-
-    Attributes:
-        name: what to call it in messages.
-        text: all of it, a byte order mark and the line ends included.
-    """
-
-    name: str
-    text: str
-
-    @property
-    def content(self) -> bytes:
-        """The text as it stands in the file."""
-        return self.text.encode()
+class JsonDocument(DottedDocument):
+    """A JSON file as it was read; both our scanner and Python's reader must see the same in it."""
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the numbers at some dotted paths, in their order.
-
-        Raises:
-            ControllerUnfit: the file does not parse, has a key twice, or a path leads to no number.
-        """
+        """See `DottedDocument.locate`; a file with a key twice is refused."""
         leaves = _Scan(self.name, self.text).leaves()
         return tuple(self._locate(leaves, key) for key in keys)
 
-    def with_values(self, spelling: Mapping[str, str]) -> JsonDocument:
-        """The same text with other numbers at some dotted paths, read back by two parsers.
-
-        Raises:
-            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
-        """
-        changed = JsonDocument(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling))
-        changed.check_against(self, spelling)
-        return changed
-
-    def check_against(self, before: JsonDocument, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone, for our scanner and for Python's.
-
-        Raises:
-            ControllerUnfit: it differs in more, or in less.
-        """
-        targets = {tuple(key.split(".")): number for key, number in spelling.items()}
-        for leaves in (_scanned, _loaded):
-            check_leaves(self.name, leaves(before), leaves(self), targets)
-        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
+    def readings(self) -> tuple[Leaves, Leaves]:
+        """Our scanner's and Python's."""
+        scanned = _Scan(self.name, self.text).leaves()
+        return {path: leaf.text for path, leaf in scanned.items()}, _loaded(self.text, self.name)
 
     def _locate(self, leaves: dict[KeyPath, _Leaf], key: str) -> Scalar:
         path = tuple(key.split("."))
@@ -111,15 +79,7 @@ def json_document(content: bytes, name: str) -> JsonDocument:
     Raises:
         ControllerUnfit: they are not UTF-8.
     """
-    try:
-        return JsonDocument(name, content.decode())
-    except UnicodeDecodeError as error:
-        raise ControllerUnfit(
-            name,
-            found=f"byte {error.start} that is not UTF-8",
-            expected="JSON in UTF-8",
-            remedy="save the file as UTF-8; nothing was written",
-        ) from error
+    return JsonDocument(name, utf8(content, name, "JSON"))
 
 
 class _Scan:
@@ -211,18 +171,13 @@ class _Scan:
         )
 
 
-def _scanned(document: JsonDocument) -> dict[KeyPath, str]:
-    return {path: leaf.text for path, leaf in _Scan(document.name, document.text).leaves().items()}
-
-
-def _loaded(document: JsonDocument) -> dict[KeyPath, str]:
+def _loaded(text: str, name: str) -> dict[KeyPath, str]:
     """The leaves as Python's own reader sees them; its numbers stay text."""
-    text = document.text.removeprefix(_BYTE_ORDER_MARK)
     try:
-        tree = json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
+        tree = json.loads(text.removeprefix(_BYTE_ORDER_MARK), parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as error:
         raise ControllerUnfit(
-            document.name,
+            name,
             found=f"no JSON ({error})",
             expected="one JSON document",
             remedy="correct the file; nothing was written",

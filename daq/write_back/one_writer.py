@@ -24,7 +24,7 @@ def only_writer(target: Path) -> Iterator[None]:
     """
     lock = target.parent / f".{target.name}.lock"
     while True:
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        descriptor = _opened(lock)
         try:
             _take(descriptor, target)
             if _is_at(descriptor, lock):
@@ -35,6 +35,24 @@ def only_writer(target: Path) -> Iterator[None]:
                 return
         finally:
             os.close(descriptor)
+
+
+def _opened(lock: Path) -> int:
+    """The lock's file, which everybody may open: one that a killed writer left must not keep other users out.
+
+    To hold a lock nothing need be written, and where others may write it the next user could not tell who did.
+    """
+    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    try:
+        descriptor = os.open(lock, flags | os.O_CREAT | os.O_EXCL, 0o644)
+    except FileExistsError:
+        # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's file.
+        try:
+            return os.open(lock, flags)
+        except FileNotFoundError:  # its owner was done just now
+            return os.open(lock, flags | os.O_CREAT, 0o644)
+    os.fchmod(descriptor, 0o644)  # whatever the umask
+    return descriptor
 
 
 def _take(descriptor: int, target: Path) -> None:

@@ -61,11 +61,31 @@ def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circum
                 "fit the logs again",
             )
         return
+    if held.serials is not None or held.payloads is not None or held.now is not None:
+        yield from _incomplete(told, name, axes)
     yield from _losses(source, told, name)
     yield from _age(told, name, policy, held.now)
     yield from _serials(told, name, axes, held)
     yield from _saturation(told, name, axes, policy)
     yield from _mass(source, told, name, held)
+
+
+def _incomplete(told: Recording, name: str, axes: list[str]) -> Iterator[Refusal]:
+    """What a log does not tell of an axis must not pass for an axis with nothing to tell."""
+    numbers = (
+        ("serial numbers", len(told.serials)),
+        ("shares of saturated samples", len(told.saturated_percent)),
+        ("counts of missing answers", len(told.missing)),
+    )
+    for what, count in numbers:
+        if count != len(axes):
+            yield Refusal(
+                Gate.SOURCES,
+                name,
+                f"{what} of {count} axes",
+                f"of each of the {len(axes)} axes that the calibration has",
+                "fit the logs again",
+            )
 
 
 def _losses(source: Source, told: Recording, name: str) -> Iterator[Refusal]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import yaml
@@ -14,84 +13,44 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from daq.errors import ControllerUnfit
-from daq.write_back.scalar import CORRECT_KEY, KeyPath, Scalar, check_leaves, check_text, spliced, unfit
+from daq.write_back.dotted_document import DottedDocument, utf8
+from daq.write_back.scalar import CORRECT_KEY, KeyPath, Leaves, Scalar, unfit
 
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+_OCTAL = re.compile(r"[-+]?0[0-9]+")
+"""To YAML 1.1; a decimal number to YAML 1.2."""
 _MERGE = "<<"
+_FLOAT = "tag:yaml.org,2002:float"
 
 
 @dataclass(frozen=True, slots=True)
-class YamlDocument:
-    """A YAML file as it was read; a number is named by its dotted path (`drives.J1.gain`, `gains.0`).
+class YamlDocument(DottedDocument):
+    """A YAML file as it was read.
 
-    Attributes:
-        name: what to call it in messages.
-        text: all of it, a byte order mark and the line ends included.
+    ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
     """
 
-    name: str
-    text: str
-
-    @property
-    def content(self) -> bytes:
-        """The text as it stands in the file."""
-        return self.text.encode()
+    # A frozen text has one tree; to make it is what takes the time here.
+    _composed: list[Node] = field(default_factory=list, init=False, repr=False, compare=False)
+    _readings: list[tuple[Leaves, Leaves]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the numbers at some dotted paths, in their order.
-
-        Raises:
-            ControllerUnfit: the file does not parse, or a path leads to no number that can be changed on its own.
-        """
-        root = self._compose()
+        """See `DottedDocument.locate`."""
+        root = self._root()
         references = Counter[int]()
         _count_references(root, references)
         return tuple(self._locate(root, key, references) for key in keys)
 
-    def with_values(self, spelling: Mapping[str, str]) -> YamlDocument:
-        """The same text with other numbers at some dotted paths, read back by two parsers.
+    def readings(self) -> tuple[Leaves, Leaves]:
+        """YAML 1.2's and 1.1's."""
+        if not self._readings:
+            self._readings.append((_leaves(self._root()), _leaves(_composed_1_1(self.text, self.name))))
+        return self._readings[0]
 
-        Args:
-            spelling: the new number, as text, by dotted path.
-
-        Raises:
-            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
-        """
-        changed = YamlDocument(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling))
-        changed.check_against(self, spelling)
-        return changed
-
-    def check_against(self, before: YamlDocument, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone, for both parsers.
-
-        ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
-
-        Raises:
-            ControllerUnfit: it differs in more, or in less.
-        """
-        targets = {tuple(key.split(".")): number for key, number in spelling.items()}
-        for leaves in (_leaves_1_2, _leaves_1_1):
-            check_leaves(self.name, leaves(before), leaves(self), targets)
-        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
-
-    def _compose(self) -> Node:
-        try:
-            root: Node | None = YAML(typ="safe", pure=True).compose(self.text)
-        except (YAMLError, ValueError, RecursionError) as error:
-            raise ControllerUnfit(
-                self.name,
-                found=f"no YAML ({' '.join(str(error).split())[:200]})",
-                expected="one YAML document",
-                remedy="correct the file; nothing was written",
-            ) from error
-        if root is None:
-            raise ControllerUnfit(
-                self.name,
-                found="an empty file",
-                expected="the controller's parameters",
-                remedy="is this the right file?",
-            )
-        return root
+    def _root(self) -> Node:
+        if not self._composed:
+            self._composed.append(_composed_1_2(self.text, self.name))
+        return self._composed[0]
 
     def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
         node = root
@@ -113,6 +72,13 @@ class YamlDocument:
         opened = self.text[start - 1 : start] == quote if quote else self._begins(node, start)
         if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
             raise unfit(self.name, key, f"{node.value!r:.60}", "write a plain decimal number")
+        if _OCTAL.fullmatch(node.value):
+            found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
+            raise unfit(self.name, key, found, "write it without leading zeros")
+        # Anchor and tag stand before the number. A new gain has a point, and is no integer even where this one is.
+        tags = [part for part in self.text[node.start_mark.index : start].split() if part.startswith("!")]
+        if tags and (tags[0] == "!" or node.tag != _FLOAT):
+            raise unfit(self.name, key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
         return Scalar(key, float(node.value), node.value, start, end, node.start_mark.line + 1)
 
     def _begins(self, node: ScalarNode, start: int) -> bool:
@@ -145,15 +111,43 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
     Raises:
         ControllerUnfit: they are not UTF-8.
     """
+    return YamlDocument(name, utf8(content, name, "YAML"))
+
+
+def _composed_1_2(text: str, name: str) -> Node:
     try:
-        return YamlDocument(name, content.decode())
-    except UnicodeDecodeError as error:
+        root: Node | None = YAML(typ="safe", pure=True).compose(text)
+    except (YAMLError, ValueError, RecursionError) as error:
         raise ControllerUnfit(
             name,
-            found=f"byte {error.start} that is not UTF-8",
-            expected="YAML in UTF-8",
-            remedy="save the file as UTF-8; nothing was written",
+            found=f"no YAML ({' '.join(str(error).split())[:200]})",
+            expected="one YAML document",
+            remedy="correct the file; nothing was written",
         ) from error
+    if root is None:
+        raise ControllerUnfit(
+            name,
+            found="an empty file",
+            expected="the controller's parameters",
+            remedy="is this the right file?",
+        )
+    return root
+
+
+def _composed_1_1(text: str, name: str) -> yaml.Node:
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        found = "nothing in it"
+    except yaml.YAMLError as error:
+        root, found = None, " ".join(str(error).split())[:200]
+    if root is None:
+        raise ControllerUnfit(
+            name,
+            found=f"no YAML 1.1 ({found})",
+            expected="one YAML document that readers of both YAML 1.1 and 1.2 understand",
+            remedy="correct the file; nothing was written",
+        )
+    return root
 
 
 def _count_references(node: Node, references: Counter[int]) -> None:
@@ -168,22 +162,6 @@ def _count_references(node: Node, references: Counter[int]) -> None:
     elif isinstance(node, SequenceNode):
         for child in node.value:
             _count_references(child, references)
-
-
-def _leaves_1_2(file: YamlDocument) -> dict[KeyPath, str]:
-    return _leaves(file._compose())
-
-
-def _leaves_1_1(file: YamlDocument) -> dict[KeyPath, str]:
-    try:
-        return _leaves(yaml.compose(file.text, Loader=yaml.SafeLoader))
-    except yaml.YAMLError as error:
-        raise ControllerUnfit(
-            file.name,
-            found=f"no YAML 1.1 ({' '.join(str(error).split())[:200]})",
-            expected="one YAML document that readers of both YAML 1.1 and 1.2 understand",
-            remedy="correct the file; nothing was written",
-        ) from error
 
 
 def _leaves(root: Any) -> dict[KeyPath, str]:

@@ -45,6 +45,7 @@ def demo_calibration() -> Calibration:
         created="2025-01-02T03:04:05+00:00",
         software="drivegain 0.1.0",
         nameplate_holdout_error_percent=RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3),
+        recording_configuration_sha256=None,
     )
 
 
@@ -124,4 +125,5 @@ calibrations = st.builds(
     created=_texts,
     software=_texts,
     nameplate_holdout_error_percent=st.none() | _errors,
+    recording_configuration_sha256=st.none() | _texts,
 )

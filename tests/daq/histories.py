@@ -12,20 +12,24 @@ import numpy as np
 from daq.calibration_file import encode
 from daq.history.store import HistoryStore
 from ident.calibration import Calibration
-from tests.daq.calibrations import demo_calibration
+from tests.daq.calibrations import demo_calibration, recorded
 
 BEGIN = datetime(2026, 1, 5, 6, 0, 0, tzinfo=UTC)
 STD = 0.004
 
 
 def calibration_of(week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibration:
-    """The demo calibration of that week, each gain times a factor."""
+    """The demo calibration of logs of that week, each gain times a factor."""
     demo = demo_calibration()
     gains = tuple(
         replace(gain, value=float(gain.value * factor), std=STD * abs(gain.value))
         for gain, factor in zip(demo.gains, factors, strict=True)
     )
-    return replace(demo, gains=gains, created=(BEGIN + timedelta(weeks=week)).isoformat())
+    at = BEGIN + timedelta(weeks=week)
+    logs = tuple(
+        replace(one, sha256=hashlib.sha256(f"{one.name} of week {week}".encode()).hexdigest()) for one in demo.sources
+    )
+    return recorded(replace(demo, gains=gains, sources=logs, created=at.isoformat()), at)
 
 
 def digest_of(calibration: Calibration) -> str:

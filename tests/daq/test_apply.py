@@ -20,6 +20,7 @@ import pytest
 from daq.cli.app import main
 from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit
 from daq.write_back.apply import Proposal, apply, propose
+from daq.write_back.audit import AuditAction, read
 from daq.write_back.backups import backups
 from daq.write_back.controller_write import roll_back
 from ident.calibration import Calibration
@@ -202,6 +203,47 @@ def test_a_disk_that_gives_back_something_else_is_noticed(controller: Path, monk
     monkeypatch.undo()
     assert controller.read_bytes() == before
     assert list(controller.parent.iterdir()) == [controller]
+
+
+@pytest.mark.parametrize("does", ["saves it", "deletes it"])
+def test_what_a_person_saves_during_the_write_is_not_lost(
+    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str
+) -> None:
+    """An editor asks nobody for the lock: the last look is right before the rename."""
+    proposal = _propose(demo_calibration(), controller)
+    fsync, edited = os.fsync, controller.read_bytes() + b"# by hand\n"
+
+    def meanwhile(descriptor: int) -> None:
+        fsync(descriptor)
+        if Path(f"/proc/self/fd/{descriptor}").readlink().suffix == ".tmp" and backups(controller):
+            if does == "saves it":
+                controller.write_bytes(edited)
+            else:
+                controller.unlink()
+
+    audit = tmp_path / "audit.jsonl"
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    with pytest.raises(ControllerChanged, match="meanwhile"):
+        apply(proposal, NOW, audit=audit, who="T")
+    monkeypatch.undo()
+    assert list(controller.parent.iterdir()) == ([controller] if does == "saves it" else [])
+    assert not controller.exists() or controller.read_bytes() == edited
+    assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
+
+
+def test_a_file_that_somebody_makes_during_a_way_back_stays(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    controller.unlink()
+    fsync = os.fsync
+
+    def meanwhile(descriptor: int) -> None:
+        fsync(descriptor)
+        controller.write_bytes(b"by: hand\n")
+
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    with pytest.raises(ControllerChanged, match="meanwhile"):
+        roll_back(controller, NOW)
+    assert controller.read_bytes() == b"by: hand\n"
 
 
 def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.calibration_file import save
+from daq.calibration_file import decode, save
 from daq.cli.app import main
 from daq.cli.apply import entered_masses, tightened
 from daq.configuration.apply_policy import ApplyPolicy
@@ -209,13 +209,73 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_written_down(
 
 def test_without_room_for_the_audit_nothing_is_written(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     before = bench.controller.read_bytes()
-    gone = str(bench.cell.parent / "gone" / "a.jsonl")
-    assert bench.apply("--yes", "--audit", gone) == ExitCode.UNEXPECTED
     os.mkfifo(bench.audit)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "the cell's audit, a regular file" in capsys.readouterr().err
     assert bench.controller.read_bytes() == before
     assert not list(bench.controller.parent.glob("*.bak"))
+
+
+def test_nobody_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
+    other = tmp_path / "other.jsonl"
+    assert bench.apply("--yes", "--audit", str(other)) == ExitCode.USAGE
+    assert bench.apply("--yes") == ExitCode.OK
+    assert bench.rollback("--audit", str(other)) == ExitCode.USAGE
+    assert not other.exists()
+    assert bench.actions() == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+
+
+@pytest.mark.parametrize("spoil", ["an end cut off", "one line cut", "emptied", "deleted"])
+def test_an_audit_that_lost_a_write_is_noticed(bench: Bench, capsys: pytest.CaptureFixture[str], spoil: str) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    lines = bench.audit.read_bytes().splitlines(keepends=True)
+    if spoil == "deleted":
+        bench.audit.unlink()
+    else:
+        kept = {"an end cut off": lines[0], "one line cut": lines[0][:40], "emptied": b""}[spoil]
+        bench.audit.write_bytes(kept)
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert "noted elsewhere" in capsys.readouterr().err
+
+
+def test_an_audit_that_lost_a_rollback_is_noticed(bench: Bench) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    written = bench.audit.read_bytes()
+    assert bench.rollback() == ExitCode.OK
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    bench.audit.write_bytes(written)
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+
+
+def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("daq.cli.apply.tell_history", killed)
+        assert bench.apply("--yes") == ExitCode.INTERRUPTED
+    assert b"-9.2100" in bench.controller.read_bytes()
+    capsys.readouterr()
+    for _ in range(2):
+        assert bench.apply("--yes") == ExitCode.OK
+        assert "these gains already" in capsys.readouterr().out
+        with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+            assert store.in_force(str(bench.controller)) == store.entries()[0].digest
+            assert len(store.events()) == 1
+            assert store.audited() == {read(bench.audit)[0].sha256}
+    assert bench.rollback() == ExitCode.OK
+    assert bench.rollback() == ExitCode.OK
+    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+        assert store.in_force(str(bench.controller)) == store.entries()[0].digest
+
+
+def test_a_dry_run_of_what_stands_there_already_tells_the_history_nothing(bench: Bench) -> None:
+    bench.controller.write_bytes(bench.controller.read_bytes())
+    assert bench.apply() == ExitCode.OK
+    assert not bench.cell.with_name("cell.history.sqlite").exists()
 
 
 def test_a_history_that_is_none_does_not_make_a_write_undone(
@@ -237,3 +297,29 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     broken = _change("J3", 30.0, float("nan"), 0.1)
     assert significant((large, small, broken)) == {"J2"}
     assert significant((broken,)) == frozenset()
+    # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
+    middle = _change("J4", 10.0, 10.25, 0.07)
+    assert significant((middle,)) == {"J4"}
+    assert significant((middle,), {"J4": 0.07}) == frozenset()
+
+
+def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fourth() -> dict[str, object]:
+        capsys.readouterr()
+        assert bench.apply("--json") == ExitCode.OK
+        found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
+        return found
+
+    assert fourth()["change_sigmas"] == pytest.approx(2.31 / 0.03684)  # entered by hand: exact
+    assert bench.apply("--yes") == ExitCode.OK
+    known = decode(bench.calibration.read_bytes(), "")
+    gain = known.gains[3]
+    moved = replace(gain, value=gain.value * 1.015)
+    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    found = fourth()
+    assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (0.03684 * 2**0.5), rel=0.01)
+    assert found["significant"] is False  # 3.7 σ would be, were the number exact
+    assert bench.apply() == ExitCode.OK
+    assert "σ of both" in capsys.readouterr().out

@@ -407,6 +407,15 @@ ParameterValue=2
 DataType=0x0003
 LowLimit=few
 ParameterValue=2
+[200Csub1]
+DataType=0x0008
+ParameterValue=1.5
+[200csub01]
+DataType=0x0008
+ParameterValue=2.5
+[200Dsub0A]
+DataType=0x0008
+ParameterValue=1.5
 """
 
 
@@ -426,12 +435,21 @@ ParameterValue=2
         ("2009", "'010'"),
         ("200A", "it 2 times, on lines"),
         ("200B", "few as lowlimit"),
+        ("200C:01", "it 2 times, on lines"),
     ],
 )
 def test_an_object_that_cannot_be_changed_alone_is_refused(key: str, says: str) -> None:
     with pytest.raises(ControllerUnfit) as caught:
         DcfDocument("drive.dcf", _DCF).locate((key,))
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["200D:0A", "200dsubA", "0x200Dsub0a"])
+def test_an_object_is_its_index_and_subindex_however_its_section_spells_them(key: str) -> None:
+    changed = DcfDocument("drive.dcf", _DCF).with_values({key: "2.5000"})
+    assert changed.text == _DCF.replace(
+        "[200Dsub0A]\nDataType=0x0008\nParameterValue=1.5", "[200Dsub0A]\nDataType=0x0008\nParameterValue=2.5000"
+    )
 
 
 @pytest.mark.parametrize(

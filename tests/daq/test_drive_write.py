@@ -25,6 +25,7 @@ from daq.errors import (
 from daq.write_back.audit import AuditAction, read, verify
 from daq.write_back.drive_proposal import DriveProposal, propose_to_drives
 from daq.write_back.drive_record import read_record, read_records, record_folder
+from daq.write_back.drive_way_back import way_back_of_drives
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives, roll_back_drives
 from daq.write_back.gates import Gate
 from drivers.bus import BusAddress
@@ -252,7 +253,7 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
         simulation.nodes[2].nmt = NmtState.OPERATIONAL
         monkeypatch.undo()
         with network_of(cell, address) as network:
-            roll_back_drives(cell, network, NOW)
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -471,7 +472,13 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
         ]
         for minutes, expected, saved in ((1, IN_DRIVES, IN_DRIVES), (2, NEW, NEW), (2, IN_DRIVES, IN_DRIVES)):
             with network_of(cell, address) as network:
-                roll_back_drives(cell, network, NOW + timedelta(minutes=minutes), audit=cell.history.audit, who="T")
+                roll_back_drives(
+                    way_back_of_drives(cell, network),
+                    network,
+                    NOW + timedelta(minutes=minutes),
+                    audit=cell.history.audit,
+                    who="T",
+                )
             assert _gains(simulation) == expected
             assert _saved(simulation) == saved
     assert len(read_records(record_folder(cell))) == 4
@@ -492,21 +499,47 @@ def test_a_way_back_that_would_lose_what_somebody_did_is_refused(address: BusAdd
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         with pytest.raises(BackupMissing, match="no record"):
-            roll_back_drives(cell, network, NOW)
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
         written = _write(cell, address)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
         with pytest.raises(ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"):
-            roll_back_drives(cell, network, NOW)
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
         body = json.loads(written.record.read_text())
         body["drives"][0]["old"] = 99999
         written.record.write_text(json.dumps(body))
         with pytest.raises(ControllerUnfit, match="as it says"):
-            roll_back_drives(cell, network, NOW)
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
         assert _gains(simulation) == NEW
         written.record.write_text("{}")
         with pytest.raises(ControllerUnfit, match="the record of a write to drives"):
-            roll_back_drives(cell, network, NOW)
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+
+
+def test_a_gain_that_somebody_entered_in_a_drive_is_looked_at_first(address: BusAddress, tmp_path: Path) -> None:
+    """The newest record says what drivegain left there: that, or what stood there before, is no surprise."""
+    cell = demo_cell(tmp_path)
+    entry = ObjectEntry(0x2003, 1, 32, signed=True)
+    with simulated(address), network_of(cell, address) as network:
+        first = _propose(cell, network)
+        assert first.refusals == ()  # no record: nothing to compare with
+        written = _write(cell, address)
+        for word in (16300, 18480):
+            network.link.objects(5).write(entry, word)
+            assert _propose(cell, network).refusals == ()
+        network.link.objects(5).write(entry, 18000)
+        changed = _propose(cell, network)
+        assert [(one.gate, one.subject, one.found) for one in changed.refusals] == [
+            (Gate.BASE, "J5, 2003h:01", "18000")
+        ]
+        assert "16300" in changed.refusals[0].expected
+        assert _propose(cell, network, looked_at=changed.base_sha256).refusals == ()
+        assert [one.gate for one in _propose(cell, network, looked_at=first.base_sha256).refusals] == [Gate.BASE]
+        network.link.objects(5).write(entry, 16300)
+        written.record.write_text("{}")
+        unread = _propose(cell, network)
+        assert [(one.gate, one.subject) for one in unread.refusals] == [(Gate.BASE, str(written.record))]
+        assert _propose(cell, network, looked_at=unread.base_sha256).refusals == ()
 
 
 def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path) -> None:
@@ -516,7 +549,7 @@ def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path
     new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
     with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
         with network_of(new, address) as network, pytest.raises(ControllerChanged, match="serial number 1002"):
-            roll_back_drives(new, network, NOW)
+            roll_back_drives(way_back_of_drives(new, network), network, NOW)
         assert _gains(simulation) == NEW
 
 
@@ -540,10 +573,10 @@ def test_after_a_kill_the_record_says_what_stood_there_and_leads_back(tmp_path: 
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:
             if writes:
-                roll_back_drives(cell, network, NOW)
+                roll_back_drives(way_back_of_drives(cell, network), network, NOW)
             else:
                 with pytest.raises(BackupMissing, match="1 records of what stands there now"):
-                    roll_back_drives(cell, network, NOW)
+                    roll_back_drives(way_back_of_drives(cell, network), network, NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 

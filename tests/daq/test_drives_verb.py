@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +15,9 @@ import typer
 from daq.bus_lock import bus_lock
 from daq.calibration_file import encode
 from daq.cli.applier import Applier
-from daq.cli.apply_drives import apply_drives, rollback_drives, saving_of
+from daq.cli.apply_drives import apply_drives
+from daq.cli.drives import saving_of
+from daq.cli.rollback_drives import rollback_drives
 from daq.configuration.cell import Bus, Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.history.store import HistoryStore
@@ -77,9 +80,9 @@ def _apply(
     )
 
 
-def _back(cell: Cell, *, as_json: bool = False) -> None:
+def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
     assert cell.history is not None
-    rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, json=as_json)
+    rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
 
 
 def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,6 +102,12 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     _apply(cell)
     assert "The drives have these gains already" in capsys.readouterr().out
 
+    _back(cell, yes=False)
+    told = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in told
+    assert "the write of 2025-01-02T03:04:05+00:00 by Kim (login kim)" in told
+    assert "Dry run, nothing was written." in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
     _back(cell)
     told = capsys.readouterr().out
     assert "J4, 2003h:01: -9210 -> -11520" in told
@@ -114,8 +123,23 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
             AuditAction.ROLLED_BACK,
         )
     ]
+    evidence = read(cell.history.audit)[0].details
+    assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
+    assert evidence["calibration"] == {
+        "file": str(Path("calibration.yaml").absolute()),
+        "sha256": hashlib.sha256(encode(demo_calibration())).hexdigest(),
+        "cell": "demo",
+        "created": demo_calibration().created,
+        "software": demo_calibration().software,
+    }
     with HistoryStore(cell.history.store) as store:
         assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
+        assert store.in_force() is None
+        # The two entries that tell how the writes ended.
+        assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::2]}
+    _back(cell)
+    with HistoryStore(cell.history.store) as store:
+        assert store.in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()
 
 
 @pytest.mark.usefixtures("simulation")
@@ -129,8 +153,11 @@ def test_a_program_is_told_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[s
     assert (written["applied"], written["saved"]) == (True, False)
     assert written["base_sha256"] == looked["base_sha256"]
     assert Path(written["record"]).is_file()
-    _back(cell, as_json=True)
-    assert json.loads(capsys.readouterr().out)["source"] == written["record"]
+    for yes in (False, True):
+        _back(cell, yes=yes, as_json=True)
+        told = json.loads(capsys.readouterr().out)
+        assert (told["source"], told["restored"]) == (written["record"], yes)
+        assert told["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
 
 
 @pytest.mark.parametrize("yes", [False, True])

@@ -6,6 +6,7 @@ import hashlib
 import math
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,12 @@ from hypothesis import strategies as st
 from daq import fit as fit_module
 from daq.calibration_file import as_document, decode, encode
 from daq.cli.app import main
+from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.conversion import load_run
 from daq.errors import ExitCode, UsageError
-from daq.fit import ALL_AXES, Reading, axis_of, calibration_of, fit
+from daq.fit import ALL_AXES, Fit, Reading, axis_of, calibration_of, close_loop, fit
 from daq.log.losses import LossyLogs
 from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import read_log
@@ -28,9 +30,16 @@ from daq.payload_mass import check_entered_mass
 from daq.plan_file import load_plan
 from daq.record import Clocks, record
 from daq.resources import shipped_configurations
+from daq.write_back.fit_gates import fit_refusals
+from daq.write_back.gates import Gate
+from ident.calibration import Calibration
 from ident.effects.lag import Lag
 from ident.effects.placed import PlacedEffect
+from ident.effects.stribeck import Stribeck
 from ident.effects.time_skew import TimeSkew
+from ident.estimate import Method
+from ident.identify import estimate_with
+from ident.loop import close_the_loop
 from ident.recording import Recording
 from ident.run import Run
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
@@ -38,6 +47,7 @@ from tests.daq.test_record import WALL_NS, Rig
 from tests.ident.recordings import GAINS, MOUNTED, tx40_truth
 from tests.ident.recordings import record as invented
 
+NOW = datetime(2025, 1, 2, tzinfo=UTC)
 LIMIT = 0x1237 | 0x0800
 """Statusword with bit 11, internal limit active (CiA 402)."""
 
@@ -134,6 +144,70 @@ def test_a_hold_out_is_told_better_than_by_a_wrong_nameplate_and_no_worse_than_b
     assert all(math.isfinite(axis) for axis in nameplate.axes)
     assert decode(encode(found), "c.yaml") == found
     assert as_document(found)["nameplate_holdout_error_percent"] is not None
+    assert found.recording_configuration_sha256 == cell.recording_digest
+    assert _refused(found) == []
+
+
+def _sticking(run: Run) -> Run:
+    """With low-speed friction in axis 2 that the declared model lacks."""
+    speed = np.gradient(run.position_rad[:, 1]) * run.rate_hz
+    added = np.zeros_like(run.current_a)
+    added[:, 1] = 5.0 * np.sign(speed) * np.exp(-((speed / 0.35) ** 2)) / GAINS[1]
+    return replace(run, current_a=run.current_a + added)
+
+
+@pytest.fixture(scope="module")
+def with_effect(truth_runs: dict[str, Run]) -> Fit:
+    """A loop that has found that friction, on a cell whose nameplate is some per cent off."""
+    runs = {name: _sticking(run) for name, run in truth_runs.items()}
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+        patch.setattr(fit_module, "close_the_loop", partial(close_the_loop, families=((Stribeck(0.3),),)))
+        start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("unused")])
+        found = close_loop(start, 0)
+    assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]
+    return found
+
+
+def _effects(fitted: Fit) -> tuple[PlacedEffect, ...]:
+    return fitted.steps[-1].after.effects
+
+
+def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
+    """What comes of other gains with all the rest refitted to them, as if they had been identified."""
+    after = fitted.steps[-1].after
+    other = estimate_with(Method.ML, after.training.system(), after.estimate.gains * np.array(factors))
+    other = replace(other, gains_fixed=False, covariance=after.estimate.covariance)
+    step = replace(fitted.steps[-1], after=replace(after, estimate=other))
+    return calibration_of(replace(fitted, steps=(*fitted.steps[:-1], step)), NOW)
+
+
+def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
+    return [(one.gate, one.subject) for one in fit_refusals(calibration, "demo", None, ApplyPolicy())]
+
+
+def test_what_an_effect_tells_is_not_credited_to_the_gains(with_effect: Fit) -> None:
+    """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
+    nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
+    gains = with_effect.final.estimate.gains
+    same = _with_gains(with_effect, tuple(nameplate / gains))
+    held, compared = same.holdout_error_percent, same.nameplate_holdout_error_percent
+    assert held is not None
+    assert compared is not None
+    assert held.axes == pytest.approx(compared.axes, rel=1e-6)
+    assert held.total == pytest.approx(compared.total, rel=1e-6)
+    bare = with_effect.identification.holdout_error
+    assert bare is not None
+    assert held.axes[1] < 0.97 * bare.axes[1]
+
+
+def test_one_wrong_gain_among_good_ones_is_refused_in_spite_of_an_effect(with_effect: Fit) -> None:
+    assert _refused(calibration_of(with_effect, NOW)) == []
+    assert _refused(_with_gains(with_effect, (1.0,) * 6)) == []
+    found = _refused(_with_gains(with_effect, (1.0, 1.0, 1.0, 0.7, 1.0, 1.0)))
+    assert (Gate.HOLDOUT, "J4") in found
+    assert {gate for gate, _ in found} == {Gate.HOLDOUT}
 
 
 def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from collections.abc import Callable
@@ -12,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from daq.calibration_file import encode
-from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.apply_policy import Applier, ApplyPolicy, ApplyPolicyModel, HoldOut
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
-from daq.errors import CalibrationRefused, exit_code
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.signature import generate, sign
 from daq.write_back import fit_gates
 from daq.write_back.apply import Proposal, apply, propose, propose_for, refused
@@ -76,7 +77,9 @@ def scene(tmp_path: Path) -> Scene:
     keys = {name: generate(tmp_path, name)[1].line for name in ("Ada", "Bob")}
     calibration = with_recordings(demo_calibration(), controller_sha256=sha256(controller.read_bytes()))
     return Scene(
-        calibration=replace(calibration, configuration_sha256=cell.digest),
+        calibration=replace(
+            calibration, configuration_sha256=cell.digest, recording_configuration_sha256=cell.recording_digest
+        ),
         cell=cell,
         controller=controller,
         policy=ApplyPolicy(signatures=1, signers=keys),
@@ -171,6 +174,15 @@ NO_SERIALS: Callable[[Scene], Scene] = lambda scene: replace(  # noqa: E731
 )
 
 
+def _wanted(scene: Scene) -> Scene:
+    """The cell wants a hold-out."""
+    return replace(scene, policy=replace(scene.policy, holdout=HoldOut.REQUIRED))
+
+
+def _bounded(scene: Scene, **axes: float) -> Scene:
+    return replace(scene, policy=replace(scene.policy, max_change=axes))
+
+
 def _both(*steps: Callable[[Scene], Scene]) -> Callable[[Scene], Scene]:
     def broken(scene: Scene) -> Scene:
         for step in steps:
@@ -180,9 +192,12 @@ def _both(*steps: Callable[[Scene], Scene]) -> Callable[[Scene], Scene]:
     return broken
 
 
+HELD = (3.2, 2.9, 3.5, 4.1, 5.6, 5.0)
+
 CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.CHANGE, "J2", _gain("J2", value=32.96 * 1.36)),
     (Gate.CHANGE, "J2", _gain("J2", value=32.96 * 0.64)),
+    (Gate.CHANGE, "J4", lambda scene: _bounded(scene, J4=2.3)),
     (Gate.NAMEPLATE, "J5", _gain("J5", nameplate=10.5)),
     (Gate.SIGN, "J4", _gain("J4", value=9.21)),
     (Gate.SIGN, "J1", _gain("J1", nameplate=-32.96)),
@@ -197,7 +212,12 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.NOT_FINITE, "calibration", _calibration(holdout_error_percent=RelativeError((1.0,), math.nan))),
     (Gate.NOT_FINITE, "calibration", _calibration(relative_error_percent=RelativeError((math.nan,), 3.0))),
     (Gate.CELL, "calibration", _calibration(cell="other")),
-    (Gate.CONFIGURATION, "calibration", _calibration(configuration_sha256="e" * 64)),
+    (Gate.CONFIGURATION, "calibration", _calibration(recording_configuration_sha256="e" * 64)),
+    (
+        Gate.CONFIGURATION,
+        "calibration",
+        _calibration(configuration_sha256="e" * 64, recording_configuration_sha256=None),
+    ),
     (
         Gate.ERROR,
         "calibration",
@@ -215,7 +235,38 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
             nameplate_holdout_error_percent=None,
         ),
     ),
-    (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=RelativeError((3.2,) * 6, 3.25))),
+    (
+        Gate.ERROR,
+        "J6",
+        _calibration(
+            holdout_error_percent=RelativeError((*HELD[:5], 51.0), 3.3),
+            nameplate_holdout_error_percent=RelativeError((*HELD[:5], 60.0), 4.3),
+        ),
+    ),
+    (
+        Gate.ERROR,
+        "J6",
+        _calibration(relative_error_percent=RelativeError((*HELD[:5], 51.0), 3.3), holdout_error_percent=None),
+    ),
+    (Gate.ERROR, "calibration", _calibration(holdout_error_percent=RelativeError(HELD[:5], 3.3))),
+    (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.25))),
+    (
+        Gate.HOLDOUT,
+        "J4",
+        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], 4.1 / 1.021, *HELD[4:]), 4.3)),
+    ),
+    (
+        Gate.HOLDOUT,
+        "J4",
+        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], math.nan, *HELD[4:]), 4.3)),
+    ),
+    (Gate.HOLDOUT, "J6", _calibration(nameplate_holdout_error_percent=RelativeError(HELD[:5], 4.3))),
+    (Gate.HOLDOUT, "calibration", _both(_wanted, _calibration(holdout_error_percent=None))),
+    (
+        Gate.HOLDOUT,
+        "calibration",
+        _both(_wanted, _calibration(nameplate_holdout_error_percent=None)),
+    ),
     (
         Gate.HOLDOUT_STILL,
         "J2",
@@ -226,6 +277,11 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.SOURCES, "log loaded", _source(1, sha256="")),
     (Gate.SOURCES, "log run.mcap.part", _source(0, name="run.mcap.part")),
     (Gate.SOURCES, "log unused", _source(2, recording=None)),
+    (Gate.SOURCES, "log loaded", _source(1, serials=())),
+    (Gate.SOURCES, "log loaded", _source(1, serials=tuple(range(1001, 1006)))),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=())),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0,) * 7)),
+    (Gate.SOURCES, "log loaded", _source(1, missing=())),
     (Gate.PARTIAL, "log loaded", _source(1, partial=True)),
     (Gate.PARTIAL, "log loaded", _source(1, partial=True, missing=(0, 3, 0, 0, 0, 0))),
     (Gate.LOSSY, "log loaded", _source(1, lost_cycles=1)),
@@ -295,7 +351,14 @@ def test_every_gate_has_such_a_test() -> None:
         _gain("J6", std=0.0299 * 6.79),
         _calibration(holdout_error_percent=None),
         _calibration(nameplate_holdout_error_percent=None),
-        _calibration(nameplate_holdout_error_percent=RelativeError((3.2,) * 6, 3.3 / fit_gates.NOISE)),
+        _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.3 / fit_gates.NOISE)),
+        _calibration(
+            nameplate_holdout_error_percent=RelativeError(tuple(axis / fit_gates.AXIS_NOISE for axis in HELD), 3.3)
+        ),
+        _calibration(
+            holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
+            nameplate_holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
+        ),
         _calibration(effects=()),
         _source(0, recorded_s=(NOW - 29.9 * DAY).timestamp()),
         _source(0, recorded_s=(NOW + 0.9 * DAY).timestamp()),
@@ -304,7 +367,10 @@ def test_every_gate_has_such_a_test() -> None:
         _source(1, entered_kg=4.595),
         _both(_source(1, entered_kg=None), _source(2, entered_kg=None), _scene(entered_kg={"disc": 4.585})),
         _both(NO_SERIALS, _logs(serials=(None,) * 6)),
-        _both(NO_SERIALS, _source(1, serials=())),
+        _wanted,
+        lambda scene: _bounded(scene, J4=2.32, J1=0.95),
+        _calibration(configuration_sha256="e" * 64),
+        _calibration(recording_configuration_sha256=None),
         _scene(policy=ApplyPolicy(), signed=(), file=None),
         _scene(policy=ApplyPolicy(max_age_days=None), now=NOW + 3000 * DAY),
         _both(_logs(recorded_s=None), _scene(policy=ApplyPolicy(max_age_days=None))),
@@ -334,6 +400,34 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
     assert [axis for gate, axis in gates if gate is Gate.UNCERTAINTY] == list(AXES)
     assert len([axis for gate, axis in gates if gate is Gate.SATURATED]) == 3
     assert len([axis for gate, axis in gates if gate is Gate.STALE]) == 3
+
+
+@pytest.mark.parametrize(
+    ("told", "wanted"),
+    [
+        ({}, HoldOut.OPTIONAL),
+        ({"holdout": "required"}, HoldOut.REQUIRED),
+        ({"by": "job"}, HoldOut.REQUIRED),
+        ({"by": "job", "holdout": "required"}, HoldOut.REQUIRED),
+    ],
+)
+def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: HoldOut) -> None:
+    policy = ApplyPolicyModel.model_validate_json(json.dumps(told)).policy
+    assert (policy.holdout, policy.by) == (wanted, Applier(told.get("by", "person")))
+    with pytest.raises(ValueError, match="holdout: required"):
+        ApplyPolicyModel.model_validate_json('{"by": "job", "holdout": "optional"}')
+
+
+def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path: Path) -> None:
+    cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
+    text = cell.read_text()
+    assert "policy:" not in text
+    cell.write_text(text + "policy: {apply: {max_change: {J4: 2.0}}}\n")
+    assert load_cell(cell).apply.max_change == {"J4": 2.0}
+    cell.write_text(text + "policy:\n  apply:\n    max_change:\n      j4: 2.0\n")
+    line = len(cell.read_text().splitlines())
+    with pytest.raises(ConfigurationInconsistent, match=rf":{line}: policy\.apply\.max_change\.j4: found axis 'j4'"):
+        load_cell(cell)
 
 
 def test_two_signatures_of_others_are_two(scene: Scene) -> None:

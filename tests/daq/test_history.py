@@ -21,15 +21,27 @@ from daq.calibration_file import save
 from daq.cli.app import main
 from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
+from daq.history.entry import logs_of, recorded_at
 from daq.history.store import HistoryStore
 from daq.history.table import COLUMNS
 from daq.history.watch import Series, watch
 from daq.history.words import alarm_words, questions
+from daq.recalibration.session import Basis, begin
+from daq.recalibration.session import save as save_session
 from daq.write_back.audit import AuditAction, append, read
-from tests.daq.calibrations import AXES
-from tests.daq.histories import BEGIN, calibration_of, enter, fill
+from tests.daq.calibrations import AXES, recorded, with_recordings
+from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, fill
 
 FLAT = (1.0,) * 6
+RECALIBRATION = """
+recalibration:
+  runs:
+    - {name: bare, plan: {seed: 1}}
+    - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
+    - {name: unused, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
+  interlock: {file: interlock}
+  mount: {command: ["true"]}
+"""
 
 
 def drifting(week: int) -> tuple[float, ...]:
@@ -186,6 +198,50 @@ def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
     assert words.startswith("gain of J4 fell 9.6 %")
 
 
+def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
+    """Twelve fits of one session are one calibration: the newest that was applied, else the newest."""
+    logs = calibration_of(0).sources
+    fits = [
+        replace(calibration_of(week, (1.0 + 0.001 * week,) * 6), sources=logs[::-1] if week % 2 else logs)
+        for week in range(12)
+    ]
+    with HistoryStore(_place(cell).store) as store:
+        digests = [enter(store, fit) for fit in fits]
+        assert len(store.entries()) == 12
+        (point,) = watch(store.entries(), ())[3].points
+        assert point.entry.digest == digests[-1]
+        assert point.entry.recorded == BEGIN
+        store.applied(digests[4], at=BEGIN, who="anna", target="x.yaml")
+        enter(store, calibration_of(1))
+        points = watch(store.entries(), ())[3].points
+        assert [point.entry.digest for point in points] == [digests[4], digest_of(calibration_of(1))]
+        held = tuple(replace(gain, std=0.0) for gain in fits[0].gains)
+        enter(store, replace(fits[0], gains=held, sources=calibration_of(1).sources))  # knows no gain, hides none
+        assert watch(store.entries(), ())[3].points[1].entry.digest == digest_of(calibration_of(1))
+    # Another log held out is another question to the same recordings.
+    other = replace(fits[0], sources=(*logs[:2], replace(logs[2], sha256="9" * 64)))
+    assert logs_of(other, "") == logs_of(fits[0], "")
+    assert logs_of(replace(fits[0], sources=()), "its own") == "its own"
+
+
+def test_old_logs_fitted_today_tell_of_their_own_time(cell: Path) -> None:
+    """A gain that was another one a year ago has not changed today."""
+    _filled(cell, 20, lambda _: FLAT)
+    year_ago = recorded(calibration_of(30, (0.9,) * 6), BEGIN - timedelta(days=400))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, year_ago)
+        assert store.entries()[-1].digest == digest_of(year_ago)  # fitted last
+    series = _series(cell)[3]
+    assert series.points[0].entry.digest == digest_of(year_ago)
+    assert [point.entry.recorded for point in series.points[:2]] == [BEGIN - timedelta(days=400), BEGIN]
+    assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
+
+
+@pytest.mark.parametrize("told", [None, float("nan"), 1e300])
+def test_a_log_without_its_time_has_that_of_the_fit(told: float | None) -> None:
+    assert recorded_at(with_recordings(calibration_of(3), recorded_s=told), BEGIN) == BEGIN
+
+
 def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _filled(cell, 3, lambda _: FLAT)
     fixed = calibration_of(5)
@@ -338,6 +394,21 @@ def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.Ca
     place.audit.write_bytes(b"".join(place.audit.read_bytes().splitlines(keepends=True)[:2]))
     assert main(["history", str(cell), "--verify"]) == 4
     assert entries[2].sha256[:12] in capsys.readouterr().err
+
+
+def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A session keeps the digest of the entry that tells of its end."""
+    cell.write_text(cell.read_text() + RECALIBRATION)
+    declared = load_cell(cell)
+    assert declared.recalibration is not None
+    ended = append(_place(cell).audit, AuditAction.RECALIBRATION_ENDED, at=BEGIN, who="job", subject="x", details={})
+    session = begin(declared.recalibration.folder, Basis(declared.name, declared.digest, ""), BEGIN)
+    assert main(["history", str(cell), "--verify"]) == 0
+    save_session(replace(session, state=session.state.with_(audit_sha256=ended.sha256)))
+    assert main(["history", str(cell), "--verify"]) == 0
+    _place(cell).audit.unlink()
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert ended.sha256[:12] in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")])

@@ -34,7 +34,7 @@ NOBODY = 65534
 def test_without_a_file_it_is_empty_and_makes_none(tmp_path: Path) -> None:
     path = tmp_path / "demo.history.sqlite"
     with HistoryStore(path) as store:
-        assert not any((store.entries(), store.gains(), store.events(), store.acknowledgements(), store.audited()))
+        assert not any((store.entries(), store.events(), store.acknowledgements(), store.audited()))
         assert store.in_force() is None
         assert store.document("0" * 64) is None
         assert store.integrity() == ()
@@ -50,7 +50,6 @@ def test_a_calibration_comes_back_as_it_was(tmp_path: Path) -> None:
         (entry,) = store.entries()
         document = store.document(digest)
         assert store.integrity() == ()
-        assert [record.gain for record in store.gains()] == list(given_.gains)
     assert document == encode(given_)
     assert decode(document, "document") == given_
     assert entry.gains == given_.gains
@@ -113,25 +112,40 @@ def test_what_is_applied_and_rolled_back_is_told(tmp_path: Path) -> None:
         def in_force() -> None:
             told.append({None: "-", first: "first", second: "second"}[store.in_force("x.yaml")])
 
-        store.applied(first, at=BEGIN, who="anna", target="x.yaml", audit="a" * 64)
+        def back(to: str, target: str = "x.yaml") -> str | None:
+            return store.rolled_back(at=BEGIN, who="anna", target=target, sha256_after=to)
+
+        store.applied(first, at=BEGIN, who="anna", target="x.yaml", audit="a" * 64, sha256_after="1")
         in_force()
-        assert store.rolled_back(at=BEGIN, who="anna", target="x.yaml") is None
+        assert back("0") is None
         in_force()
-        assert store.rolled_back(at=BEGIN, who="anna", target="x.yaml") == first  # takes the rollback back
+        assert back("1") == first  # takes the rollback back
         in_force()
-        store.applied(second, at=BEGIN, who="job", target="x.yaml")
+        store.applied(second, at=BEGIN, who="job", target="x.yaml", sha256_after="2")
         in_force()
-        store.applied(second, at=BEGIN, who="job", target="another.yaml")
-        assert store.rolled_back(at=BEGIN, who="anna", target="x.yaml") == first
+        store.applied(second, at=BEGIN, who="job", target="another.yaml", sha256_after="1")
+        assert back("1") == first
         in_force()
         assert told == ["first", "-", "first", "second", "first"]
         assert store.in_force("another.yaml") == second
         assert store.in_force() == first
         assert store.audited() == {"a" * 64}
         assert [event.deed for event in store.entries()[0].events] == [Deed.APPLIED, Deed.ROLLED_BACK, Deed.ROLLED_BACK]
-        assert all(record.applied for record in store.gains())
+        assert all(entry.applied for entry in store.entries())
         with pytest.raises(ValueError, match="not in the history"):
             store.applied("0" * 64, at=BEGIN, who="anna", target="x.yaml")
+
+
+def test_what_a_person_entered_between_two_writes_is_no_calibration(tmp_path: Path) -> None:
+    """The order of the writes does not tell to what a rollback leads back: the content does."""
+    with HistoryStore(tmp_path / "h") as store:
+        first, second = (enter(store, calibration_of(week)) for week in range(2))
+        store.applied(first, at=BEGIN, who="anna", target="x.yaml", sha256_after="1")
+        store.applied(second, at=BEGIN, who="anna", target="x.yaml", sha256_after="2")  # over what was entered by hand
+        assert store.rolled_back(at=BEGIN, who="anna", target="x.yaml", sha256_after="entered by hand") is None
+        assert store.in_force("x.yaml") is None
+        assert store.rolled_back(at=BEGIN, who="anna", target="x.yaml", sha256_after="2") == second
+        assert store.events()[0].sha256_after == "1"
 
 
 def test_acknowledgements_come_back(tmp_path: Path) -> None:

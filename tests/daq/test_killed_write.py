@@ -20,6 +20,7 @@ from daq.write_back.backups import backups
 from daq.write_back.controller_file import decode
 from daq.write_back.controller_write import roll_back
 from ident.calibration import Calibration
+from tests.daq import killing
 from tests.daq.calibrations import demo_calibration
 from tests.daq.killing import killed_at
 
@@ -154,6 +155,16 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_
     assert set(outcomes) == {Content.BEFORE, Content.AFTER}
     # Otherwise nobody was killed half-way.
     assert {"lock", "tmp"} <= left
+
+
+@pytest.mark.parametrize(("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
+def test_where_ptrace_is_not_permitted_it_is_skipped_by_people_and_fails_in_ci(
+    monkeypatch: pytest.MonkeyPatch, ci: str, ends: type[BaseException]
+) -> None:
+    monkeypatch.setenv("CI", ci)
+    monkeypatch.setattr(killing, "_ptrace", lambda *_: -1)
+    with pytest.raises(ends, match="ptrace is not permitted"):
+        killing.killed_at(1, lambda: None)
 
 
 def _check(place: Place, before: bytes, after: bytes) -> Content:

@@ -57,6 +57,31 @@ LEGACY = (
 )
 
 
+def test_a_pipe_or_a_folder_in_place_of_a_file_keeps_nobody_waiting(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_bytes(CONTENT)
+    secret, public = generate(tmp_path, "Bob")
+    signature = signature_path(file, "Bob")
+    for made in (os.mkfifo, os.mkdir):
+        made(signature)
+        with pytest.raises(SignatureInvalid, match=r"no regular file|is a directory"):
+            signers_of(file, {"Bob": public.line})
+        with pytest.raises(OutputExists, match="no signature"):
+            sign(file, secret, "Bob")
+        signature.rmdir() if signature.is_dir() else signature.unlink()
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(CalibrationMissing, match="no regular file"):
+        sign(pipe, secret, "Bob")
+    with pytest.raises(CalibrationMissing, match="no regular file"):
+        signers_of(pipe, {"Bob": public.line})
+    with pytest.raises(SecretKeyUnfit, match="no regular file"):
+        sign(file, pipe, "Bob")
+    signature.symlink_to("/dev/zero")
+    with pytest.raises(SignatureInvalid, match="no regular file"):
+        signers_of(file, {"Bob": public.line})
+
+
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     path = tmp_path / "calibration.yaml"

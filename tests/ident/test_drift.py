@@ -66,19 +66,17 @@ def test_probabilities_of_no_change_are_uniform() -> None:
 
 @pytest.mark.parametrize("common", [0.0, 0.9])
 def test_a_recalibration_without_change_is_seldom_taken_for_one(common: float) -> None:
-    """However the errors of the axes depend on each other; where the correlation is known, with χ² too."""
+    """However the errors of the axes depend on each other."""
     rng = np.random.default_rng(2)
     correlation = np.full((AXES, AXES), common) + (1.0 - common) * np.eye(AXES)
     root = np.linalg.cholesky(correlation)
     std = 0.004 * np.abs(GAINS)
-    alone, together = [], []
+    found = []
     for _ in range(1500):
         old, new = (GAINS + DISPERSION * std * (root @ rng.standard_normal(AXES)) for _ in range(2))
-        alone.append(decide(NAMES, old, std, new, std).differs)
-        together.append(decide(NAMES, old, std, new, std, correlation=(correlation, correlation)).differs)
+        found.append(decide(NAMES, old, std, new, std).differs)
     # 1 % asked for; 1500 draws know it to 0.26 %.
-    assert np.mean(alone) < 0.02
-    assert np.mean(together) < 0.02
+    assert np.mean(found) < 0.02
 
 
 def test_a_recalibration_with_a_change_says_which_and_how_much() -> None:
@@ -89,26 +87,11 @@ def test_a_recalibration_with_a_change_says_which_and_how_much() -> None:
     assert found.differs
     assert found.changes[3].percent == pytest.approx(-6.0)
     assert found.adjusted[3] == min(found.adjusted) < 1e-6
-    assert found.joint is None
     assert found.words.startswith("changed by more than noise: J4 -6 % (10.")
     assert "J3" not in found.words
     same = decide(NAMES, GAINS, std, GAINS, std)
     assert not same.differs
     assert same.words.startswith("no gain has changed by more than noise")
-
-
-def test_many_small_changes_are_seen_together() -> None:
-    """2.2 σ on each axis: none for itself, and χ² of 29 over six."""
-    std = 0.004 * np.abs(GAINS)
-    new = GAINS + 2.2 * DISPERSION * math.sqrt(2.0) * std * np.array([1, -1, 1, -1, 1, -1])
-    alone = decide(NAMES, GAINS, std, new, std)
-    independent = np.eye(AXES)
-    together = decide(NAMES, GAINS, std, new, std, correlation=(independent, independent))
-    assert not alone.differs
-    assert together.differs
-    assert together.joint is not None
-    assert together.joint < 1e-3
-    assert "all together have" in together.words
 
 
 def test_nothing_to_compare_changes_nothing() -> None:
@@ -234,6 +217,38 @@ def test_one_calibration_is_its_own_baseline() -> None:
 def test_what_cannot_be_watched_is_refused(values: list[float], stds: list[float]) -> None:
     with pytest.raises(ValueError, match="expected"):
         cusum(values, stds)
+
+
+@pytest.mark.parametrize(
+    ("values", "stds"),
+    [
+        ([1e300] * 6, [1e-300] * 6),
+        ([1e300, 1.1e300] * 3, [1e-300] * 6),
+        ([1e-300] * 6, [1e300] * 6),
+        ([5e-324] * 6, [1.0] * 6),
+        ([1.0] * 6, [5e-324] * 6),
+        ([1e300, 1.0, 1.0, 1.0, 1.0, 1.0], [1e-3] * 6),
+        ([1.0] * 6, [1e300, 0.01, 0.01, 0.01, 0.01, 0.01]),
+        ([1.0] * 6, [1e-15, 1e-10, 1e-5, 1.0, 1e5, 1e10]),
+        ([1.0] * 6, [1e10, 1e5, 1.0, 1e-5, 1e-10, 1e-15]),
+    ],
+)
+def test_numbers_of_any_size_are_watched(values: list[float], stds: list[float]) -> None:
+    """As a file that was made by hand may have them; a warning of numpy would be an error here."""
+    (factor,) = dispersions([values], [stds])
+    found = cusum(values, stds, dispersion=float(factor))
+    numbers = [found.baseline, found.change_percent, found.change_sigmas]
+    assert all(map(math.isfinite, [*numbers, *found.deviations, *found.upper, *found.lower, *found.trend]))
+    assert len(decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2]).words) < 120
+
+
+def test_one_sigma_of_any_size_leaves_the_others_their_say() -> None:
+    values = np.r_[np.full(14, 10.0), np.full(6, 9.4)]
+    plain = cusum(values, np.full(20, 0.04))
+    for far in (1e-300, 1e300):
+        stds = np.full(20, 0.04)
+        stds[3] = far
+        assert cusum(values, stds).onset == plain.onset
 
 
 @settings(max_examples=100, deadline=None)

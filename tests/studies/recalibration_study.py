@@ -1,20 +1,29 @@
 """Whole jobs week after week, recordings included, on a simulated cell: quiet weeks, a gain that falls, faults between.
 
     python -m tests.studies.recalibration_study [--weeks 8] [--seconds 12]
+    python -m tests.studies.recalibration_study --kills
+    python -m tests.studies.recalibration_study --years 300
 
 Each week the timer calls the job, and where it was ended calls it again the next day. J4 loses 6 % in the middle of the
 time; in one week a drive fails, in another the door is open. What is printed: outcome, drift in σ, and the truth beside
 what the controller has.
+
+`--kills` kills a job (-9) before and behind every call to another room and lets the next one finish it; the tests do
+the same at some of them. `--years` draws years of weekly jobs in which nothing changes, and counts those in which a
+gain was changed all the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from daq.cli.simulate import MountedFile
 from daq.configuration.cell_bus import bus_address
@@ -27,8 +36,11 @@ from drivers.errors import DriverError
 from drivers.simulated.fault import FaultKind, FaultSpec
 from drivers.simulated.mounting import MountingCell
 from drivers.simulated.spec import CellSpec
+from ident.drift import DISPERSION, decide
 from ident.errors import IdentificationError
+from tests.daq.recalibration.made import made_rig, whole_job
 from tests.daq.recalibration.rig import RUNS, Rig, make_plan, make_rig
+from tests.daq.recalibration.test_killed import Kill, finished_by_the_next
 
 AXIS, LOSS = 3, 0.94
 FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)
@@ -101,14 +113,58 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
     return int(bool(wrong))
 
 
+def kills(folder: Path) -> int:
+    """A kill before and behind every call; an AssertionError where one was not finished as it should be."""
+    (folder / "whole").mkdir()
+    _, made = whole_job(folder / "whole")
+    counted = made_rig(new(folder / "counted"), made, metrics=None)
+    kill = Kill()
+    replace(counted, tools=kill.tools(counted.tools)).job()
+    for at, name in enumerate(kill.calls):
+        for behind in (False, True):
+            rig = made_rig(new(folder / f"{at}-{behind}"), made, metrics=None)
+            finished_by_the_next(rig, Kill(at, behind=behind))
+            shutil.rmtree(rig.folder)
+        print(f"call {at + 1} of {len(kill.calls)}, {name}: applied once, killed before it and behind it", flush=True)  # noqa: T201
+    return 0
+
+
+def new(folder: Path) -> Path:
+    """An empty folder."""
+    folder.mkdir()
+    return folder
+
+
+def unchanged_years(years: int, seed: int = 1) -> int:
+    """Weekly jobs that write what differs, on a robot that stays as it is; its scatter is as large as is known."""
+    rng = np.random.default_rng(seed)
+    axes, gain, std = tuple(f"J{number}" for number in range(1, 7)), 1000.0, 1.0
+    changes = np.zeros(years, int)
+    for year in range(years):
+        in_force = gain + DISPERSION * std * rng.standard_normal(len(axes))
+        for _ in range(52):
+            found = gain + DISPERSION * std * rng.standard_normal(len(axes))
+            if decide(axes, in_force, std, found, std).differs:
+                changes[year] += 1
+                in_force = found
+    print(  # noqa: T201
+        f"{years} years of 52 jobs: a change in {(changes > 0).mean():.0%} of them, {changes.mean():.2f} a year"
+    )
+    return 0
+
+
 def main() -> int:
     """The command."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weeks", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=12.0)
+    parser.add_argument("--kills", action="store_true")
+    parser.add_argument("--years", type=int)
     chosen = parser.parse_args()
+    if chosen.years is not None:
+        return unchanged_years(chosen.years)
     with tempfile.TemporaryDirectory() as folder:
-        return study(chosen.weeks, chosen.seconds, Path(folder))
+        return kills(Path(folder)) if chosen.kills else study(chosen.weeks, chosen.seconds, Path(folder))
 
 
 if __name__ == "__main__":

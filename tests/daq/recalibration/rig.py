@@ -13,7 +13,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
 from daq.cli.residual_report import save_report
@@ -22,7 +21,6 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import load_cell
 from daq.configuration.simulation import load_simulation
-from daq.fit import Fit
 from daq.plan import Plan, plan
 from daq.plan_file import save_plan
 from daq.recalibration.job import recalibrate
@@ -30,7 +28,7 @@ from daq.recalibration.journal import Form, Journal
 from daq.recalibration.report import Conclusion
 from daq.recalibration.session import Session, sessions
 from daq.recalibration.tools import Tools
-from daq.record import Clocks, Recorded, record
+from daq.record import Clocks, record
 from daq.resources import shipped_configurations
 from daq.write_back.audit import AuditEntry, read, verify
 from drivers.bus import open_bus
@@ -206,68 +204,3 @@ def make_plan(cell: Cell, path: Path, *, seed: int, duration_s: float, moves: in
     )
     save_plan(replace(made, moves=made.moves[:moves]), path)
     return path
-
-
-@dataclass(frozen=True)
-class Made:
-    """What a whole real job has made, for tests of what comes after the recordings.
-
-    Attributes:
-        plan_file: of its runs.
-        logs: by their runs' names.
-        recorded: what the recorder told of each.
-        fitted, closed: before and after the loop.
-    """
-
-    plan_file: Path
-    logs: dict[str, Path]
-    recorded: dict[str, Recorded]
-    fitted: Fit
-    closed: Fit
-
-    def tools(self, rig: Rig, **factors: float) -> Tools:
-        """Recorder and fit that know the result already: with the rig's cell, at the rig's time.
-
-        Args:
-            rig: whose tools they are.
-            factors: by which gains have changed since, by axis.
-        """
-
-        def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **_: object) -> Recorded:
-            shutil.copyfile(self.logs[out.stem], out)
-            return replace(self.recorded[out.stem], path=out)
-
-        def in_this_cell(fit: Fit) -> Fit:
-            sources = tuple(
-                replace(source, recording=replace(source.recording, controller_sha256=None))
-                if source.recording is not None
-                else source
-                for source in fit.sources
-            )
-            here = replace(fit, cell=replace(fit.cell, digest=rig.cell.digest), sources=sources)
-            return with_gains(here, factors) if here.steps else here
-
-        return replace(
-            rig.tools,
-            save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
-            drives=lambda _cell, _undisturbed: None,
-            record=copied,
-            fit=lambda _logs, **_: in_this_cell(self.fitted),
-            close_loop=lambda _fit, _seed, _told: in_this_cell(self.closed),
-        )
-
-
-def with_gains(fit: Fit, factors: dict[str, float]) -> Fit:
-    """A closed fit whose gains have changed by these factors."""
-    last = fit.steps[-1]
-    estimate = last.after.estimate
-    factor = np.array([factors.get(axis, 1.0) for axis in fit.cell.axis_names])
-    after = replace(last.after, estimate=replace(estimate, gains=estimate.gains * factor))
-    return replace(fit, steps=(*fit.steps[:-1], replace(last, after=after)))
-
-
-def made_rig(folder: Path, made: Made, **section: Any) -> Rig:
-    """A rig whose recordings are copies of those that were made."""
-    rig = make_rig(folder, made.plan_file, **section)
-    rig.tools = made.tools(rig)
-    return rig

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +12,13 @@ from typing import Any
 import pytest
 
 from daq.cli.app import main
-from daq.errors import CalibrationRefused, ExitCode, ModelContradicted
+from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable, ModelContradicted
 from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
 from daq.write_back.audit import AuditAction
 from drivers.errors import DriveFault
-from tests.daq.recalibration.rig import Made, Rig, made_rig
+from tests.daq.recalibration.made import Made, made_rig
+from tests.daq.recalibration.rig import Rig
 
 BY_A_PERSON, BY_THE_JOB = (
     {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}} for by in ("person", "job")
@@ -121,13 +124,63 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     decision = rig.sessions[-1].state.decision
     assert decision is not None
     assert not any(gain.differs for gain in decision.gains)
-    assert len(rig.sessions) == 4
+    # The last four, and the one whose gains are in force: its logs are what the controller rests on.
+    assert len(rig.sessions) == 5
+    assert rig.sessions[0].state.outcome is Outcome.APPLIED
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        fitted = rig.sessions[0].state.fitted
+        assert fitted is not None
+        assert store.in_force() == fitted.calibration_sha256
     assert len(rig.backups) == 2
     begun, ended = (
         [entry for entry in rig.audit if entry.action is action]
         for action in (AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED)
     )
     assert len(begun) == len(ended) == len(outcomes)
+
+
+def test_a_write_that_the_history_was_not_told_of_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
+    """Whoever wrote them was killed right behind it: taken for exact, they would differ from each new one too often."""
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    assert rig.job().outcome is Outcome.APPLIED
+    with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
+        history.execute("DELETE FROM event")
+        history.commit()
+    rig.clock.go_on(days=7)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    decision = rig.sessions[-1].state.decision
+    assert decision is not None
+    assert all(gain.old_std > 0 for gain in decision.gains)
+
+
+def test_a_drift_is_told_although_the_job_applies_it_in_slices(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    for week in range(12):
+        rig.tools = made.tools(rig, J4=0.98**week)
+        assert rig.job().outcome in (Outcome.APPLIED, Outcome.UNCHANGED)
+        alarms = {gain.axis: gain.alarm for gain in rig.sessions[-1].state.watched}
+        if any(alarms.values()):
+            break
+        rig.clock.go_on(days=7)
+    assert [axis for axis, alarm in alarms.items() if alarm] == ["J4"]
+    warned = [event for event in rig.events if event["event"] == "drift"]
+    assert [(event["level"], event["axis"], event["text"]) for event in warned] == [("warning", "J4", alarms["J4"])]
+    assert alarms["J4"] in (rig.sessions[-1].folder / "summary.txt").read_text()
+    metrics = (rig.cells / "drivegain_demo.prom").read_text()
+    told = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
+    assert [line for line in told if line not in metrics] == []
+
+
+def test_nothing_is_removed_while_nobody_knows_what_is_in_force(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
+    for outcome in (Outcome.APPLIED, Outcome.UNCHANGED):
+        assert rig.job().outcome is outcome
+        rig.clock.go_on(days=7)
+    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    with pytest.raises(HistoryUnreadable):
+        rig.job()
+    assert len(rig.sessions) == 3
+    assert "no old session removed" in {event["event"] for event in rig.events}
 
 
 def failing_once(rig: Rig) -> Any:

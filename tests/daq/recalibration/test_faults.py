@@ -21,7 +21,7 @@ from tests.daq.recalibration.rig import Rig, make_rig, powerless, serving
 from tests.faults.test_at_start import REFUSALS
 from tests.faults.test_in_motion import STOPS
 
-STRIKE = 300
+STRIKE = 120
 """SYNCs since power-on: in the first move of the first recording, which begins at about 30 and takes more than 500."""
 AXIS = 2
 CUT_OFF = {
@@ -30,6 +30,14 @@ CUT_OFF = {
     "bus off": (FaultSpec(FaultKind.BUS_OFF, None, STRIKE), BusError),
 }
 COUNTED = (FaultKind.LOST, FaultKind.LATE, FaultKind.DUPLICATE, FaultKind.SHORT_PDO)
+BORNE = (
+    FaultSpec(FaultKind.NO_GUARD, AXIS),
+    FaultSpec(FaultKind.REFUSES_WRITE, AXIS),
+    FaultSpec(FaultKind.REFUSES_SAVE, AXIS),
+    FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
+)
+"""No run ends of them: one is warned of, one is told in the log, and a job writes no gain into a drive."""
+ONLY_BARE = {"command": ["sh", "-c", 'test "$1" = none', "mount"]}
 
 
 @pytest.fixture(autouse=True)
@@ -100,12 +108,10 @@ def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
         assert cell.plant.time_s < 1.0
 
 
-@pytest.mark.parametrize("kind", COUNTED, ids=lambda kind: kind.value)
-def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path, kind: FaultKind) -> None:
+def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
     """Once its recorder stands for it the job goes on, here to a payload that nobody mounts."""
-    only_bare = {"command": ["sh", "-c", 'test "$1" = none', "mount"]}
-    rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=only_bare)
-    with serving(rig, FaultSpec(kind, AXIS, STRIKE, 1)) as cell:
+    rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=ONLY_BARE)
+    with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
         fails(rig, cell, MountFailed)
         assert powerless(cell)
     (run,) = rig.session.state.runs
@@ -113,9 +119,28 @@ def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_mov
     assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
 
 
-def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(tmp_path: Path, one_move: Path) -> None:
+def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move, retries=0, mount=ONLY_BARE)
+    with serving(rig, *BORNE) as cell:
+        fails(rig, cell, MountFailed)
+        assert powerless(cell)
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    warned = [event["text"] for event in rig.events if event["level"] == "warning"]
+    assert [text for text in warned if "no 1016h" in text]
+
+
+def test_no_kind_of_fault_is_left_out() -> None:
+    seen = {promise.fault.kind for promise in STOPS.values()} | {fault.kind for fault, _ in CUT_OFF.values()}
+    assert seen | {*REFUSALS, *COUNTED, *(fault.kind for fault in BORNE)} == set(FaultKind)
+
+
+@pytest.mark.parametrize("kind", COUNTED, ids=lambda kind: kind.value)
+def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
+    tmp_path: Path, one_move: Path, kind: FaultKind
+) -> None:
+    """A single bad frame of any kind makes it so."""
     rig = make_rig(tmp_path / "cell", one_move, retries=0)
-    with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
+    with serving(rig, FaultSpec(kind, AXIS, STRIKE, 1)) as cell:
         fails(rig, cell, RunInvalid)
         assert powerless(cell)
     assert rig.session.state.exit_code == ExitCode.DATA_UNFIT

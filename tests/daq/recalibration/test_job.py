@@ -12,7 +12,8 @@ from daq.errors import ExitCode
 from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
 from daq.write_back.audit import AuditAction
-from tests.daq.recalibration.rig import WHO, Made, Rig, made_rig
+from tests.daq.recalibration.made import Made, made_rig
+from tests.daq.recalibration.rig import WHO, Rig
 
 
 def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_it(
@@ -43,6 +44,13 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_i
     with HistoryStore(rig.cells / "demo.history.sqlite") as store:
         assert [event.who for event in store.events()] == [WHO]
         assert store.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
+        # By which `history --verify` notices an audit whose end was cut off.
+        assert store.audited() <= {entry.sha256 for entry in rig.audit}
+        assert len(store.audited()) == 1
+    # The numbers in the file were the manufacturer's: of none of them a σ is known.
+    assert session.state.decision is not None
+    assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
+    assert [gain.alarm for gain in session.state.watched] == [""] * 6
     summary = json.loads((session.folder / "summary.json").read_text())
     assert summary["outcome"] == "applied"
     assert "drivegain rollback" in " ".join(summary["to_do"])

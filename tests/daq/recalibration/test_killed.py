@@ -8,7 +8,6 @@ import signal
 import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +17,18 @@ from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
 from daq.recalibration.tools import Tools
 from daq.write_back.audit import AuditAction
-from tests.daq.recalibration.rig import Made, Rig, made_rig
+from tests.daq.recalibration.made import Made, made_rig
+from tests.daq.recalibration.rig import Rig
 
 CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"})
 """What a job hands its work to: between two of these calls it reads and writes its own files."""
 
 
 EFFECTS = ("record", "save_report", "apply")
-FREQUENT = {"now": 4, "run": 2}
+PURE = ("close_loop", "calibration", "account")
+"""Nothing is written between the fit and these: to be killed there is to be killed at the fit."""
+FREQUENT = {"now": 6, "run": 6, "record": 2, "free": 2}
+"""Of these calls every so manieth is enough here; `tests.studies.recalibration_study --kills` takes every call."""
 
 
 class Kill:
@@ -102,29 +105,29 @@ def test_every_step_is_among_the_calls(calls: list[str]) -> None:
 def test_a_job_that_is_killed_at_any_call_is_finished_by_the_next(
     tmp_path: Path, made: Made, calls: list[str], behind: bool
 ) -> None:
-    """Before each call, and behind each that has an effect: what it made is there, and the state does not know it.
+    """Before each call, and behind each that has an effect: what it made is there, and the state does not know it."""
+    for at, name in enumerate(calls):
+        chosen = name not in PURE and calls[:at].count(name) % FREQUENT.get(name, 1) == 0
+        if chosen and (name in EFFECTS or not behind):
+            finished_by_the_next(made_rig(tmp_path / f"{at}-{name}", made, metrics=None), Kill(at, behind=behind))
 
-    Of the questions after the time every fourth is enough, and of the cell's commands every second.
-    """
-    few = {at for name, step in FREQUENT.items() for at in [k for k, one in enumerate(calls) if one == name][::step]}
-    chosen = [at for at, name in enumerate(calls) if (name in EFFECTS if behind else name not in FREQUENT or at in few)]
-    for at in chosen:
-        name = calls[at]
-        rig = made_rig(tmp_path / f"{at}-{name}", made, metrics=None)
-        before = rig.controller.read_bytes()
-        killed_job(rig, Kill(at, behind=behind))
-        begun = bool(rig.sessions)
-        whole = rig.controller.read_bytes()
-        rig.clock.go_on(minutes=10)
-        # Killed as the very last thing it was done already.
-        outcome = rig.job().outcome
-        if outcome is not Outcome.NOT_DUE:
-            assert outcome is Outcome.APPLIED, f"{at} {name}"
-            assert rig.session.state.attempt == 1 + begun
-        assert rig.controller.read_bytes() != before
-        if whole != before:
-            assert rig.controller.read_bytes() == whole
-        applied_once(rig)
+
+def finished_by_the_next(rig: Rig, kill: Kill) -> None:
+    """Kill a job there, and let the next one finish it: what was found is in the controller's file, once."""
+    before = rig.controller.read_bytes()
+    killed_job(rig, kill)
+    begun = bool(rig.sessions)
+    whole = rig.controller.read_bytes()
+    rig.clock.go_on(minutes=10)
+    # Killed as the very last thing it was done already.
+    outcome = rig.job().outcome
+    if outcome is not Outcome.NOT_DUE:
+        assert outcome is Outcome.APPLIED
+        assert rig.session.state.attempt == 1 + begun
+    assert rig.controller.read_bytes() != before
+    if whole != before:
+        assert rig.controller.read_bytes() == whole
+    applied_once(rig)
 
 
 def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:
@@ -150,9 +153,9 @@ def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, 
     applied_once(rig)
 
 
-def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, made: Made) -> None:
+def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, made: Made, calls: list[str]) -> None:
     rig = made_rig(tmp_path / "cell", made)
-    killed_job(rig, Kill(_nth_call(rig, made, "fit")))
+    killed_job(rig, Kill(calls.index("fit")))
     log = rig.session.folder / "bare-1.mcap"
     log.write_bytes(log.read_bytes()[:-1] + b"\0")
     assert rig.job().outcome is Outcome.APPLIED
@@ -160,27 +163,31 @@ def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, m
     assert rig.session.state.runs[-1].name == "bare-1"
 
 
-def test_a_session_that_is_too_old_or_of_another_configuration_is_not_taken_up(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, resume_within_h=2)
-    killed_job(rig, Kill(_nth_call(rig, made, "fit")))
-    shutil.copytree(rig.folder, tmp_path / "copy")
+def too_old(rig: Rig) -> None:
     rig.clock.go_on(hours=3)
+
+
+def of_another_configuration(rig: Rig) -> None:
+    rig.cell_file.write_text(rig.cell_file.read_text() + "\n# another comment\n")
+
+
+def with_another_plan(rig: Rig) -> None:
+    """Somebody has approved other moves: half of the logs would be of these, half of those."""
+    plan = rig.cells / "plan.yaml"
+    plan.write_bytes(plan.read_bytes() + b"\n# approved again\n")
+
+
+@pytest.mark.parametrize("change", [too_old, of_another_configuration, with_another_plan])
+def test_a_session_of_something_else_is_not_taken_up(
+    tmp_path: Path, made: Made, calls: list[str], change: Callable[[Rig], None]
+) -> None:
+    own = replace(made, plan_file=tmp_path / "cell" / "cells" / "plan.yaml")
+    rig = made_rig(tmp_path / "cell", own, resume_within_h=2)
+    shutil.copyfile(made.plan_file, own.plan_file)
+    killed_job(rig, Kill(calls.index("fit")))
+    change(rig)
+    rig.tools = own.tools(rig)
     assert rig.job().outcome is Outcome.APPLIED
     old, new = rig.sessions
     assert old.state.outcome is None
-    assert new.began - old.began > timedelta(hours=2)
-    other = replace(rig, folder=tmp_path / "copy")
-    other.clock.go_on(hours=-2)
-    other.cell_file.write_text(other.cell_file.read_text() + "\n# another comment\n")
-    other.tools = made.tools(other)
-    assert other.job().outcome is Outcome.APPLIED
-    assert len(other.sessions) == 2
-
-
-def _nth_call(rig: Rig, made: Made, name: str) -> int:
-    """The first call of that name in a job of such a rig."""
-    twin = made_rig(rig.folder.with_name("twin"), made)
-    kill = Kill()
-    replace(twin, tools=kill.tools(twin.tools)).job()
-    shutil.rmtree(twin.folder)
-    return kill.calls.index(name)
+    assert (len(old.state.runs), len(new.state.runs)) == (3, 3)

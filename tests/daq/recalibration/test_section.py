@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,18 @@ import yaml
 from daq.configuration.cell_file import load_cell
 from daq.configuration.recalibration import RecalibrationModel, RunModel
 from daq.errors import SchemaMismatch
-from daq.recalibration.session import Outcome, begin, digest_of, last_good, remove_old, save, sessions, to_take_up
+from daq.recalibration.session import (
+    Basis,
+    Fitted,
+    Outcome,
+    begin,
+    digest_of,
+    last_good,
+    remove_old,
+    save,
+    sessions,
+    to_take_up,
+)
 from tests.daq.recalibration.rig import BEGAN, make_rig
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "recalibration.md"
@@ -25,6 +37,7 @@ def changed(tmp_path: Path, **section: Any) -> Path:
     return rig.cell_file
 
 
+BASIS = Basis("demo", "c" * 64, "b" * 64)
 RUN = {"name": "bare-1", "plan": {"seed": 1}}
 LOADED = {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59, "plan": {"seed": 1}}
 UNUSED = {**LOADED, "name": "unused", "holdout": True}
@@ -81,7 +94,7 @@ def test_the_page_shows_every_key_and_its_example_is_one() -> None:
 def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) -> None:
     made = []
     for week in range(6):
-        session = begin(tmp_path, "demo", "c" * 64, BEGAN + timedelta(days=7 * week))
+        session = begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week))
         outcome = (Outcome.APPLIED, Outcome.STOPPED)[week % 2]
         state = session.state.with_(outcome=outcome, ended=session.state.began)
         made.append(save(type(session)(session.folder, state)))
@@ -91,17 +104,22 @@ def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) ->
     assert found == tuple(made)
     assert last_good(found) == made[4]
     now = BEGAN + timedelta(days=35)
-    assert to_take_up(found, "c" * 64, now + timedelta(hours=1), 2.0) == made[5]
-    for configuration, later_h, within_h in (("d" * 64, 1, 2.0), ("c" * 64, 3, 2.0), ("c" * 64, -1, 2.0)):
-        assert to_take_up(found, configuration, now + timedelta(hours=later_h), within_h) is None
-    assert to_take_up(found[:5], "c" * 64, made[4].began, 2.0) is None
-    removed = remove_old(found, 1)
-    assert removed == tuple(session.folder for session in made[:4])
-    assert sessions(tmp_path) == (made[4], made[5])
+    assert to_take_up(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
+    for basis in (replace(BASIS, configuration_sha256="d" * 64), replace(BASIS, plans_sha256="d" * 64)):
+        assert to_take_up(found, basis, now + timedelta(hours=1), 2.0) is None
+    for later_h in (3, -1):
+        assert to_take_up(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
+    assert to_take_up(found[:5], BASIS, made[4].began, 2.0) is None
+    # The calibration of the third week is in force: its logs and signatures are what the controller rests on.
+    fitted = Fitted(calibration_sha256="f" * 64, sentences=())
+    save(replace(made[2], state=made[2].state.with_(fitted=fitted)))
+    removed = remove_old(sessions(tmp_path), 1, {"f" * 64})
+    assert removed == tuple(session.folder for session in (made[0], made[1], made[3]))
+    assert [session.folder for session in sessions(tmp_path)] == [made[i].folder for i in (2, 4, 5)]
 
 
 def test_two_sessions_of_one_second_have_folders_of_their_own(tmp_path: Path) -> None:
-    names = [begin(tmp_path, "demo", "c" * 64, BEGAN).folder.name for _ in range(3)]
+    names = [begin(tmp_path, BASIS, BEGAN).folder.name for _ in range(3)]
     assert names == ["20260105T020000Z", "20260105T020000Z-02", "20260105T020000Z-03"]
     assert [session.folder.name for session in sessions(tmp_path)] == names
 

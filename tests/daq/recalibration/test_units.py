@@ -51,6 +51,18 @@ def test_the_timer_never_makes_up_for_a_date_and_the_service_bounds_the_job(rig:
     assert "User" not in read(units_of(rig.cell, section, installation(rig, user=True))[0].text)["Service"]
 
 
+def test_what_is_written_through_a_link_is_writable_to_the_service(rig: Rig, tmp_path: Path) -> None:
+    """ProtectHome= would lock the folder in which the file is, wherever the link to it is."""
+    elsewhere = tmp_path / "controllers of all cells"
+    elsewhere.mkdir()
+    rig.controller.rename(elsewhere / "demo.yaml")
+    rig.controller.symlink_to(elsewhere / "demo.yaml")
+    section = rig.cell.recalibration
+    assert section is not None
+    service = units_of(rig.cell, section, installation(rig))[0].text
+    assert f'ReadWritePaths="-{elsewhere}"' in service.splitlines()
+
+
 @pytest.mark.parametrize("user", [False, True], ids=["system", "user"])
 def test_systemd_takes_them(rig: Rig, tmp_path: Path, user: bool) -> None:
     if shutil.which("systemd-analyze") is None:

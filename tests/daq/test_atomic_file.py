@@ -1,0 +1,152 @@
+"""A file that is replaced keeps its rights: mode, owner, access lists."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import struct
+from pathlib import Path
+
+import pytest
+
+from daq.atomic_file import replace_file
+
+ACCESS, DEFAULT = "system.posix_acl_access", "system.posix_acl_default"
+READ, WRITE = 4, 2
+_OWNER, _USER, _GROUP, _MASK, _OTHERS, _NOBODY = 0x01, 0x02, 0x04, 0x10, 0x20, 0xFFFFFFFF
+
+
+def _access_list(user: int) -> bytes:
+    """As Linux keeps it (version 2): the owner and one more user may read and write, nobody else."""
+    entries = (
+        (_OWNER, READ | WRITE, _NOBODY),
+        (_USER, READ | WRITE, user),
+        (_GROUP, 0, _NOBODY),
+        (_MASK, READ | WRITE, _NOBODY),
+        (_OTHERS, 0, _NOBODY),
+    )
+    return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *entry) for entry in entries)
+
+
+def _set(path: Path, name: str, value: bytes) -> None:
+    try:
+        os.setxattr(path, name, value)
+    except OSError as error:
+        if error.errno != errno.ENOTSUP:
+            raise
+        pytest.skip(f"this file system keeps no {name}")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Of a controller, with an access list and a note."""
+    path = tmp_path / "demo.yaml"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    _set(path, "user.note", b"K. has weighed it")
+    _set(path, ACCESS, _access_list(4711))
+    return path
+
+
+def _rights(path: Path) -> dict[str, bytes | int]:
+    attributes: dict[str, bytes | int] = {name: os.getxattr(path, name) for name in os.listxattr(path)}
+    return attributes | {"mode": stat.S_IMODE(path.stat().st_mode)}
+
+
+def test_mode_access_list_and_attributes_stay(file: Path) -> None:
+    before = _rights(file)
+    replace_file(file, b"new")
+    assert file.read_bytes() == b"new"
+    assert _rights(file) == before
+    assert before["mode"] == 0o660
+
+
+def _refusing(prefix: str, number: int) -> object:
+    """`os.setxattr` of a user, or a file system, that may not set some attributes."""
+    true = os.setxattr
+
+    def setxattr(path: int, name: str, value: bytes) -> None:
+        if name.startswith(prefix):
+            raise OSError(number, os.strerror(number))
+        true(path, name, value)
+
+    return setxattr
+
+
+def _with_capability(monkeypatch: pytest.MonkeyPatch, file: Path, name: str) -> None:
+    """The file has an attribute more, named first, that no test may set."""
+    listed, got = os.listxattr, os.getxattr
+
+    def listxattr(path: object) -> list[str]:
+        return [name, *listed(path)] if path == file else listed(path)  # type: ignore[arg-type]
+
+    def getxattr(path: object, asked: str) -> bytes:
+        return b"\x01" if asked == name else got(path, asked)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(os, "listxattr", listxattr)
+    monkeypatch.setattr(os, "getxattr", getxattr)
+
+
+@pytest.mark.parametrize("name", ["security.capability", "security.ima", "trusted.overlay.origin"])
+def test_a_label_that_the_kernel_alone_sets_takes_no_access_list_with_it(
+    file: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    before = _rights(file)
+    with monkeypatch.context() as patch:
+        _with_capability(patch, file, name)
+        patch.setattr(os, "setxattr", _refusing(name, errno.EPERM))
+        replace_file(file, b"new")
+    assert _rights(file) == before
+
+
+@pytest.mark.parametrize("name", [ACCESS, "user.note"])
+def test_an_access_list_that_cannot_be_kept_stops_the_write(
+    file: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(os, "setxattr", _refusing(name, errno.EPERM))
+    with pytest.raises(PermissionError):
+        replace_file(file, b"new")
+    assert file.read_bytes() == b"old"
+    assert [path.name for path in file.parent.iterdir()] == ["demo.yaml"]
+
+
+def test_a_file_system_without_attributes_has_none_to_keep(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "setxattr", _refusing("", errno.ENOTSUP))
+    replace_file(file, b"new")
+    assert file.read_bytes() == b"new"
+
+    def unsupported(_: object) -> list[str]:
+        raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP))
+
+    monkeypatch.setattr(os, "listxattr", unsupported)
+    replace_file(file, b"newer")
+    assert file.read_bytes() == b"newer"
+
+
+def test_whom_the_folder_lets_into_new_files_stays_out_of_an_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "demo.yaml"
+    path.write_bytes(b"old")
+    path.chmod(0o640)
+    _set(tmp_path, DEFAULT, _access_list(4712))
+    replace_file(path, b"new")
+    assert _rights(path) == {"mode": 0o640}
+
+
+def test_nobody_else_can_open_the_unfinished_copy_of_a_file_of_one_s_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it has the file's rights: who has it open reads on."""
+    path = tmp_path / "demo.yaml"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    modes = []
+    true = os.fchmod
+
+    def fchmod(descriptor: int, mode: int) -> None:
+        modes.append(stat.S_IMODE(os.fstat(descriptor).st_mode))
+        true(descriptor, mode)
+
+    monkeypatch.setattr(os, "fchmod", fchmod)
+    replace_file(path, b"new")
+    assert modes == [0o600]

@@ -1,0 +1,114 @@
+"""What the hold-out tells of the gains beside an effect: of right ones, and of one that is wrong among them.
+
+`python -m tests.studies.holdout_study` prints the figures of docs/write-back.md. Sessions obey the declared model and a
+low-speed friction that it lacks; the loop finds it. Each session is fitted twice: for a cell whose nameplate is 2 to
+20 % off, and for one whose nameplate is true. Then one gain is made wrong, and all the rest is refitted to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+import numpy as np
+
+from daq.configuration.cell import Cell
+from daq.configuration.cell_file import load_cell
+from daq.configuration.cell_model import model_of
+from daq.fit import Fit, calibration_of
+from daq.resources import shipped_configurations
+from ident.estimate import Method
+from ident.identify import estimate_with, identify
+from ident.loop import close_the_loop, gather
+from ident.run import Run
+from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
+
+FIT = ("bare-1", "loaded-1", "bare-2", "loaded-2")
+UNUSED = "unused"
+WRONG_AXIS = 3
+FACTORS = (1.0, 0.7, 0.9, 1.1)
+
+
+@dataclass(frozen=True, slots=True)
+class Ratio:
+    """Errors on the hold-out over those with the nameplate's gains, in total and of each axis."""
+
+    seed: int
+    nameplate: str
+    factor: float
+    total: float
+    axes: tuple[float, ...]
+
+    def __str__(self) -> str:
+        axes = " ".join(f"{axis:6.3f}" for axis in self.axes)
+        return f"{self.seed:4d}  {self.nameplate:9s}  J4 × {self.factor:.1f}  {self.total:6.3f}  {axes}"
+
+
+def session(seed: int) -> dict[str, Run]:
+    """Four runs for the fit and one to be held out, by name."""
+    truth, rng = tx40_truth(), np.random.default_rng(seed)
+    mounted = {name: None if name.startswith("bare") else MOUNTED for name in (*FIT, UNUSED)}
+    return {
+        name: _sticking(record(truth, name, rng, payload, noise_a=0.3, seconds=22.0))
+        for name, payload in mounted.items()
+    }
+
+
+def _sticking(run: Run) -> Run:
+    speed = np.gradient(run.position_rad[:, 1]) * run.rate_hz
+    added = np.zeros_like(run.current_a)
+    added[:, 1] = 5.0 * np.sign(speed) * np.exp(-((speed / 0.35) ** 2)) / GAINS[1]
+    return replace(run, current_a=run.current_a + added)
+
+
+def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
+    """With the effects that the loop accepts."""
+    trained, unseen = [runs[name] for name in FIT], [runs[UNUSED]]
+    found = identify(model_of(cell), trained, cell.conditioning, holdout=unseen)
+    steps = close_the_loop(gather(found, trained, unseen), np.random.default_rng(0))
+    return Fit(cell, (), (), (), found, steps, None)
+
+
+def with_factor(right: Fit, factor: float) -> Fit:
+    """As if one gain had been identified wrong by a factor."""
+    after = right.steps[-1].after
+    gains = after.estimate.gains.copy()
+    gains[WRONG_AXIS] *= factor
+    other = replace(estimate_with(Method.ML, after.training.system(), gains), gains_fixed=False)
+    step = replace(right.steps[-1], after=replace(after, estimate=other))
+    return replace(right, steps=(*right.steps[:-1], step))
+
+
+def ratios(seeds: range) -> Iterator[Ratio]:
+    """Of every session, nameplate and factor."""
+    off = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    axes = (replace(axis, nameplate_gain=float(gain)) for axis, gain in zip(off.axes, GAINS, strict=True))
+    true = replace(off, axes=tuple(axes))
+    for seed in seeds:
+        runs = session(seed)
+        for name, cell in (("true", true), ("off", off)):
+            right = fitted(cell, runs)
+            for factor in FACTORS:
+                of = calibration_of(with_factor(right, factor), datetime(2025, 1, 2, tzinfo=UTC))
+                held, nameplate = of.holdout_error_percent, of.nameplate_holdout_error_percent
+                if held is None or nameplate is None:
+                    raise LookupError("a session without a hold-out")
+                compared = tuple(one / other for one, other in zip(held.axes, nameplate.axes, strict=True))
+                yield Ratio(seed, name, factor, held.total / nameplate.total, compared)
+
+
+def main() -> None:
+    """Print a line for each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sessions", type=int, default=4)
+    sys.stdout.write("seed  nameplate  gain      total  J1 to J6\n")
+    for ratio in ratios(range(3, 3 + parser.parse_args().sessions)):
+        sys.stdout.write(f"{ratio}\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
