@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import getpass
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from daq.configuration.cell import Cell
-from daq.errors import DaqError
+from daq.errors import AuditUnusable
 from daq.history.store import HistoryStore
 
 _LOG = logging.getLogger("drivegain")
@@ -47,9 +47,43 @@ def applier(by: str | None) -> Applier:
     return Applier(by or login, login)
 
 
-def audit_of(cell: Cell) -> Path | None:
-    """Where the writes of a cell are written down; None only for a cell that was read from a log."""
-    return None if cell.history is None else cell.history.audit
+def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
+    """Where the writes of a cell are written down; None only for a cell that was read from a log.
+
+    Args:
+        cell: whose writes.
+        others: files that take part, besides the cell's history and its controller's file.
+
+    Raises:
+        AuditUnusable: it is one of them.
+    """
+    if cell.history is None:
+        return None
+    own_file(cell.history.audit, (cell.history.store, cell.controller_path, *others))
+    return cell.history.audit
+
+
+def own_file(audit: Path, others: Iterable[Path | None]) -> None:
+    """Refuse an audit that is another file which takes part, by whatever name, there already or not.
+
+    Raises:
+        AuditUnusable: it is.
+    """
+    for other in others:
+        if other is not None and (audit.resolve() == other.resolve() or _is_same(audit, other)):
+            raise AuditUnusable(
+                str(audit),
+                found=f"the same file as {other}",
+                expected="a file of the audit's own",
+                remedy="correct `history.audit` of the cell file, or --audit; nothing was written",
+            )
+
+
+def _is_same(audit: Path, other: Path) -> bool:
+    try:
+        return audit.samefile(other)
+    except OSError:
+        return False
 
 
 def tell_history(cell: Cell, tell: Callable[[HistoryStore], object]) -> None:
@@ -59,5 +93,5 @@ def tell_history(cell: Cell, tell: Callable[[HistoryStore], object]) -> None:
     try:
         with HistoryStore(cell.history.store) as store:
             tell(store)
-    except DaqError as error:
+    except Exception as error:  # noqa: BLE001 - whatever it is, the controller has its gains: not to be called undone
         _LOG.warning("the history does not know of this: %s", error)

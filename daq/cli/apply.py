@@ -30,6 +30,7 @@ from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
 from daq.write_back.audit import told_of
 from daq.write_back.controller_write import Written, sha256
+from daq.write_back.gates import Gate
 from daq.write_back.link import followed
 from ident.calibration import Calibration
 
@@ -40,7 +41,7 @@ def apply_verb(
     to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
     base: Annotated[
-        str | None, typer.Option("--base", help="Write only if the controller file still has this SHA-256 (dry run).")
+        str | None, typer.Option("--base", help="Write only the change of the dry run that tells this BEFORE-AFTER.")
     ] = None,
     by: ByOption = None,
     payload_mass: Annotated[
@@ -74,7 +75,7 @@ def apply_verb(
     fitted = decode(content, str(calibration))
     policy = tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent)
     masses_kg = entered_masses(payload_mass or (), fitted)
-    book = audit_of(declared)
+    book = audit_of(declared, (cell, calibration, to))
     if drives:
         if to is not None:
             raise UsageError(
@@ -119,13 +120,15 @@ def apply_verb(
         written = _write(proposal, now, book, doer) if yes else None
     except CalibrationRefused:
         if json:
-            print_json(describe(proposal, None, stds))
+            print_json({**describe(proposal, None, stds), "base": proposal.looked_at})
         raise
     if yes and not proposal.refusals:
         tell_history(declared, partial(_enter, proposal, written, fitted, content, now, doer, book))
     if json:
-        print_json(describe(proposal, written, stds))
+        print_json({**describe(proposal, written, stds), "base": proposal.looked_at})
     if proposal.refusals:
+        if not yes and not json:
+            _say_way_on(proposal)
         raise refused(proposal)
     if not json:
         _say_outcome(proposal, written, yes, cell, to, book)
@@ -227,11 +230,19 @@ def _enter(
     store.applied(digest, at=now, who=str(doer), target=target, audit=told, sha256_after=after)
 
 
+def _say_way_on(proposal: Proposal) -> None:
+    """Where nothing but a look at the changed file is wanted: this was the look."""
+    if {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
+        console = Console(soft_wrap=True, highlight=False, markup=False)
+        console.print("Nothing was written. If this change of the file as it is now is right, repeat the command with:")
+        console.print(f"  --yes --base {proposal.looked_at}")
+
+
 def _say_outcome(
     proposal: Proposal, written: Written | None, yes: bool, cell: Path, to: Path | None, audit: Path | None
 ) -> None:
     console = Console(soft_wrap=True, highlight=False, markup=False)
-    if proposal.before == proposal.after:
+    if proposal.before_content == proposal.after_content:
         console.print("Nothing to write: the controller file has these gains already.")
     elif written is not None:
         console.print(f"Written to {written.file}, backup {written.backup.name}; the audit is {audit}.")
@@ -239,7 +250,7 @@ def _say_outcome(
         console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell))}{other}")
     elif not yes:
         console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
-        console.print(f"  --yes --base {proposal.base_sha256}")
+        console.print(f"  --yes --base {proposal.looked_at}")
 
 
 APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells/demo.yaml --yes")

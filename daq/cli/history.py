@@ -11,9 +11,10 @@ import typer
 from rich.console import Console
 
 from daq.atomic_file import replace_file
-from daq.calibration_file import decode
+from daq.calibration_file import decode, read
 from daq.cli.applier import applier
 from daq.cli.history_audit import verify_history
+from daq.cli.history_deeds import deed_words, in_force
 from daq.cli.history_view import describe, show, show_axis
 from daq.cli.output import say_written
 from daq.cli.verb import JsonOption, Verb, print_json
@@ -21,7 +22,6 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
 from daq.errors import (
-    CalibrationMissing,
     ConfigurationInconsistent,
     HistoryMixed,
     OutputExists,
@@ -91,18 +91,20 @@ def history_verb(
         if csv is not None:
             _write_csv(csv, chosen)
         entries = store.entries()
+        current = in_force(declared, store)
+        deeds = deed_words(entries, store.events(), current)
         checked = verify_history(declared, place, store) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:
-            document = describe(declared.name, entries, chosen, all_series, store.in_force())
+            document = describe(declared.name, entries, chosen, all_series, current)
             print_json(document if checked is None else {**document, "audit": checked.document})
         else:
             if checked is not None:
                 checked.say(console)
             elif axis is not None:
-                show_axis(chosen[0], all_series, console)
+                show_axis(chosen[0], all_series, deeds, console)
             else:
-                show(entries, all_series, store.in_force(), console)
+                show(entries, all_series, deeds, console)
             say_written(console, picture, csv)
         if checked is not None:
             checked.require()
@@ -117,15 +119,7 @@ def _place(cell: Cell, file: Path) -> HistoryPlace:
 
 
 def _add(store: HistoryStore, cell: Cell, file: Path, now: datetime) -> None:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise CalibrationMissing(
-            str(file),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="the file that `drivegain fit` wrote",
-            remedy="check the name",
-        ) from error
+    content = read(file)
     calibration = decode(content, str(file))
     if calibration.cell != cell.name:
         raise HistoryMixed(

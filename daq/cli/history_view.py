@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -18,21 +18,21 @@ from daq.report.gain_table import with_deviation
 from ident.drift_chart import CHART
 
 
-def show(entries: Sequence[Entry], all_series: Sequence[Series], in_force: str | None, console: Console) -> None:
-    """The calibrations, a line each, then each gain as it is now."""
+def show(entries: Sequence[Entry], all_series: Sequence[Series], deeds: Mapping[str, str], console: Console) -> None:
+    """The calibrations, a line each, with what was done with each by its digest; then each gain as it is now."""
     if not entries:
         console.print("The history is empty: no calibration was applied or entered yet.")
         console.print("To enter one: drivegain history CELL --add CALIBRATION")
         return
-    console.print(calibration_table(entries, all_series, in_force))
+    console.print(calibration_table(entries, all_series, deeds))
     console.print()
     console.print(gain_table(all_series))
     say_alarms(all_series, console)
 
 
-def show_axis(series: Series, all_series: Sequence[Series], console: Console) -> None:
+def show_axis(series: Series, all_series: Sequence[Series], deeds: Mapping[str, str], console: Console) -> None:
     """Every calibration of one gain."""
-    console.print(axis_table(series))
+    console.print(axis_table(series, deeds))
     for noted in series.acknowledged:
         console.print(
             f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
@@ -57,7 +57,7 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
         console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
 
 
-def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], in_force: str | None) -> Table:
+def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], deeds: Mapping[str, str]) -> Table:
     """One row a calibration."""
     table = _table("recorded (UTC)", "calibration")
     table.add_column("error %", justify="right", no_wrap=True)
@@ -79,7 +79,7 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], in
             f"{error:.2f}",
             _largest([point for _, _, point in points]),
             ", ".join(alarms) or "-",
-            printable(_applied(entry, in_force)),
+            printable(deeds[entry.digest]),
         )
     return table
 
@@ -112,7 +112,7 @@ def gain_table(all_series: Sequence[Series]) -> Table:
     return table
 
 
-def axis_table(series: Series) -> Table:
+def axis_table(series: Series, deeds: Mapping[str, str]) -> Table:
     """Every calibration of one gain, with the two sums and the slope that are watched."""
     table = _table("recorded (UTC)")
     headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
@@ -133,7 +133,7 @@ def axis_table(series: Series) -> Table:
             f"{stretch.drift.lower[place]:.1f}",
             f"{stretch.drift.trend[place]:+.1f}",
             "-" if alarm is None else alarm.kind.value,
-            printable(_applied(point.entry, None)),
+            printable(deeds[point.entry.digest]),
         )
     return table
 
@@ -196,10 +196,3 @@ def _largest(points: Sequence[Point]) -> str:
     sigmas, point = max(told, key=lambda pair: pair[0])
     percent = 0.0 if point.change is None else point.change.percent
     return f"{printable(point.gain.axis)} {percent:+.1f} % {sigmas:.1f} σ"
-
-
-def _applied(entry: Entry, in_force: str | None) -> str:
-    if not entry.events:
-        return "-"
-    last = entry.events[-1]
-    return f"{last.deed.value} by {last.who}" + (", in force" if entry.digest == in_force else "")

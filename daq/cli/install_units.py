@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +15,7 @@ from daq.cli.verb import Verb
 from daq.configuration.cell_file import load_cell
 from daq.errors import OutputExists, OutputFailed, UsageError
 from daq.recalibration.preflight import section_of, target_of
-from daq.recalibration.units import MARK, Installation, Unit, cron_line, next_commands, units_of
+from daq.recalibration.units import MARK, Installation, Unit, cron_line, next_commands, told_cell, units_of
 
 SYSTEM, OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
@@ -41,11 +42,14 @@ def install_units(
     wanted = Installation(cell.resolve(), program(), schedule, user, owner_of(cell.resolve()))
     if cron:
         typer.echo(cron_line(wanted))
+        if yes:
+            typer.echo("Not installed: put this line into the table that `crontab -e` opens.", err=True)
         return
+    check_schedule(schedule)
     folder = to or (Path.home() / OF_USER if user else SYSTEM)
     units = units_of(declared, section, wanted)
     for unit in units:
-        require_ours(folder / unit.name)
+        require_ours(folder / unit.name, told_cell(wanted) if unit.name.endswith(".service") else "")
     if yes:
         _write(folder, units)
     for unit in units:
@@ -81,17 +85,51 @@ def owner_of(path: Path) -> str:
         return str(path.stat().st_uid)
 
 
-def require_ours(path: Path) -> None:
-    """Refuse to replace a file that this verb has not made.
+def check_schedule(schedule: str) -> None:
+    """Have systemd read the calendar expression, where this computer has it.
+
+    Raises:
+        UsageError: it is none.
+    """
+    found = "" if schedule.strip() and schedule.isprintable() else "nothing that can stand in a line"
+    analyze = shutil.which("systemd-analyze")
+    if not found and analyze is not None:
+        done = subprocess.run(
+            [analyze, "calendar", "--", schedule], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+        )
+        found = "" if done.returncode == 0 else " ".join(done.stderr.split()) or "no calendar expression"
+    if found:
+        raise UsageError(
+            f"--schedule {schedule!r}",
+            found=found,
+            expected="a calendar expression of systemd.time(7): weekly, 'Sun 03:00', 'Mon..Fri 22:30'",
+            remedy="correct it; `systemd-analyze calendar EXPRESSION` tells when it strikes",
+        )
+
+
+def require_ours(path: Path, saying: str = "") -> None:
+    """Refuse to replace a file that this verb has not made, or that it made for another cell.
+
+    Args:
+        path: of the unit.
+        saying: what a unit of this cell says.
 
     Raises:
         OutputExists: it is somebody else's.
     """
     try:
-        ours = not path.exists() or path.read_text(encoding="utf-8", errors="replace").startswith(MARK)
+        # What is no regular file is nobody's unit, and a pipe would be waited for.
+        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
     except OSError as error:
         raise OutputFailed.of(path, error) from error
-    if not ours:
+    if text is not None and text.startswith(MARK) and saying not in text:
+        raise OutputExists(
+            str(path),
+            found="the unit of another cell file",
+            expected=f"no such file, or one that says {saying}",
+            remedy="name another folder with --to, or remove it where the cell file has moved",
+        )
+    if (text is None and path.exists()) or (text is not None and not text.startswith(MARK)):
         raise OutputExists(
             str(path),
             found="a unit that drivegain did not make",

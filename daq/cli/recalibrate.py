@@ -5,6 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -30,6 +31,9 @@ def recalibrate_verb(
         bool,
         typer.Option("--dry-run", help="Ask interlock and drives, say what would be done, move and write nothing."),
     ] = False,
+    now: Annotated[
+        bool, typer.Option("--now", help="Also where the last good calibration is young: a motor was replaced.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Record, fit, decide, and propose or apply, without anybody: for a timer. Events go to stderr, a line each.
@@ -41,7 +45,7 @@ def recalibrate_verb(
     """
     journal = Journal(sys.stderr, form_of(sys.stderr, os.environ), lambda: datetime.now(UTC))
     try:
-        _run(cell, dry_run, json, journal)
+        _run(cell, dry_run, now, json, journal)
     except KeyboardInterrupt as interrupt:
         notes = [note for note in getattr(interrupt, "__notes__", ()) if note.startswith(WHILE)]
         journal.say(Level.ERROR, "interrupted", axes="; ".join(notes) or "stopped")
@@ -59,8 +63,10 @@ def error_notes(error: BaseException) -> list[str]:
     return list(getattr(error, "__notes__", ()))
 
 
-def _run(cell: Path, dry_run: bool, json: bool, journal: Journal) -> None:
+def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
     declared = load_cell(cell)
+    if now and declared.recalibration is not None:
+        declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {getpass.getuser()}"
     tools = Tools(save_report=save_report)
     with interruptible() as undisturbed:

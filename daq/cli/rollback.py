@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.syntax import Syntax
 
-from daq.cli.applier import ByOption, applier, audit_of, tell_history
+from daq.cli.applier import ByOption, applier, audit_of, own_file, tell_history
 from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
 from daq.cli.rollback_drives import rollback_drives
 from daq.cli.verb import JsonOption, Verb, print_json
@@ -54,7 +54,9 @@ def rollback(
             expected="one of the two: what is done to a cell's controller is in the cell's audit",
             remedy="leave --audit out; `history: {audit: ...}` of the cell file says where its audit is",
         )
-    now, doer, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared)
+    now, doer, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
+    if audit is not None:
+        own_file(audit, (to,))
     if drives:
         if declared is None or to is not None:
             raise UsageError(

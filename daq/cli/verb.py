@@ -54,8 +54,9 @@ class Listed:
 
 
 def json_text(document: Any) -> str:
-    """One JSON document; numbers that JSON cannot say become null."""
-    return json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """One JSON document; numbers that JSON cannot say become null, bytes of names that are no UTF-8 are spelt out."""
+    text = json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text.encode(errors="backslashreplace").decode()
 
 
 def print_json(document: Any) -> None:

@@ -17,6 +17,7 @@ from daq.configuration.drive_train import ratio_of
 from daq.configuration.sync_checks import producer_faults
 from daq.configuration.yaml_file import Document, Fault, describe
 from daq.errors import ConfigurationInconsistent
+from daq.signature import public_keys
 from drivers.profile import DriveProfile
 from ident.errors import ModelError
 from ident.robot import Joint, robot_from_urdf
@@ -47,6 +48,7 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
         *producer_faults(model),
         *axis_faults(model, joints, urdf),
         *_list_faults(model),
+        *_signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, [axis.name for axis in model.axes]),
     ]
     if faults:
@@ -108,6 +110,18 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 "each mounting a name of its own: it stands for one body in one place",
             )
         yield from _inertia_faults(payload, index)
+
+
+def _signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
+    """A key that is none would be found at the first signature only, long after the recording."""
+    good: dict[str, str] = {}
+    for name, line in signers.items():
+        try:
+            public_keys({**good, name: line})
+        except ConfigurationInconsistent as error:
+            yield Fault(("policy", "apply", "signers", name), error.found, error.expected)
+        else:
+            good[name] = line
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:

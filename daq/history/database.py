@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from collections.abc import Iterator
 from enum import Enum
@@ -35,7 +36,7 @@ def connect(path: Path, access: Access) -> sqlite3.Connection:
         OutputFailed: there is none, and none can be made.
     """
     with telling(path, access):
-        address = f"file:{quote(str(path.absolute()))}?mode={access.value}"
+        address = f"file:{quote(os.fsencode(path.absolute()))}?mode={access.value}"
         connection = sqlite3.connect(address, uri=True, timeout=BUSY_S, isolation_level=None)
         try:
             connection.execute("PRAGMA foreign_keys = ON")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shlex
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ from pathlib import Path
 from daq.configuration.cell import Cell
 from daq.configuration.recalibration import Recalibration
 from daq.errors import ExitCode, UsageError
-from daq.write_back.link import followed
 
 MARK = "# Made by `drivegain install-units`, which may replace this file."
 """First line of what is ours; any other file of that name is somebody else's."""
@@ -67,8 +67,10 @@ def units_of(cell: Cell, section: Recalibration, wanted: Installation) -> tuple[
 
 
 def unit_name(cell: Cell) -> str:
-    """Without its suffix."""
-    return "drivegain-recalibrate-" + (re.sub(r"[^A-Za-z0-9]+", "-", cell.name).strip("-").lower() or "cell")
+    """Without its suffix; cells whose names differ in more than small letters, digits and hyphens get a digest too."""
+    plain = re.sub(r"[^a-z0-9]+", "-", cell.name.lower()).strip("-")
+    digest = "" if plain == cell.name else "-" + hashlib.sha256(cell.name.encode()).hexdigest()[:6]
+    return f"drivegain-recalibrate-{plain or 'cell'}{digest}"
 
 
 def cron_line(wanted: Installation) -> str:
@@ -104,6 +106,11 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
     )
 
 
+def told_cell(wanted: Installation) -> str:
+    """How a service of ours tells for which cell it is."""
+    return f"--cell {_quoted(str(wanted.cell_file))}"
+
+
 def _command(wanted: Installation) -> tuple[str, ...]:
     return (str(wanted.program), "recalibrate", "--cell", str(wanted.cell_file))
 
@@ -120,7 +127,6 @@ def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
     return f"""{MARK}
 [Unit]
 Description=drivegain: scheduled recalibration of cell {_plain(cell.name)}
-Documentation=https://www.freedesktop.org/software/systemd/man/latest/systemd.service.html
 
 [Service]
 Type=oneshot
@@ -159,21 +165,33 @@ WantedBy=timers.target
 
 
 def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
-    """Folders that ProtectHome= and ProtectSystem= would lock: where files are, and not where links to them are."""
+    """Folders that ProtectHome= and ProtectSystem= would lock; of links, those where the files are."""
     folders = {cell_file.parent, section.folder.parent, section.folder}
     if cell.controller_path is not None:
-        folders.add(followed(cell.controller_path).parent)
+        folders.add(cell.controller_path.parent)
     if cell.history is not None:
-        folders |= {cell.history.store.resolve().parent, cell.history.audit.resolve().parent}
+        folders |= {cell.history.store.parent, cell.history.audit.parent}
     if section.metrics is not None:
         folders.add(section.metrics)
     # "-": one that is not there yet must not keep the service from starting.
-    return "".join(f"ReadWritePaths={_quoted('-' + str(folder))}\n" for folder in sorted(folders))
+    # A path is no command line: here a $ is a $.
+    return "".join(f"ReadWritePaths={_quoted('-' + str(folder), dollar='$')}\n" for folder in sorted(folders))
 
 
-def _quoted(part: str) -> str:
-    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them."""
-    plain = _plain(part).replace("$", "$$")
+def _quoted(part: str, *, dollar: str = "$$") -> str:
+    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them.
+
+    Raises:
+        UsageError: it has a character that no unit can say, and with another one it would be another file.
+    """
+    if not part.isprintable():
+        raise UsageError(
+            f"{part!r}",
+            found="a control character in a path",
+            expected="a path that can stand in a line of a unit",
+            remedy="rename the folder or file",
+        )
+    plain = _plain(part).replace("$", dollar)
     if re.fullmatch(r"[A-Za-z0-9_/.:=@%+-]+", plain):
         return plain
     return '"' + plain.replace("\\", "\\\\").replace('"', '\\"') + '"'

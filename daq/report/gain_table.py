@@ -7,7 +7,9 @@ from collections.abc import Mapping
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
+from daq.report.terminal_text import terminal_text
 from ident.calibration import Calibration, Gain
 
 
@@ -26,8 +28,8 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for gain in gains:
-        row = [
-            gain.axis,
+        row: list[str | Text] = [
+            terminal_text(gain.axis),
             f"{gain.nameplate:.4g}",
             with_deviation(gain.value, gain.std),
             f"{gain.std_percent:.2f}" if gain.std else "-",
@@ -35,7 +37,7 @@ def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
         ]
         if truth is not None:
             row += [f"{truth[gain.axis]:.4g}", f"{100.0 * (gain.value / truth[gain.axis] - 1.0):+.2f}"]
-        table.add_row(*row, gain.unit)
+        table.add_row(*row, terminal_text(gain.unit))
     return table
 
 

@@ -24,7 +24,7 @@ def base_refusals(calibration: Calibration, file: str, base_sha256: str, looked_
                 file,
                 f"content {base_sha256[:12]}…",
                 f"{looked_at[:12]}…, as --base says",
-                "somebody has changed the file: look at a new dry run",
+                "the file was changed since that look: take a new dry run, without --base",
             ),
         )
     logged = [(one.name, one.recording.controller_sha256) for one in calibration.sources if one.recording is not None]
@@ -35,8 +35,8 @@ def base_refusals(calibration: Calibration, file: str, base_sha256: str, looked_
             file,
             f"content {base_sha256[:12]}…",
             f"{digest[:12]}…, as when {name} was recorded",
-            "the file was changed since: look at the difference in a dry run and repeat it with the --base that it "
-            "tells",
+            "the file was changed since, by hand or by an earlier write: look at its gains and at the diff of this dry "
+            f"run, and where both are as they should be, repeat it with --base {base_sha256}",
         )
         for name, digest in others[:1]
     )

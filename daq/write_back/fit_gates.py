@@ -65,11 +65,15 @@ def _error_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refus
     numbers = [*trained.axes, trained.total]
     if held is not None:
         numbers += [*(number for number in held.axes if not math.isnan(number)), held.total]
-    if not all(map(math.isfinite, numbers)):
+    if not all(0.0 <= number < math.inf for number in numbers):
         return [
             *still,
             Refusal(
-                Gate.NOT_FINITE, "calibration", "a relative error that is no number", "finite", "fit the logs again"
+                Gate.NOT_FINITE,
+                "calibration",
+                "a relative error that is no number, or below zero",
+                "finite numbers from 0 %",
+                "fit the logs again",
             ),
         ]
     return [*still, *_size_refusals(calibration, policy), *_holdout_refusals(calibration, policy)]
@@ -101,32 +105,43 @@ def _size_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusa
         for name, number in zip(names, error.axes, strict=False)
         if number > policy.max_axis_error_percent
     ]
-    if len(error.axes) < len(names):
-        closed.append(
-            Refusal(
-                Gate.ERROR,
-                "calibration",
-                f"relative errors of {len(error.axes)} axes",
-                f"one of each of the {len(names)} axes",
-                "fit the logs again",
-            )
+    counts = {len(one.axes) for one in (calibration.relative_error_percent, held) if one is not None}
+    closed += [
+        Refusal(
+            Gate.ERROR,
+            "calibration",
+            f"relative errors of {count} axes",
+            f"one of each of the {len(names)} axes",
+            "fit the logs again",
         )
+        for count in sorted(counts)
+        if count < len(names)
+    ]
     return closed
 
 
 def _holdout_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusal]:
     held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
-    if held is None or nameplate is None:
+    if held is None:
         if policy.holdout is HoldOut.OPTIONAL:
             return []
-        found = "no run that was held out" if held is None else "a hold-out that was not compared with the nameplate"
         return [
             Refusal(
                 Gate.HOLDOUT,
                 "calibration",
-                found,
+                "no run that was held out",
                 "a run that puts the gains to the test, as the cell wants (`holdout: required`, or `by: job`)",
                 "fit the logs again, with --holdout for a run that the fit does not see",
+            )
+        ]
+    if nameplate is None:
+        return [
+            Refusal(
+                Gate.HOLDOUT,
+                "calibration",
+                "a hold-out that was not compared with the nameplate",
+                "what the nameplate's gains leave of it",
+                "fit the logs again with free gains and --holdout",
             )
         ]
     closed = []

@@ -1,7 +1,8 @@
 """What must hold before a gain is written to a controller; each gate closes for a reason of its own.
 
-The gates of a gain are in `gain_gates`, of the fit in `fit_gates`, of the logs in `source_gates`, of the controller's
-file and of who stands for the calibration in `base_gate` and `signature_gate`. docs/write-back.md has them in a table.
+The gates of a gain are in `gain_gates` and `axis_gates`, of the fit in `fit_gates`, of the logs in `source_gates` and
+`role_gates`, of the controller's file and of who stands for the calibration in `base_gate` and `signature_gate`.
+docs/write-back.md has them in a table.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ class Gate(Enum):
     SIGN = "sign"
     CHANGE = "change"
     NAMEPLATE = "nameplate"
+    UNIT = "unit"
     UNCERTAINTY = "uncertainty"
     CELL = "cell"
     CONFIGURATION = "configuration"

@@ -1,9 +1,10 @@
-"""Symbolic links to a controller's file: followed to where they lead, if that place is nobody else's."""
+"""Links to a controller's file: symbolic ones are followed to where they lead, if that place is nobody else's."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shlex
 import stat
 from pathlib import Path
 
@@ -52,8 +53,11 @@ def followed(file: Path) -> Path:
 def require_there(file: Path) -> None:
     """Refuse a symbolic link that leads nowhere, by that name: "no such file" would be hard to believe.
 
+    A file of several names (hard links) is refused too: a new file takes the place of one name, and whoever reads the
+    others goes on with the old gains.
+
     Raises:
-        ControllerUnfit: it does; and see `followed`.
+        ControllerUnfit: for either; and see `followed`.
     """
     target = followed(file)
     if file.is_symlink() and not target.exists():
@@ -62,6 +66,15 @@ def require_there(file: Path) -> None:
             found=f"a symbolic link to {target}, which is not there",
             expected="a link that leads to the controller's file",
             remedy="correct the link, or name the file itself",
+        )
+    if target.is_file() and (names := target.stat().st_nlink) > 1:
+        quoted = shlex.quote(str(target))
+        raise ControllerUnfit(
+            str(file),
+            found=f"a file with {names} names (hard links)",
+            expected="one name: under the others the old gains would stay",
+            remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of them, or give this name "
+            f"a file of its own: cp -p {quoted} {quoted}.new && mv {quoted}.new {quoted}",
         )
 
 

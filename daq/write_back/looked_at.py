@@ -1,7 +1,7 @@
 """What somebody has looked at before a write: what stood there, and what would stand there in its place.
 
-Both as the first digits of their SHA-256, before-after, as a backup is named. Who repeats it at the write gets the change
-that was shown: not another one because the calibration, the keys or the file have become others meanwhile.
+Both as the first digits of their SHA-256, before-after, as a backup is named. Who repeats it at the write gets the
+change that was shown: not another one because the calibration, the keys or the file have become others meanwhile.
 """
 
 from __future__ import annotations

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from daq.errors import ControllerBusy
 
+_MODE = 0o644
+"""Everybody may read it, and that is enough to lock it (not on NFS, which wants it writable)."""
+
 
 @contextlib.contextmanager
 def only_writer(target: Path) -> Iterator[None]:
@@ -31,28 +34,33 @@ def only_writer(target: Path) -> Iterator[None]:
                 try:
                     yield
                 finally:
-                    lock.unlink(missing_ok=True)
+                    # Another user's may stay, where only they may remove it: nobody holds it.
+                    with contextlib.suppress(PermissionError):
+                        lock.unlink(missing_ok=True)
                 return
         finally:
             os.close(descriptor)
 
 
 def _opened(lock: Path) -> int:
-    """The lock's file, which everybody may open: one that a killed writer left must not keep other users out.
-
-    To hold a lock nothing need be written, and where others may write it the next user could not tell who did.
-    """
-    flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    try:
-        descriptor = os.open(lock, flags | os.O_CREAT | os.O_EXCL, 0o644)
-    except FileExistsError:
+    """The lock's file, made where there is none; one that another user has left does not keep anybody out."""
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    while True:
+        with contextlib.suppress(FileExistsError):
+            descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _MODE)
+            try:
+                os.fchmod(descriptor, _MODE)  # whatever the umask
+            except BaseException:
+                os.close(descriptor)
+                lock.unlink(missing_ok=True)
+                raise
+            return descriptor
         # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's file.
-        try:
-            return os.open(lock, flags)
-        except FileNotFoundError:  # its owner was done just now
-            return os.open(lock, flags | os.O_CREAT, 0o644)
-    os.fchmod(descriptor, 0o644)  # whatever the umask
-    return descriptor
+        with contextlib.suppress(FileNotFoundError):  # whose owner was done just now
+            try:
+                return os.open(lock, flags | os.O_RDWR)
+            except PermissionError:
+                return os.open(lock, flags | os.O_RDONLY)
 
 
 def _take(descriptor: int, target: Path) -> None:

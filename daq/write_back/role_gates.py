@@ -10,12 +10,11 @@ from ident.calibration import Calibration
 _FIT, _HOLDOUT = "fit", "holdout"
 
 
-def role_refusals(calibration: Calibration, *, payload_wanted: bool) -> Iterator[Refusal]:
+def role_refusals(calibration: Calibration) -> Iterator[Refusal]:
     """Closed where the roles of the logs do not bear what the calibration says.
 
     Args:
         calibration: to be written, with at least one log.
-        payload_wanted: the logs say what was mounted; without a known mass in the fit no gain has a scale.
     """
     sources = calibration.sources
     for source in sources:
@@ -31,7 +30,7 @@ def role_refusals(calibration: Calibration, *, payload_wanted: bool) -> Iterator
     held = [source for source in sources if source.role == _HOLDOUT]
     if not fitted:
         yield Refusal(Gate.SOURCES, "calibration", "no log that was fitted", "at least one", "fit the logs again")
-    elif payload_wanted and not any(source.payload for source in fitted):
+    elif not any(source.payload for source in fitted):
         yield Refusal(
             Gate.SOURCES,
             "calibration",
@@ -39,7 +38,7 @@ def role_refusals(calibration: Calibration, *, payload_wanted: bool) -> Iterator
             "one with a weighed payload, which sets the scale of the gains",
             "fit a loaded run too",
         )
-    elif payload_wanted and len(fitted) < 2:
+    elif len(fitted) < 2:
         yield Refusal(
             Gate.SOURCES,
             "calibration",
@@ -52,15 +51,28 @@ def role_refusals(calibration: Calibration, *, payload_wanted: bool) -> Iterator
 
 
 def _repeated(calibration: Calibration) -> Iterator[Refusal]:
+    """A log that was held out of nothing, or counts twice."""
     met: dict[str, str] = {}
     for source in calibration.sources:
-        before = met.setdefault(source.sha256, source.role)
-        if before is source.role and met[source.sha256] is before and source is _first(calibration, source.sha256):
-            continue
+        if source.sha256 in met:
+            yield Refusal(
+                Gate.SOURCES,
+                f"log {source.name}",
+                f"the same recording as log {met[source.sha256]}",
+                "every recording once, in the fit or held out",
+                "fit the logs again, each once",
+            )
+        met.setdefault(source.sha256, source.name)
+
+
+def _figures(calibration: Calibration, held_out: bool) -> Iterator[Refusal]:
+    """A figure without a log is nobody's; a log without its figure hides one."""
+    told = calibration.holdout_error_percent is not None
+    if told != held_out:
         yield Refusal(
-            Gate.SOURCES,
-            f"log {source.name}",
-            f"the recording of log {_first(calibration, source.sha256).name}",
-            "every recording once, in the fit or held out",
-            "fit the logs again, each once",
+            Gate.HOLDOUT,
+            "calibration",
+            "an error on held-out data, and no log of them" if told else "a log that was held out, and no error on it",
+            "both or neither",
+            "fit the logs again",
         )

@@ -4,36 +4,45 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 
 from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.cell import WeighedPayload
 from daq.payload_mass import agree, tolerance_kg
+from daq.write_back.axis_gates import axis_refusals
 from daq.write_back.circumstances import Circumstances
 from daq.write_back.gates import Gate, Refusal
+from daq.write_back.role_gates import role_refusals
 from ident.calibration import Calibration, Source
 from ident.recording import Recording
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _UNFINISHED = ".part"
-_CLOCKS = timedelta(days=1)
+_DAY_S = 86_400.0
+_CLOCKS_DAYS = 1.0
 """By which the recorder's clock may be ahead of ours."""
+_LONGEST_DAYS = 1e5
+"""Some 270 years: no log is so old."""
 
 
 def source_refusals(calibration: Calibration, policy: ApplyPolicy, held: Circumstances) -> tuple[Refusal, ...]:
-    """Closed gates of the logs.
+    """Closed gates of the logs, and of what the calibration says of the axes.
 
     Args:
         calibration: to be written.
         policy: bounds.
-        held: what the logs are held against.
+        held: what all of it is held against.
     """
+    of_axes = () if held.axes is None else tuple(axis_refusals(calibration, held.axes))
     if not calibration.sources:
         return (
+            *of_axes,
             Refusal(Gate.SOURCES, "calibration", "no logs it rests on", "at least one", "fit from logs of this cell"),
         )
     axes = [gain.axis for gain in calibration.gains]
     closed = [refusal for source in calibration.sources for refusal in _refusals(source, axes, policy, held)]
-    return (*closed, *_exchanged(calibration.sources, axes))
+    roles = role_refusals(calibration) if held.told else ()
+    return (*of_axes, *closed, *roles, *_exchanged(calibration.sources, axes))
 
 
 def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circumstances) -> Iterator[Refusal]:
@@ -52,7 +61,7 @@ def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circum
         )
     told = source.recording
     if told is None:
-        if held.serials is not None or held.payloads is not None or held.now is not None:
+        if held.told:
             yield Refusal(
                 Gate.SOURCES,
                 name,
@@ -61,7 +70,7 @@ def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circum
                 "fit the logs again",
             )
         return
-    if held.serials is not None or held.payloads is not None or held.now is not None:
+    if held.told:
         yield from _incomplete(told, name, axes)
     yield from _losses(source, told, name)
     yield from _age(told, name, policy, held.now)
@@ -86,6 +95,16 @@ def _incomplete(told: Recording, name: str, axes: list[str]) -> Iterator[Refusal
                 f"of each of the {len(axes)} axes that the calibration has",
                 "fit the logs again",
             )
+    shares = [percent for percent in told.saturated_percent if not 0.0 <= percent <= 100.0]
+    counts = [count for count in (told.lost_cycles, *told.missing) if count < 0]
+    if shares or counts:
+        yield Refusal(
+            Gate.SOURCES,
+            name,
+            f"{shares[0]:g} % of saturated samples" if shares else f"a loss of {counts[0]} samples",
+            "shares from 0 to 100 %, and counts of 0 or more",
+            "fit the logs again",
+        )
 
 
 def _losses(source: Source, told: Recording, name: str) -> Iterator[Refusal]:
@@ -103,18 +122,25 @@ def _losses(source: Source, told: Recording, name: str) -> Iterator[Refusal]:
 def _age(told: Recording, name: str, policy: ApplyPolicy, now: datetime | None) -> Iterator[Refusal]:
     if now is None or policy.max_age_days is None:
         return
-    expected = f"recorded within the last {policy.max_age_days:g} days"
-    if told.recorded_s is None:
+    expected = f"recorded within the last {_span(policy.max_age_days)}"
+    days = None if told.recorded_s is None else (now.timestamp() - told.recorded_s) / _DAY_S
+    # In numbers, not in dates: a hand-made date may be one that no calendar has.
+    if days is not None and -_CLOCKS_DAYS <= days <= policy.max_age_days:
+        return
+    if days is None:
         found = "no date: it was imported"
         remedy = "record with drivegain, or allow it with `max_age_days: null` in the cell's `policy: {apply: ...}`"
+    elif not abs(days) < _LONGEST_DAYS:
+        found, remedy = f"a date that cannot be, {told.recorded_s:g} s of Unix time", "fit the logs again"
     else:
-        age = now - datetime.fromtimestamp(told.recorded_s, UTC)
-        if -_CLOCKS <= age <= timedelta(days=policy.max_age_days):
-            return
-        days = age / timedelta(days=1)
-        found = f"recorded {days:.1f} days ago" if days > 0 else f"recorded {-days:.1f} days from now"
+        found = f"recorded {_span(days)} ago" if days > 0 else f"recorded {_span(-days)} from now"
         remedy = "record again and fit" if days > 0 else "set the clocks of this computer and of the recorder"
     yield Refusal(Gate.STALE, name, found, expected, remedy)
+
+
+def _span(days: float) -> str:
+    """In hours where days would be a small fraction."""
+    return f"{round(days, 1):g} days" if days >= 1.0 else f"{24.0 * days:.2g} hours"
 
 
 def _serials(told: Recording, name: str, axes: list[str], held: Circumstances) -> Iterator[Refusal]:
@@ -164,9 +190,14 @@ def _saturation(told: Recording, name: str, axes: list[str], policy: ApplyPolicy
 
 
 def _mass(source: Source, told: Recording, name: str, held: Circumstances) -> Iterator[Refusal]:
-    if held.payloads is None or source.payload is None:
+    if held.payloads is None:
+        return
+    if source.payload is None:
+        if source.mass_kg is not None or told.entered_kg is not None:
+            yield Refusal(Gate.MASS, name, "a mass, and no payload", "both or neither", "fit the logs again")
         return
     subject, fitted_kg = f"{name}, payload {source.payload}", source.mass_kg
+    yield from _mass_now(subject, source.payload, fitted_kg, held.payloads)
     at_apply_kg = held.entered_kg.get(source.payload)
     entered = [kg for kg in (told.entered_kg, at_apply_kg) if kg is not None]
     if fitted_kg is None or not entered:
@@ -189,3 +220,27 @@ def _mass(source: Source, told: Recording, name: str, held: Circumstances) -> It
                 f"{fitted_kg:g} kg within {within_kg:g} kg, as fitted",
                 "weigh it again, correct the wrong one of the two, and fit: all gains are in proportion to this mass",
             )
+
+
+def _mass_now(
+    subject: str, payload: str, fitted_kg: float | None, payloads: tuple[WeighedPayload, ...]
+) -> Iterator[Refusal]:
+    """Whoever corrects a mass in the cell file says that the fit went with a wrong one."""
+    declared = [one for one in payloads if one.name == payload]
+    if not declared:
+        names = ", ".join(one.name for one in payloads) or "none"
+        yield Refusal(
+            Gate.MASS,
+            subject,
+            "no such payload in the cell file now",
+            f"one of the cell's: {names}",
+            "give it back its name in the cell file, with its mass",
+        )
+    elif fitted_kg is not None and not any(agree(one.mass_kg, fitted_kg, one.mass_tolerance_kg) for one in declared):
+        yield Refusal(
+            Gate.MASS,
+            subject,
+            f"fitted with {fitted_kg:g} kg",
+            f"{declared[0].mass_kg:g} kg within {declared[0].mass_tolerance_kg:g} kg, as in the cell file now",
+            "fit the logs again with --cell, or correct the cell file: all gains are in proportion to this mass",
+        )

@@ -10,6 +10,7 @@ import os
 import shlex
 import shutil
 import stat
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -23,6 +24,7 @@ from daq.write_back.apply import Proposal, apply, propose
 from daq.write_back.audit import AuditAction, read
 from daq.write_back.backups import backups
 from daq.write_back.controller_write import roll_back
+from daq.write_back.one_writer import only_writer
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, KEYS, demo_calibration
 
@@ -134,6 +136,59 @@ def test_a_second_writer_is_refused(controller: Path) -> None:
     # The lock of a writer that was killed is free, whatever its file says.
     assert apply(proposal, NOW) is not None
     assert not lock.exists()
+
+
+def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: Path) -> None:
+    file = tmp_path / "x.yaml"
+    lock, made = tmp_path / ".x.yaml.lock", 0
+    umask = os.umask(0o077)
+    try:
+        with only_writer(file):
+            made = stat.S_IMODE(lock.stat().st_mode)
+    finally:
+        os.umask(umask)
+    assert made == 0o644
+    assert not lock.exists()
+    if os.geteuid() != 0:
+        pytest.skip("only root can be another user")
+    lock.touch(0o644)
+    held = os.open(lock, os.O_RDONLY)
+    # The folders above are pytest's own, for root alone: a folder of its own, by its descriptor.
+    shared = Path(tempfile.mkdtemp())
+    lock = lock.rename(shared / lock.name)
+    shared.chmod(0o1777)
+    os.seteuid(65534)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+            pass
+        fcntl.flock(held, fcntl.LOCK_UN)
+        with only_writer(shared / "x.yaml"), pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+            pass
+        assert lock.exists()  # root's, in a folder where each removes their own
+    finally:
+        os.seteuid(0)
+        os.close(held)
+        shutil.rmtree(shared)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "keys"),
+    [
+        (
+            "x.dcf",
+            "[2003]\nObjectType=0x9\nSubNumber=2\n[2003sub1]\nDataType=0x0008\nParameterValue=32.96\n",
+            ("2003:01", "2003sub1"),
+        ),
+        ("x.xml", "<c><Axis name='J1'><gain>32.96</gain></Axis></c>", ("c/Axis[1]/gain", "c/Axis[@name='J1']/gain")),
+    ],
+)
+def test_two_names_of_one_number_are_refused(tmp_path: Path, name: str, content: str, keys: tuple[str, str]) -> None:
+    file = tmp_path / name
+    file.write_text(content)
+    two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
+    with pytest.raises(ControllerUnfit, match="which name the same number"):
+        propose(two, file, dict(zip(("J1", "J2"), keys, strict=True)), cell="demo")
 
 
 def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:

@@ -20,8 +20,9 @@ from daq.write_back.audit import AuditAction, read
 from daq.write_back.controller_file import decode
 from daq.write_back.gain_spelling import spell
 from daq.write_back.yaml_document import YamlDocument
-from ident.calibration import Gain
-from tests.daq.calibrations import demo_calibration
+from ident.calibration import Calibration, Gain
+from ident.relative_error import RelativeError
+from tests.daq.calibrations import demo_calibration, with_recordings
 
 _words = st.text("abcdefghijklmnopqrstuvwxyzé_", min_size=1, max_size=6).filter(
     lambda word: word not in ("y", "n", "no", "on", "off", "yes", "true", "false", "null", "gain")
@@ -110,6 +111,25 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
     assert file.with_values({}).text == file.text
 
 
+def _of_axes(gains: tuple[Gain, ...]) -> Calibration:
+    """The demo calibration with other gains, and what it tells of each axis for as many."""
+    count, demo = len(gains), demo_calibration()
+
+    def first(error: RelativeError | None) -> RelativeError | None:
+        return None if error is None else replace(error, axes=error.axes[:count])
+
+    cut = replace(
+        demo,
+        gains=gains,
+        relative_error_percent=RelativeError(demo.relative_error_percent.axes[:count], 3.2),
+        holdout_error_percent=first(demo.holdout_error_percent),
+        nameplate_holdout_error_percent=first(demo.nameplate_holdout_error_percent),
+    )
+    return with_recordings(
+        cut, serials=tuple(range(1, count + 1)), saturated_percent=(0.0,) * count, missing=(0,) * count
+    )
+
+
 @settings(max_examples=500, deadline=None)
 @given(_cases(), st.data())
 def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, data: st.DataObject) -> None:
@@ -128,7 +148,7 @@ def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, dat
     with tempfile.TemporaryDirectory() as folder:
         file, audit = Path(folder) / "robot.yaml", Path(folder) / "audit.jsonl"
         file.write_bytes(case.text(case.numbers).encode())
-        calibration = replace(demo_calibration(), gains=gains)
+        calibration = _of_axes(gains)
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
         proposal = propose(calibration, file, keys, cell="demo", calibration_content=b"a calibration")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import hashlib
 import json
 import os
 import shlex
@@ -113,8 +114,8 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
     assert main(undo) == ExitCode.OK
     assert "Restored" in capsys.readouterr().out
     assert bench.controller.read_bytes() == before
-    begun = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
-    assert bench.actions() == [AuditAction.REFUSED] * 2 + begun
+    there, back = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED], [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
     assert read(bench.audit)[2].who == f"Ada (login {getpass.getuser()})"
     with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
         assert [event.target for event in store.events()] == [str(bench.controller)] * 2
@@ -323,3 +324,114 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
     assert bench.apply() == ExitCode.OK
     assert "σ of both" in capsys.readouterr().out
+
+
+def _told_base(shown: str) -> str:
+    """What the dry run says to repeat."""
+    return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
+
+
+def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, fitted = bench.controller.read_bytes(), bench.calibration.read_bytes()
+    assert bench.apply() == ExitCode.OK
+    base = _told_base(capsys.readouterr().out)
+    assert bench.apply("--json") == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["base"] == base
+    # Another calibration under the same name.
+    known = decode(fitted, "")
+    moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
+    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert "the keys or the factors have changed since the dry run" in " ".join(capsys.readouterr().err.split())
+    assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert _told_base(capsys.readouterr().out) != base
+    bench.calibration.write_bytes(fitted)
+    # Other keys in the cell: the gains of J1 and J2 exchanged.
+    cell = bench.cell.read_text()
+    swapped = cell.replace("[drives.J1.gain, drives.J2.gain,", "[drives.J2.gain, drives.J1.gain,")
+    assert swapped != cell
+    bench.cell.write_text(swapped)
+    assert bench.apply("--yes", "--base", base, "--configuration-changed") == ExitCode.CALIBRATION_REFUSED
+    bench.cell.write_text(cell)
+    # Another file.
+    bench.controller.write_bytes(before + b"# seen by K.\n")
+    assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert "as --base says" in " ".join(capsys.readouterr().err.split())
+    bench.controller.write_bytes(before)
+    assert not list(bench.controller.parent.glob("*.bak"))
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    (backup,) = bench.controller.parent.glob("*.bak")
+    assert f".{base}.bak" in backup.name
+    # Asked for once more, what it wants is there already.
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    for wrong in ("abc", base[:-1], base.replace("-", "_"), "x" * 64):
+        assert bench.apply("--yes", "--base", wrong) == ExitCode.USAGE
+
+
+def test_a_dry_run_of_a_file_that_changed_since_the_recording_tells_the_way_on(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = decode(bench.calibration.read_bytes(), "")
+    digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
+    save(with_recordings(known, controller_sha256=digest), bench.calibration)
+    bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--base" not in capsys.readouterr().out
+    assert bench.apply() == ExitCode.CALIBRATION_REFUSED
+    base = _told_base(capsys.readouterr().out)
+    assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
+    assert "--yes" not in capsys.readouterr().out  # another gate is closed
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    capsys.readouterr()
+    # The file is another one than at the recording, by this very write.
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "these gains already" in capsys.readouterr().out
+    assert bench.actions()[-1] is AuditAction.NOTHING_TO_DO
+    assert bench.apply() == ExitCode.OK
+    assert bench.actions().count(AuditAction.NOTHING_TO_DO) == 1
+    assert bench.apply("--configuration-changed", "--max-std-percent", "0.01") == ExitCode.CALIBRATION_REFUSED
+
+
+@pytest.mark.parametrize("place", ["controller", "cell", "calibration", "store", "notes"])
+@pytest.mark.parametrize("refused", [False, True])
+def test_no_other_file_becomes_an_audit(
+    bench: Bench, capsys: pytest.CaptureFixture[str], place: str, refused: bool
+) -> None:
+    notes, store = bench.cell.with_name("notes.txt"), bench.cell.with_name("cell.history.sqlite")
+    notes.write_text("the robot was moved\non Monday\n")
+    audit = {"store": store, "notes": notes}.get(place) or getattr(bench, place)
+    bench.cell.write_text(
+        bench.cell.read_text() + f"history: {{store: {json.dumps(str(store))}, audit: {json.dumps(str(audit))}}}\n"
+    )
+    paths = [bench.controller, bench.cell, bench.calibration, notes]
+    before = [path.read_bytes() for path in paths]
+    strict = ["--max-change-percent", "1"] if refused else []
+    assert bench.apply("--yes", "--configuration-changed", *strict) != ExitCode.OK
+    assert [path.read_bytes() for path in paths] == before
+    assert not store.exists()
+    if not refused:
+        assert "audit" in capsys.readouterr().err
+
+
+def test_a_rollback_writes_into_no_other_file(bench: Bench) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    link = bench.controller.with_name("audit.jsonl")
+    link.hardlink_to(bench.cell)
+    cell, written = bench.cell.read_bytes(), bench.controller.read_bytes()
+    for audit in (bench.controller, link):
+        assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
+    assert (bench.cell.read_bytes(), bench.controller.read_bytes()) == (cell, written)
+
+
+def test_whatever_the_history_does_a_write_is_not_called_undone(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed")
+
+    monkeypatch.setattr(HistoryStore, "add", broken)
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert b"-9.2100" in bench.controller.read_bytes()

@@ -213,6 +213,43 @@ def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
     assert verdict.entries[2].details["torn_bytes"] == 100
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"drives:\n  J1: {gain: 32.96}\n",
+        b"[2003]\nObjectType=0x9\n",
+        b'{\n  "gain": 1\n',
+        b"no line end",
+        b'{"actions": 1',
+        b"SQLite format 3\x00",
+        b"\xff\xfe",
+    ],
+)
+def test_nothing_is_appended_to_a_file_that_is_no_audit(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(content)
+    with pytest.raises(AuditUnusable, match=r"another file, correct `history\.audit`"):
+        _filled(path, 1)
+    assert path.read_bytes() == content
+    assert not verify(path).holds
+    # Behind entries it is nobody's unfinished line either.
+    path.unlink()
+    _filled(path, 1)
+    with path.open("ab") as stream:
+        stream.write(content)
+    assert not verify(path).holds
+
+
+def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
+    _filled(tmp_path / "whole", 1)
+    whole = (tmp_path / "whole").read_bytes()
+    for length in range(len(whole) - 1):
+        path = tmp_path / str(length)
+        path.write_bytes(whole[:length])
+        assert append(path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}).number == 1 + (length > 0)
+        assert verify(path).holds
+
+
 @pytest.mark.parametrize("spoil", [lambda line: line.replace(b"Ito", b"Itu"), lambda _: b"{}", lambda _: b"17"])
 def test_nothing_is_appended_to_a_last_line_that_was_changed(tmp_path: Path, spoil: Callable[[bytes], bytes]) -> None:
     path = tmp_path / "a"
@@ -349,3 +386,14 @@ def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
     (one,) = _filled(tmp_path / "a", 1)
     assert one.holds
     assert not replace(one, who="somebody else").holds
+
+
+@pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
+def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object) -> None:
+    """A chain that holds can be written by anybody."""
+    path, strangers = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
+    for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
+        append(path, action, at=NOW, who="", subject="x", details=strangers)
+    verdict = verify(path)
+    assert verdict.holds
+    assert len(verdict.open_writes) == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 import re
 import shutil
 import sqlite3
@@ -19,9 +20,10 @@ import pytest
 
 from daq.calibration_file import save
 from daq.cli.app import main
+from daq.cli.history_deeds import deed_words
 from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
-from daq.history.entry import logs_of, recorded_at
+from daq.history.entry import Deed, Entry, Event, logs_of, recorded_at
 from daq.history.store import HistoryStore
 from daq.history.table import COLUMNS
 from daq.history.watch import Series, watch
@@ -29,6 +31,8 @@ from daq.history.words import alarm_words, questions
 from daq.recalibration.session import Basis, begin
 from daq.recalibration.session import save as save_session
 from daq.write_back.audit import AuditAction, append, read
+from daq.write_back.controller_file import decode as read_controller
+from daq.write_back.scalar import respell
 from tests.daq.calibrations import AXES, recorded, with_recordings
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, fill
 
@@ -89,6 +93,25 @@ def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]
     return found
 
 
+def _entry(digest: str) -> Entry:
+    demo = calibration_of(0)
+    return Entry(digest, BEGIN, BEGIN, "", BEGIN, "demo", "", "ml", "", 3.0, None, 1, demo.gains, ())
+
+
+def _put(cell: Path, digest: str) -> str:
+    """The gains of a calibration into the cell's controller, past drivegain; its file."""
+    controller = load_cell(cell).controller_path
+    assert controller is not None
+    with HistoryStore(_place(cell).store) as store:
+        (entry,) = [one for one in store.entries() if one.digest == digest]
+    keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
+    document = read_controller(controller.read_bytes(), controller.name)
+    scalars = document.locate(tuple(keys.values()))
+    spelling = {s.key: respell(s, g.value, g.std).spelling for s, g in zip(scalars, entry.gains, strict=True)}
+    controller.write_bytes(document.with_values(spelling).content)
+    return str(controller.resolve())
+
+
 def test_an_empty_history_says_what_to_do(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["history", str(cell)]) == 0
     assert "The history is empty" in capsys.readouterr().out
@@ -122,6 +145,7 @@ def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsy
     digests = _filled(cell, 26, drifting)
     with HistoryStore(_place(cell).store) as store:
         store.applied(digests[8], at=BEGIN + timedelta(weeks=8), who="anna", target="x.yaml")
+    _put(cell, digests[8])
     assert main(["history", str(cell)]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert re.search(r"ALARM: gain of J4 fell 5\.\d % since 2026-04-\d\d, \d\d\.\d σ", out)
@@ -436,3 +460,64 @@ def test_a_broken_history_is_told(cell: Path, capsys: pytest.CaptureFixture[str]
         other.commit()
     assert main(["history", str(cell), "--verify"]) == 4
     assert "without its calibration" in " ".join(capsys.readouterr().err.split())
+
+
+def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second, third = _filled(cell, 3, lambda _: FLAT)
+    own = _put(cell, first)
+
+    def applied(digest: str, target: str) -> None:
+        with HistoryStore(_place(cell).store) as store:
+            store.applied(digest, at=BEGIN, who="anna", target=target)
+
+    def told() -> str | None:
+        return str(found) if (found := _json(capsys, str(cell))["in_force"]) else None
+
+    applied(first, own)
+    applied(second, "/another/controller.yaml")
+    assert told() == first
+    applied(third, own)
+    assert told() == first  # whatever the history says: the backup was copied back by hand
+    _put(cell, third)
+    assert told() == third
+    edited = Path(own).read_text().replace("loop:", "lopp:")
+    Path(own).write_text(edited + "# K.\n")
+    assert told() == third  # the gains are the same
+    capsys.readouterr()
+    assert main(["history", str(cell)]) == 0
+    assert " ".join(capsys.readouterr().out.split()).count("in force") == 1
+    _put(cell, third)
+    Path(own).write_text(re.sub("gain: -9[.0-9]*", "gain: -9.5", Path(own).read_text()))
+    assert told() is None
+    Path(own).unlink()
+    assert told() is None
+
+
+def test_what_was_done_is_told_in_the_words_of_who_did_it() -> None:
+    def event(digest: str | None, deed: Deed, who: str, target: str = "x") -> Event:
+        return Event(digest, deed, BEGIN, who, target)
+
+    entries = tuple(_entry(name) for name in ("a", "b", "c"))
+    done = [event("a", Deed.APPLIED, "anna")]
+    assert deed_words(entries, done, "a") == {"a": "applied by anna, in force", "b": "-", "c": "-"}
+    done += [event("b", Deed.APPLIED, "ben"), event("c", Deed.APPLIED, "cem", "y")]
+    assert deed_words(entries, done, "b") == {
+        "a": "applied by anna",
+        "b": "applied by ben, in force",
+        "c": "applied by cem",
+    }
+    done += [event("a", Deed.ROLLED_BACK, "dora")]
+    assert deed_words(entries, done, "a") == {
+        "a": "restored by dora, in force",
+        "b": "applied by ben, taken back by dora",
+        "c": "applied by cem",
+    }
+    done += [event(None, Deed.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
+    assert deed_words(entries, done, None)["c"] == "applied by cem, taken back by eva"
+    assert deed_words(entries, done, "c")["c"] == "applied by cem, taken back by eva, in force"
+
+
+def test_nobody_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
+    os.mkfifo(cell.parent / "pipe")
+    for path in (cell.parent / "pipe", Path("/dev/zero"), cell.parent):
+        assert main(["history", str(cell), "--add", str(path)]) == 4

@@ -412,3 +412,12 @@ def test_tables_are_strict(tmp_path: Path) -> None:
         assert found == dict.fromkeys(("calibration", "gain", "event", "acknowledgement"), 1)
         with pytest.raises(sqlite3.IntegrityError):
             other.execute("UPDATE gain SET value = 'much'")
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff ?#%"))
+    folder.mkdir()
+    with HistoryStore(folder / "h") as store:
+        digest = enter(store, calibration_of(0))
+    with HistoryStore(folder / "h") as store:
+        assert [one.digest for one in store.entries()] == [digest]

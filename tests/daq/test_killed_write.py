@@ -20,6 +20,7 @@ from daq.write_back.backups import backups
 from daq.write_back.controller_file import decode
 from daq.write_back.controller_write import roll_back
 from ident.calibration import Calibration
+from ident.relative_error import RelativeError
 from tests.daq import killing
 from tests.daq.calibrations import demo_calibration
 from tests.daq.killing import killed_at
@@ -34,7 +35,13 @@ LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.y
 
 def _calibration(gain: float) -> Calibration:
     calibration = demo_calibration()
-    return replace(calibration, gains=(replace(calibration.gains[0], value=gain, std=0.1),))
+    return replace(
+        calibration,
+        gains=(replace(calibration.gains[0], value=gain, std=0.1),),
+        relative_error_percent=RelativeError((3.1,), 3.1),
+        holdout_error_percent=RelativeError((3.2,), 3.2),
+        nameplate_holdout_error_percent=RelativeError((4.2,), 4.2),
+    )
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -105,6 +106,21 @@ def test_the_link_of_a_stranger_is_not_followed(controller: Path, tmp_path: Path
     written = apply(propose(demo_calibration(), link, KEYS, cell="demo"), NOW)
     assert written is not None
     assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
+
+
+def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, tmp_path: Path) -> None:
+    """The other name would keep the old gains, and whoever reads it would not know."""
+    other = tmp_path / "plc's.yaml"
+    other.hardlink_to(controller)
+    for name in (controller, other):
+        with pytest.raises(ControllerUnfit, match=r"2 names \(hard links\)") as caught:
+            propose(demo_calibration(), name, KEYS, cell="demo")
+    remedy = str(caught.value).rpartition("of its own: ")[2]
+    assert subprocess.run(remedy, shell=True, check=False).returncode == 0
+    assert controller.stat().st_nlink == 1
+    assert other.read_bytes() == controller.read_bytes()
+    assert propose(demo_calibration(), other, KEYS, cell="demo").refusals == ()
+    assert apply(propose(demo_calibration(), controller, KEYS, cell="demo"), NOW) is not None
 
 
 def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path, tmp_path: Path) -> None:

@@ -52,6 +52,11 @@ def _cell(path: Path, _content: bytes) -> Cell:
     return load_cell(path)
 
 
+@cache
+def _truth(payload: str | None) -> CellSpec:
+    return load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload)
+
+
 class TestClock:
     """A wall clock that goes on by a second whenever it is asked, and further when it is told."""
 
@@ -179,8 +184,7 @@ def serving(
     rig: Rig, *faults: FaultSpec, toggle_bit: int | None = None, seed: int = 1, spec: CellSpec | None = None
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
-    load = partial(load_simulation, shipped_configurations() / "simulation" / "demo.yaml")
-    mounted = MountedFile(rig.cells / "mounted", load, lambda error: None)
+    mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
     truth = replace(spec or mounted.at_power_on(), faults=faults, seed=seed)
     truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
     bus = open_bus(bus_address(rig.cell))

@@ -105,9 +105,9 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
         held(rig, NotReleased, ExitCode.NOT_RELEASED)
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
         assert cell.cycles == cycles[2]
-    # By the third question the drives had been mapped and had answered a SYNC, and nothing came after it.
+    # By the third question the drives had been mapped and had answered a SYNC, and no move had been made.
     assert len(cycles) == 3
-    assert cycles[2] > cycles[1]
+    assert 0 < cycles[2] - cycles[1] < 10
     assert not list(rig.session.folder.glob("*.mcap*"))
 
 

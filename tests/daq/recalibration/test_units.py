@@ -127,8 +127,47 @@ def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
     assert section is not None
     named = replace(rig.cell, name='50 %h "cell"\nExecStart=/bin/false')
     wanted = replace(installation(rig), cell_file=Path("/cells/100 % $HOME/it's.yaml"))
-    assert unit_name(named) == "drivegain-recalibrate-50-h-cell-execstart-bin-false"
+    assert unit_name(named) == "drivegain-recalibrate-50-h-cell-execstart-bin-false-cc6ad2"
+    assert unit_name(rig.cell) == f"drivegain-recalibrate-{rig.cell.name}"
+    others = {unit_name(replace(rig.cell, name=name)) for name in ("Пресс 4", "Робот 4", "press 4", "press-4")}
+    assert len(others) == 4
     service = read(units_of(named, section, wanted)[0].text)["Service"]
     assert service["ExecStart"] == '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
     assert units_of(named, section, wanted)[0].text.count("\nExecStart=") == 1
     assert cron_line(wanted).endswith("--cell '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
+
+
+def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "units"
+    command = ["install-units", "--to", str(folder), "--yes", "--cell"]
+    assert main([*command, str(rig.cell_file)]) == ExitCode.OK
+    other = rig.cell_file.with_name("another.yaml")
+    shutil.copyfile(rig.cell_file, other)
+    before = (folder / f"{NAME}.service").read_bytes()
+    capsys.readouterr()
+    assert main([*command, str(other)]) == ExitCode.USAGE
+    assert "the unit of another cell file" in capsys.readouterr().err
+    assert (folder / f"{NAME}.service").read_bytes() == before
+    (folder / f"{NAME}.service").unlink()
+    os.mkfifo(folder / f"{NAME}.service")
+    assert main([*command, str(rig.cell_file)]) == ExitCode.USAGE
+    assert "did not make" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("schedule", ["", "  ", "weekly\nPersistent=true"])
+def test_a_schedule_that_no_line_can_say_is_refused(
+    rig: Rig, tmp_path: Path, schedule: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(tmp_path / "units"), "--schedule", schedule]
+    assert main([*command, "--yes"]) == ExitCode.USAGE
+    assert "--schedule" in capsys.readouterr().err
+    assert not (tmp_path / "units").exists()
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this computer")
+def test_systemd_reads_the_schedule_before_it_is_written(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "every sunday"]) == ExitCode.USAGE
+    assert "calendar" in capsys.readouterr().err
+    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK

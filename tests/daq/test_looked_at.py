@@ -1,0 +1,108 @@
+"""What --base says: the change that somebody has looked at, of a file or of the drives, and no other."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.calibration_file import encode
+from daq.cli.applier import Applier
+from daq.cli.apply_drives import apply_drives
+from daq.configuration.cell import Bus, Cell
+from daq.errors import CalibrationRefused, UsageError
+from daq.write_back.looked_at import LookedAt, change_of, look, other_change
+from drivers.bus import BusAddress
+from drivers.parameter_write import Saving
+from drivers.simulated.cell import SimulatedCell
+from ident.calibration import Calibration
+from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
+from tests.daq.drives import demo_cell, entered_gain, simulated
+
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+DOER = Applier("Kim", "kim")
+
+
+@given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
+def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
+    looked = look(f" {change_of(before, after).upper()}\n", before)
+    assert looked.base_sha256 == hashlib.sha256(before).hexdigest()
+    assert other_change(looked, "x", before, after) == ()
+    assert bool(other_change(looked, "x", before, another)) == (another != after)
+    assert (look(change_of(another, after), before).base_sha256 == looked.base_sha256) == (another == before)
+
+
+def test_the_whole_digest_alone_names_no_change() -> None:
+    digest = hashlib.sha256(b"old").hexdigest()
+    looked = look(digest, b"old")
+    assert looked == LookedAt(digest, None)
+    assert other_change(looked, "x", b"old", b"whatever") == ()
+    assert look(None, b"old") == LookedAt(None, None)
+
+
+@pytest.mark.parametrize("told", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
+def test_what_is_no_digest_is_refused(told: str) -> None:
+    with pytest.raises(UsageError, match="12 digits, a hyphen, 12 digits"):
+        look(told, b"old")
+
+
+@pytest.fixture
+def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
+    """The demo cell on a bus of this test's own."""
+    declared = demo_cell(tmp_path)
+    bus = Bus("the bus", "virtual", request.node.name, 1_000_000, "127.0.0.1", 29536)
+    return replace(
+        declared, folder=tmp_path, buses=(bus,), axes=tuple(replace(axis, bus="the bus") for axis in declared.axes)
+    )
+
+
+@pytest.fixture
+def simulation(cell: Cell) -> Iterator[SimulatedCell]:
+    """Its drives."""
+    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+        yield running
+
+
+def _apply(cell: Cell, calibration: Calibration, *, base: str | None, yes: bool) -> None:
+    assert cell.history is not None
+    apply_drives(
+        cell,
+        Path("cells/demo.yaml"),
+        calibration,
+        now=NOW,
+        doer=DOER,
+        policy=cell.apply,
+        configuration_changed=True,
+        entered_kg={},
+        looked_at=base,
+        appliers=DOER.names,
+        calibration_file=Path("calibration.yaml"),
+        calibration_content=encode(calibration),
+        saving=Saving.KNOWN,
+        audit=cell.history.audit,
+        yes=yes,
+        json=False,
+    )
+
+
+def test_the_drives_get_the_change_that_was_looked_at_and_no_other(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = demo_calibration()
+    _apply(cell, calibration, base=None, yes=False)
+    base = capsys.readouterr().out.split("--base ")[1].split(maxsplit=1)[0]
+    moved = replace(calibration.gains[3], value=calibration.gains[3].value * 1.01)
+    another = replace(calibration, gains=(*calibration.gains[:3], moved, *calibration.gains[4:]))
+    with pytest.raises(CalibrationRefused, match="have changed since the dry run"):
+        _apply(cell, another, base=base, yes=True)
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    _apply(cell, calibration, base=base, yes=True)
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
+    with pytest.raises(CalibrationRefused, match="as --base says"):
+        _apply(cell, another, base=base, yes=True)
