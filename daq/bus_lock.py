@@ -9,9 +9,11 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import socket
 import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from ipaddress import ip_address
 from pathlib import Path
 
 from daq.configuration.cell import Bus, Cell
@@ -34,7 +36,7 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
 
     Raises:
         BusTaken: another recording or job has one of them.
-        OutputFailed: the lock file cannot be made.
+        OutputFailed: the lock file cannot be made, or something else is there.
     """
     where = folder or _shared_folder()
     # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
@@ -46,13 +48,24 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
 
 
 def lock_name(bus: Bus) -> str:
-    """Of a bus's lock file: by its interface and channel, and of a hub by its host and port."""
+    """Of a bus's lock file: by its interface and channel, and of a hub by its host's address and its port."""
     parts = [bus.interface, bus.channel]
     if bus.interface == "socketcand":
-        parts += [bus.host, str(bus.port)]
+        parts += [_address(bus), str(bus.port)]
     elif bus.interface == VIRTUAL:
         parts.append(str(os.getpid()))
     return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
+
+
+def _address(bus: Bus) -> str:
+    """One for all names of a host; its name where nobody knows an address, since then nobody reaches it either."""
+    try:
+        found = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return bus.host.lower()
+    # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
+    _, address = min((family is not socket.AF_INET, str(where[0])) for family, _, _, _, where in found)
+    return "localhost" if ip_address(address).is_loopback else address
 
 
 def _shared_folder() -> Path:
@@ -72,6 +85,7 @@ def _held(lock: Path, bus: Bus) -> Iterator[None]:
         except OSError as error:
             raise OutputFailed.of(lock, error) from error
         try:
+            _check_regular(descriptor, lock)
             _take(descriptor, lock, bus)
             if _is_at(descriptor, lock):
                 try:
@@ -89,12 +103,23 @@ def _open(lock: Path) -> int:
     """To read is enough to lock; and to open another user's file in a shared folder, O_CREAT must not be asked for."""
     while True:
         with suppress(FileNotFoundError):
-            return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+            # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
+            return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
         with suppress(FileExistsError):
             made = os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
             # Whatever the umask says: who cannot open it would not learn that the bus is taken.
             os.fchmod(made, MODE)
             return made
+
+
+def _check_regular(descriptor: int, lock: Path) -> None:
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        raise OutputFailed(
+            str(lock),
+            found="something that is no regular file",
+            expected="the lock file of the bus, or none",
+            remedy="nothing has moved; see who has put it there, and remove it",
+        )
 
 
 def _take(descriptor: int, lock: Path, bus: Bus) -> None:

@@ -101,7 +101,7 @@ def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Chec
 
     Raises as `daq.write_back.audit.verify` and the store.
     """
-    past = () if cell.recalibration is None else sessions(cell.recalibration.folder)
+    past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
     ends = [session.state.audit_sha256 for session in past]
     heads = store.audited().union(end for end in ends if end is not None)
     return Checked(place.audit, place.store, verify(place.audit, heads), store.integrity())

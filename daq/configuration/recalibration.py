@@ -14,6 +14,7 @@ Argument = Annotated[str, Field(max_length=4000, pattern=r"^[^\x00]+$")]
 FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 RunName = Annotated[str, Field(max_length=40, pattern=r"^[a-z0-9][a-z0-9_-]*$")]
 Seconds = Annotated[float, Field(gt=0, le=24 * 3600)]
+Hours = Annotated[float, Field(ge=0, le=100_000)]
 NotNegative = Annotated[float, Field(ge=0)]
 RESERVED = ("warm-up",)
 """Names of logs that are no run of the fit."""
@@ -181,14 +182,14 @@ class RunModel(StrictModel):
 class RecalibrationModel(StrictModel):
     """`recalibration`; names of files are relative to the cell file (docs/recalibration.md has an example)."""
 
-    folder: FileName = "recalibration"
+    folder: FileName | None = None
     runs: Annotated[tuple[RunModel, ...], Field(min_length=3, max_length=100)]
     interlock: InterlockModel
     mount: CommandModel
     warm_up_min: Annotated[float, Field(ge=0, le=240)] = 10.0
-    every_h: NotNegative = 144.0
+    every_h: Hours = 144.0
     max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0
-    resume_within_h: NotNegative = 12.0
+    resume_within_h: Hours = 12.0
     retries: Annotated[int, Field(ge=0, le=5)] = 1
     min_free_mb: NotNegative = 1000.0
     keep_sessions: Annotated[int, Field(ge=1)] = 20
@@ -211,7 +212,8 @@ class RecalibrationModel(StrictModel):
         """With absolute paths."""
         folder = cell_file.parent
         return Recalibration(
-            folder=(folder / self.folder).resolve(),
+            # Of the cell file's name, as its history: two cells in one folder have sessions of their own.
+            folder=(folder / (self.folder or f"{cell_file.stem}.recalibration")).resolve(),
             runs=tuple(run.run(folder) for run in self.runs),
             interlock=self.interlock.interlock(folder),
             mount=Command(self.mount.command, self.mount.timeout_s),

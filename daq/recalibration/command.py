@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import selectors
 import signal
 import subprocess
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,6 +16,9 @@ from daq.configuration.recalibration import Command
 
 TOLD = 400
 """Characters of what a program said that are shown."""
+_KEPT_BYTES = 4 * TOLD
+"""As many as those characters may take in UTF-8."""
+_READ_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +66,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
         return Finished(None, f"{command.arguments[0]}: {(error.strerror or type(error).__name__).lower()}")
     with process:
         try:
-            said, _ = process.communicate(timeout=command.timeout_s)
+            said = _said(process, command.timeout_s)
         except subprocess.TimeoutExpired:
             _end(process)
             return Finished(None, f"not ended within {command.timeout_s:g} s")
@@ -69,6 +74,27 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             _end(process)
             raise
     return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-TOLD:])
+
+
+def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
+    """The end of what a program says until it has ended; the rest of it is read, and not kept.
+
+    Raises:
+        subprocess.TimeoutExpired: it takes longer.
+    """
+    assert process.stdout is not None
+    ends_s, said = time.monotonic() + timeout_s, b""
+    with selectors.DefaultSelector() as output:
+        output.register(process.stdout, selectors.EVENT_READ)
+        while (left_s := ends_s - time.monotonic()) > 0:
+            if not output.select(left_s):
+                continue
+            piece = os.read(process.stdout.fileno(), _READ_BYTES)
+            if not piece:
+                process.wait(max(0.0, ends_s - time.monotonic()))
+                return said
+            said = (said + piece)[-_KEPT_BYTES:]
+    raise subprocess.TimeoutExpired(process.args, timeout_s)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

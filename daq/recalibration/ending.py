@@ -121,7 +121,8 @@ class Ending:
             # What a controller rests on is not known: nothing of it may go.
             self.journal.say(Level.WARNING, "no old session removed", text=str(error))
             return
-        for folder in sessions.remove_old(sessions.sessions(self.section.folder), self.section.keep_sessions, in_force):
+        found = sessions.sessions(self.section.folder, self.cell.name)
+        for folder in sessions.remove_old(found, self.section.keep_sessions, in_force):
             self.journal.say(Level.INFO, "old session removed", folder=str(folder))
 
     def _write_summary(self, conclusion: Conclusion) -> None:
@@ -140,7 +141,7 @@ class Ending:
     def _write_metrics(self, conclusion: Conclusion, now: datetime) -> None:
         if self.section.metrics is None:
             return
-        good = sessions.last_good(sessions.sessions(self.section.folder))
+        good = sessions.last_good(sessions.sessions(self.section.folder, self.cell.name))
         shown = conclusion.session
         calibration = None if shown is None else calibration_of_session(shown)
         if calibration is None and good is not None:

@@ -55,12 +55,12 @@ def recalibrate(
             file stands as it was, and audit, state, metrics and summary tell of it.
     """
     section, target = section_of(cell), target_of(cell)
-    if (early := _not_due(section, tools.now())) is not None:
+    if (early := _not_due(section, cell, tools.now())) is not None:
         journal.say(Level.INFO, "not due", remark=early.remark)
         return early
     with bus_lock(cell, lock_folder):
         # Another job may have ended between the question and the lock.
-        if (early := _not_due(section, tools.now())) is not None:
+        if (early := _not_due(section, cell, tools.now())) is not None:
             return early
         began_s = tools.monotonic_s()
         session = _taken_up_or_new(section, cell, tools.now(), journal)
@@ -100,10 +100,10 @@ def preview(
     """
     section, target = section_of(cell), target_of(cell)
     now = tools.now()
-    if (early := _not_due(section, now)) is not None:
+    if (early := _not_due(section, cell, now)) is not None:
         return Preview((), early.remark)
     with bus_lock(cell, lock_folder):
-        found = sessions.sessions(section.folder)
+        found = sessions.sessions(section.folder, cell.name)
         session = sessions.to_take_up(found, basis_of(cell, section), now, section.resume_within_h)
         made = () if session is None else tuple(run.name for run in standing_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
@@ -135,9 +135,9 @@ def _go(side: Cellside, session: Session, journal: Journal) -> Session:
         return settle(side, session, calibration, past, journal.within(step="decide"))
 
 
-def _not_due(section: Recalibration, now: datetime) -> Conclusion | None:
+def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
     """Also the place where a clock that went back is noticed: every age hangs on it."""
-    found = sessions.sessions(section.folder)
+    found = sessions.sessions(section.folder, cell.name)
     require_clock(found, now)
     left = due_in(found, section.every_h, now)
     good = sessions.last_good(found)
@@ -149,7 +149,7 @@ def _not_due(section: Recalibration, now: datetime) -> Conclusion | None:
 
 
 def _taken_up_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
-    found, basis = sessions.sessions(section.folder), basis_of(cell, section)
+    found, basis = sessions.sessions(section.folder, cell.name), basis_of(cell, section)
     session = sessions.to_take_up(found, basis, now, section.resume_within_h)
     if session is None:
         session = sessions.begin(section.folder, basis, now)

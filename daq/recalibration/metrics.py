@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -72,7 +73,7 @@ def write_metrics(figures: Figures, folder: Path) -> Path:
     Raises:
         OutputFailed: the file system refuses.
     """
-    path = folder / f"drivegain_{re.sub(r'[^A-Za-z0-9]+', '_', figures.cell)}.prom"
+    path = folder / f"drivegain_{file_stem(figures.cell)}.prom"
     try:
         write_to_textfile(str(path), registry_of(figures))
         # The collector is another user, and a service's umask may be strict.
@@ -80,6 +81,12 @@ def write_metrics(figures: Figures, folder: Path) -> Path:
     except OSError as error:
         raise OutputFailed.of(path, error) from error
     return path
+
+
+def file_stem(cell: str) -> str:
+    """A cell's name as a file's; with six digits of its hash where letters were lost that may tell two cells apart."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", cell)
+    return plain if plain == cell else f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
 
 
 def _tell_session(gauge: _Gauges, state: SessionState, cell: str) -> None:

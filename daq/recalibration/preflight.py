@@ -82,13 +82,14 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
     Raises:
         ClockWentBack: the clock is behind the newest session.
     """
-    latest = max((session.last_written for session in found), default=now)
-    if now < latest - CLOCK_SLACK:
+    last = max(found, key=lambda session: session.last_written, default=None)
+    if last is not None and now + CLOCK_SLACK < last.last_written:
         raise ClockWentBack(
             "the clock of this computer",
             found=now.isoformat(timespec="seconds"),
-            expected=f"a time after {latest.isoformat(timespec='seconds')}, when the last session was written",
-            remedy="set the clock (`timedatectl`); ages, history and audit would be in the wrong order",
+            expected=f"a time after {last.last_written.isoformat(timespec='seconds')}, which stands in {last.folder}",
+            remedy="set the clock (`timedatectl`), or where it is right, move that folder away: it was made by a wrong "
+            "one; ages, history and audit would be in the wrong order",
         )
 
 
@@ -117,7 +118,7 @@ def before_motion(side: Cellside, journal: Journal) -> None:
             expected=f"{section.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
-    require_release(section.interlock, side.tools.run, side.tools.now(), section.working_folder)
+    require_release(section.interlock, side.tools.run, side.tools.now, section.working_folder)
     journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
     side.tools.drives(side.cell, side.undisturbed)
     journal.say(Level.INFO, "drives are as declared, without fault and without power")

@@ -173,7 +173,7 @@ def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recor
     """One recording. The interlock is asked before the drives are, and again right before they get power."""
 
     def released() -> None:
-        require_release(side.section.interlock, side.tools.run, side.tools.now(), side.section.working_folder)
+        require_release(side.section.interlock, side.tools.run, side.tools.now, side.section.working_folder)
 
     released()
     return side.tools.record(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import stat
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -15,13 +17,13 @@ NOTHING = "none"
 _LOOK_BYTES = 4096
 
 
-def require_release(interlock: Interlock, run: Runner, now: datetime, folder: Path) -> None:
+def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path) -> None:
     """Go on only where the interlock says so; a program that cannot run and a file that cannot be read say no.
 
     Args:
         interlock: of the cell.
         run: runs its command.
-        now: wall clock, against which the file's age is counted.
+        now: wall clock, asked when the file is: the command before it may take its time.
         folder: in which the command runs.
 
     Raises:
@@ -52,19 +54,26 @@ def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
         )
 
 
-def _require_file(file: InterlockFile, now: datetime) -> None:
+def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
     subject = f"interlock file {file.path}"
     expected = f"{file.says!r} in its first line, written within the last {file.max_age_s:g} s"
     try:
-        with file.path.open("rb") as stream:
+        # A FIFO of that name must not keep us waiting for its other end.
+        descriptor = os.open(file.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
             # Of the file that is open: a gateway may put another in its place meanwhile.
-            stat, head = os.fstat(stream.fileno()), stream.read(_LOOK_BYTES)
+            found, asked = os.fstat(descriptor), now()
+            if not stat.S_ISREG(found.st_mode):
+                raise _held(subject, "no regular file", expected)
+            head = os.read(descriptor, _LOOK_BYTES)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
     if says != file.says:
         raise _held(subject, repr(says[:80]), expected)
-    age_s = now.timestamp() - stat.st_mtime
+    age_s = asked.timestamp() - found.st_mtime
     # One from the future is of another clock: how old it is, nobody knows.
     if not -file.max_age_s <= age_s <= file.max_age_s:
         raise _held(subject, f"an age of {age_s:.0f} s", expected)

@@ -78,7 +78,7 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     session, outcome = conclusion.session, conclusion.outcome
     if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
         calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file))
-        base = session.state.target.base_sha256
+        base = f"{session.state.target.base_sha256[:12]}-{session.state.target.after_sha256[:12]}"
         return [
             f"drivegain apply {calibration} --cell {cell}",
             "look at the change, and if it is right, write it:",

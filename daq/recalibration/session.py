@@ -167,16 +167,21 @@ class Session:
     @property
     def last_written(self) -> datetime:
         """The latest time in its state."""
-        return datetime.fromisoformat(self.state.ended or self.state.attempt_began)
+        return max(_times(self.state))
 
 
-def sessions(folder: Path) -> tuple[Session, ...]:
-    """All sessions in a folder, oldest first; what has no readable state is none."""
+def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
+    """Sessions in a folder, oldest first; what has no readable state is none.
+
+    Args:
+        folder: where they are.
+        cell: name of the cell whose they are, since several may keep theirs in one folder; None for all of them.
+    """
     found: list[Session] = []
     with suppress(FileNotFoundError):
         folders = [entry for entry in folder.iterdir() if _NAME.fullmatch(entry.name)]
         read = ((entry, _read(entry / STATE)) for entry in folders)
-        found = [Session(entry, state) for entry, state in read if state is not None]
+        found = [Session(entry, state) for entry, state in read if state is not None and cell in (None, state.cell)]
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
 
 
@@ -287,6 +292,12 @@ def digest_of(path: Path) -> str | None:
 def _read(path: Path) -> SessionState | None:
     with suppress(OSError, ValidationError, ValueError):
         state = SessionState.model_validate_json(path.read_bytes())
-        datetime.fromisoformat(state.began)
-        return state
+        # Ages are counted from them, so each must be a time, and of a known zone.
+        if all(time.utcoffset() is not None for time in _times(state)):
+            return state
     return None
+
+
+def _times(state: SessionState) -> list[datetime]:
+    told = (state.began, state.attempt_began, state.ended)
+    return [datetime.fromisoformat(time) for time in told if time is not None]

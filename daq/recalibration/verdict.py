@@ -19,12 +19,14 @@ from daq.recalibration.recording import Cellside
 from daq.recalibration.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, digest_of
 from daq.write_back.apply import Proposal
 from daq.write_back.audit import AuditAction, append
+from daq.write_back.audit import read as read_audit
 from daq.write_back.controller_write import Written, sha256
 from daq.write_back.gates import Gate
 from daq.write_back.link import followed
 from ident.calibration import Calibration
 from ident.drift import FALSE_ALARM, decide
 
+TOUCHED = "The controller's file was written or rolled back since the session began: a person decides."
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
 
 
@@ -42,6 +44,9 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
     content = read(path)
     proposal = side.tools.propose(side.cell, calibration, now=now, calibration_file=path, calibration_content=content)
     decision = judge(proposal, calibration, past)
+    differs, touched = any(gain.differs for gain in decision.gains), _written_since(side, session)
+    if differs and touched:
+        decision = decision.model_copy(update={"remark": f"{decision.remark} {TOUCHED}"})
     journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(proposal.after_content)
     target = Target(file=str(proposal.file), base_sha256=proposal.base_sha256, after_sha256=after)
@@ -54,9 +59,9 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
             journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
         sessions.save(_with_outcome(session, Outcome.REFUSED))
         _apply(side, proposal, now)  # which refuses it, and writes that down
-    if proposal.after_content == proposal.before_content or not any(gain.differs for gain in decision.gains):
+    if proposal.after_content == proposal.before_content or not differs:
         return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
-    if proposal.refusals or by_a_person(side):
+    if proposal.refusals or by_a_person(side) or touched:
         _propose(side, session, target, journal)
         return sessions.save(_with_outcome(session, Outcome.PROPOSED))
     written = _apply(side, proposal, now)
@@ -125,6 +130,24 @@ def _written_before(session: Session, past: Past, journal: Journal) -> Session:
     journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
     past.note_applied()
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
+
+
+def _written_since(side: Cellside, session: Session) -> bool:
+    """Whether the audit tells of a write of the controller's file, or of a way back, since the session began.
+
+    An earlier job of it may have been killed right behind its write, and a person may have rolled that back since: the
+    file is then what it was before, and the job must not do again what the person has undone.
+    """
+    entries = read_audit(side.target.history.audit)
+    begun = [
+        index
+        for index, entry in enumerate(entries)
+        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
+    ]
+    file = str(followed(side.target.file))
+    ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
+    # Of an audit that does not know the begin, all of it is later: the part that knew it was moved away.
+    return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
 
 
 def _propose(side: Cellside, session: Session, target: Target, journal: Journal) -> None:

@@ -112,7 +112,7 @@ class Rig:
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        return sessions(self.cells / "recalibration")
+        return sessions(self.cells / "demo.recalibration", "demo")
 
     @property
     def session(self) -> Session:

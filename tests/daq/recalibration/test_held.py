@@ -6,6 +6,8 @@ import json
 import os
 import select
 import signal
+import socket
+import tracemalloc
 from contextlib import suppress
 from dataclasses import replace
 from datetime import timedelta
@@ -14,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from daq.bus_lock import bus_lock
+from daq.bus_lock import bus_lock, lock_name
 from daq.cli.interrupt import interruptible
 from daq.configuration.recalibration import Command, Interlock, InterlockFile
 from daq.errors import (
@@ -25,10 +27,11 @@ from daq.errors import (
     ExitCode,
     MountFailed,
     NotReleased,
+    OutputFailed,
     TimeBoundReached,
     exit_code,
 )
-from daq.recalibration.command import Finished, run_command
+from daq.recalibration.command import TOLD, Finished, run_command
 from daq.recalibration.job import preview
 from daq.recalibration.journal import Form, Journal
 from daq.recalibration.preflight import section_of
@@ -179,6 +182,37 @@ def test_another_user_learns_that_a_bus_is_taken_whatever_our_umask_is(tmp_path:
         os.umask(before)
 
 
+def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    (bus,) = rig.cell.buses
+    os.mkfifo(rig.folder / lock_name(bus))
+    with pytest.raises(OutputFailed, match="no regular file"), bus_lock(rig.cell, rig.folder):
+        pass
+    assert (rig.folder / lock_name(bus)).is_fifo()
+
+
+def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    known = {"hub": ["fd00::7", "10.0.0.9", "10.0.0.7"], "hub.lan": ["10.0.0.7", "10.0.0.9"], "other": ["10.0.0.8"]}
+    known |= {"localhost": ["::1", "127.0.0.1"], "127.0.0.1": ["127.0.0.1"], "::1": ["::1"]}
+
+    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
+        if host not in known:
+            raise socket.gaierror(-2, "Name or service not known")
+        kinds = [socket.AF_INET6 if ":" in one else socket.AF_INET for one in known[host]]
+        return [(kind, 1, 6, "", (one, port)) for kind, one in zip(kinds, known[host], strict=True)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", addresses)
+
+    def name(host: str) -> str:
+        return lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
+
+    assert name("hub") == name("hub.lan") == "drivegain-socketcand-can0-10.0.0.7-29536.lock"
+    assert name("localhost") == name("127.0.0.1") == name("::1") != name("hub")
+    assert name("other") != name("hub")
+    assert name("Nowhere") == name("nowhere") == "drivegain-socketcand-can0-nowhere-29536.lock"
+
+
 def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
     rig = make_rig(tmp_path / "cell", one_move)
     powered = []
@@ -299,7 +333,7 @@ def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
 
     def ask(code: int | None = 0, later_s: float = 0.0) -> None:
         now = BEGAN + timedelta(seconds=later_s)
-        require_release(interlock, lambda *_: Finished(code, "said"), now, tmp_path)
+        require_release(interlock, lambda *_: Finished(code, "said"), lambda: now, tmp_path)
 
     with pytest.raises(NotReleased, match="no such file"):
         ask()
@@ -318,6 +352,48 @@ def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
         os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
         with pytest.raises(NotReleased, match="in its first line"):
             ask()
+
+
+def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path) -> None:
+    """A command that takes 9 s of a file's 5: the file was fresh when the command was asked, and is not any more."""
+    path = tmp_path / "interlock"
+    path.write_text("closed\n")
+    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    at = [BEGAN]
+
+    def slow(*_: object) -> Finished:
+        at[0] += timedelta(seconds=9)
+        return Finished(0, "")
+
+    interlock = Interlock(Command(("some", "program"), 10.0), InterlockFile(path, "closed", 5.0))
+    with pytest.raises(NotReleased, match="an age of 9 s"):
+        require_release(interlock, slow, lambda: at[0], tmp_path)
+
+
+def test_an_interlock_that_is_no_file_says_no_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", tmp_path, Path(os.devnull)):
+        interlock = Interlock(None, InterlockFile(path, "closed", 5.0))
+        with pytest.raises(NotReleased, match=r"no regular file|is a directory"):
+            require_release(interlock, run_command, lambda: BEGAN, tmp_path)
+
+
+def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Path) -> None:
+    much = "i=0; while [ $i -lt 2000 ]; do printf '%01000d' 0; i=$((i+1)); done; echo; echo the end; exit 3"
+    tracemalloc.start()
+    try:
+        ended = run_command(Command(("sh", "-c", much), 60.0), (), tmp_path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert ended.code == 3
+    assert ended.said.endswith("0\nthe end")
+    assert len(ended.said) == TOLD
+    assert peak < 1_000_000
+    endless = run_command(Command(("yes",), 0.2), (), tmp_path)
+    assert endless == Finished(None, "not ended within 0.2 s")
+    silent = run_command(Command(("sh", "-c", "exec >&- 2>&-; sleep 60"), 0.2), (), tmp_path)
+    assert silent == Finished(None, "not ended within 0.2 s")
 
 
 def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -76,9 +76,9 @@ def figures(outcome: Outcome) -> Figures:
 
 
 def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: Path) -> None:
-    (tmp_path / "drivegain_the_cell_.prom").write_text("half of a fi")
+    (tmp_path / "drivegain_the_cell__e183a8.prom").write_text("half of a fi")
     path = write_metrics(figures(Outcome.STOPPED), tmp_path)
-    assert path.name == "drivegain_the_cell_.prom"
+    assert path.name == "drivegain_the_cell__e183a8.prom"
     assert path.stat().st_mode & 0o777 == 0o644
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     families = {family.name: family for family in text_string_to_metric_families(path.read_text())}

@@ -13,10 +13,12 @@ from typing import Any
 
 import pytest
 
+from daq.errors import ExitCode
 from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
 from daq.recalibration.tools import Tools
 from daq.write_back.audit import AuditAction
+from daq.write_back.controller_write import roll_back
 from tests.daq.recalibration.made import Made, made_rig
 from tests.daq.recalibration.rig import Rig
 
@@ -128,6 +130,32 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
     if whole != before:
         assert rig.controller.read_bytes() == whole
     applied_once(rig)
+
+
+@pytest.mark.parametrize("way", ["rollback", "cp", "edited"])
+def test_what_a_person_took_back_behind_a_killed_write_is_not_written_again(
+    tmp_path: Path, made: Made, calls: list[str], way: str
+) -> None:
+    """The file is as it was before the write; only the audit knows that there was one."""
+    rig = made_rig(tmp_path / "cell", made)
+    killed_job(rig, Kill(calls.index("apply"), behind=True))
+    assert rig.session.state.outcome is None
+    (backup,) = rig.backups
+    if way == "rollback":
+        roll_back(rig.controller, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="a person")
+    else:
+        shutil.copyfile(backup, rig.controller)
+    if way == "edited":
+        rig.controller.write_text(rig.controller.read_text() + "\n# looked at\n")
+    taken_back = rig.controller.read_bytes()
+    rig.clock.go_on(minutes=10)
+    ended = rig.job()
+    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert "rolled back since the session began" in ended.remark
+    assert rig.controller.read_bytes() == taken_back
+    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
+    assert rig.job().outcome is Outcome.NOT_DUE
+    assert rig.controller.read_bytes() == taken_back
 
 
 def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:

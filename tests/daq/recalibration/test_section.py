@@ -80,7 +80,7 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
     assert section.interlock.file is not None
     assert section.interlock.file.path == (file.parent / "state" / "interlock").resolve()
     assert section.metrics == (file.parent.parent / "metrics").resolve()
-    assert section.folder == (file.parent / "recalibration").resolve()
+    assert section.folder == (file.parent / "demo.recalibration").resolve()
 
 
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
