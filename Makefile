@@ -55,7 +55,7 @@ demo: setup
 	$(BIN)/drivegain demo --out out/demo
 
 test: check
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 test-vcan: setup vcan-tools
 	@if command -v npm >/dev/null; then npm ci --prefix tests/vcan/foreign --no-audit --no-fund; \

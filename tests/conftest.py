@@ -19,6 +19,15 @@ settings.load_profile("drivegain")
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 
+LONG = ("test_guide.py", "test_main_job.py", "test_any_robot.py")
+"""Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes long begins first."""
+    items.sort(key=lambda item: item.path.name not in LONG)
+
+
 @pytest.fixture(scope="session")
 def checkout() -> Path:
     """The folder of the checkout."""
