@@ -17,6 +17,7 @@ import pytest
 import yaml
 
 from daq.cli.app import main
+from daq.configuration.cell_file import load_cell
 from daq.configuration.simulation import load_simulation
 from daq.conversion import load_run
 from daq.errors import ClockImplausible, ExitCode
@@ -85,7 +86,8 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
         name = payload or "bare"
         with simulated(simulation, payload):
             nodes = _say("scan", str(cell))["nodes"]
-            mounted = [] if payload is None else ["--payload", payload]
+            mass = str(load_cell(cell).payloads[0].mass_kg)
+            mounted = [] if payload is None else ["--payload", payload, "--mass", mass]
             moving = ["--enable-motion", "--operator", "test", *mounted]
             gc.collect()
             gc.freeze()  # what pytest and the fit hold is not searched while SYNC waits
