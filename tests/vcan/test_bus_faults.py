@@ -23,6 +23,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
+from daq.log.losses import tells_losses_alone
 from daq.log.reader import Log, read_log
 from drivers.event import EventKind
 from drivers.state import State, decode
@@ -30,9 +31,10 @@ from tests.faults.test_scenario import PLAN
 from tests.vcan.cells import simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE
 
-PERIOD_US = 10_000
+PERIOD_US = 40_000
+"""Two capture processes, the recorder, the cell and the wire between them share the one processor of the guest."""
 STRIKE = 20
-"""SYNCs after the first set-point; the move takes some two hundred."""
+"""SYNCs after the first set-point; the move takes some fifty."""
 PATIENCE_S = 120.0
 NODES = range(1, 7)
 SYNC, RPDO, SDO_REQUEST, SDO_ANSWER = 0x080, 0x200, 0x600, 0x580
@@ -229,8 +231,10 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
 
 def test_error_passive_is_told_and_the_run_goes_on(tmp_path: Path, figure: Callable[[str], None]) -> None:
     ended = record(tmp_path, error_passive)
-    # A frame lost on the way makes the run unfit, and ends nothing early.
-    assert ended.code in (ExitCode.OK, ExitCode.DATA_UNFIT), ended.told
+    # The run goes on to its end; a frame that was lost on the way makes it unfit, and nothing else may.
+    counted = ended.log.statistics
+    assert ended.code == (ExitCode.OK if counted.valid else ExitCode.DATA_UNFIT), ended.told
+    assert counted.valid or tells_losses_alone(counted.reason), counted.reason
     told = [event for event in ended.log.events if event.kind is EventKind.BUS_PASSIVE]
     assert len(told) == 1
     assert "error passive" in told[0].text

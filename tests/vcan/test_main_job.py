@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import gc
-import io
-import json
 import re
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,18 +13,15 @@ from typing import Any
 import pytest
 import yaml
 
-from daq.cli.app import main
 from daq.configuration.cell_file import load_cell
 from daq.configuration.simulation import load_simulation
 from daq.conversion import load_run
-from daq.errors import ClockImplausible, ExitCode
-from tests.vcan.cells import simulated, write_cell, write_simulation
+from daq.errors import ClockImplausible
+from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
 
-PERIOD_US = 10_000
+PERIOD_US = 20_000
 SECONDS = 12
 PAYLOAD = "disc"
-ATTEMPTS = 5
-"""A guest on a busy host may send SYNC late; such a run is marked invalid, and one records again."""
 SIGMAS = 4.0
 """Six gains are each tried; one of them lies beyond this by chance once in 2600 times."""
 
@@ -51,16 +45,6 @@ class Job:
     truth: dict[str, float]
 
 
-def _say(*arguments: str) -> dict[str, Any]:
-    with redirect_stdout(io.StringIO()) as out:
-        code = main([*arguments, "--json"])
-    # A recording with losses is told of and tried again; whoever calls this looks at its "valid".
-    fine = (ExitCode.OK, ExitCode.DATA_UNFIT) if arguments[0] == "record" else (ExitCode.OK,)
-    assert code in fine, f"drivegain {' '.join(arguments)} ended with {code}"
-    document: dict[str, Any] = json.loads(out.getvalue())
-    return document
-
-
 def _in_time(log: Path) -> bool:
     """A step that is off by half a period is refused by the fit: then too, one records again."""
     try:
@@ -78,29 +62,29 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
     plan, calibration = folder / "plan.yaml", folder / "calibration.yaml"
     started = time.monotonic()
     arguments = ["--duration", str(SECONDS), "--exchanges", "5", "--seed", "3", "--condition", "1e6"]
-    _say("plan", str(cell), "--out", str(plan), *arguments)
+    say("plan", str(cell), "--out", str(plan), *arguments)
     planned = time.monotonic()
     recorded: dict[str, dict[str, Any]] = {}
     nodes: list[dict[str, Any]] = []
     for payload in (None, PAYLOAD):
         name = payload or "bare"
         with simulated(simulation, payload):
-            nodes = _say("scan", str(cell))["nodes"]
+            nodes = say("scan", str(cell))["nodes"]
             mass = str(load_cell(cell).payloads[0].mass_kg)
             mounted = [] if payload is None else ["--payload", payload, "--mass", mass]
-            moving = ["--enable-motion", "--operator", "test", *mounted]
             gc.collect()
             gc.freeze()  # what pytest and the fit hold is not searched while SYNC waits
             for attempt in range(1, ATTEMPTS + 1):
                 log = folder / f"{name}-{attempt}.mcap"
                 begun = time.monotonic()
-                one = _say("record", str(cell), str(plan), "--out", str(log), *moving)
+                one = record_once(cell, plan, log, *mounted)
                 recorded[name] = {**one, "seconds": time.monotonic() - begun, "attempt": attempt}
                 if one["valid"] and _in_time(log):
                     break
+            assert one["valid"], f"{name}: {one['reason']}"
     fitting = time.monotonic()
     logs = [str(one["log"]) for one in recorded.values()]
-    fitted = _say("fit", *logs, "--out", str(calibration))
+    fitted = say("fit", *logs, "--out", str(calibration))
     figure(f"plan {planned - started:.1f} s, fit {time.monotonic() - fitting:.1f} s")
     for name, one in recorded.items():
         rate = 7 * one["samples"] / one["seconds"]
@@ -141,9 +125,9 @@ def test_the_gains_are_written_into_the_controllers_file(job: Job) -> None:
     calibration, cell = str(job.folder / "calibration.yaml"), str(job.folder / "cell.yaml")
     controller = job.folder / "controller.yaml"
     before = controller.read_text(encoding="utf-8")
-    _say("apply", calibration, "--cell", cell)
+    say("apply", calibration, "--cell", cell)
     assert controller.read_text(encoding="utf-8") == before
-    _say("apply", calibration, "--cell", cell, "--yes")
+    say("apply", calibration, "--cell", cell, "--yes")
     after = controller.read_text(encoding="utf-8")
     drives = yaml.safe_load(after)["drives"]
     for gain in job.fitted["gains"]:

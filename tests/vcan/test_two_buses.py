@@ -2,33 +2,25 @@
 
 from __future__ import annotations
 
-import io
-import json
 import socket
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import pytest
 
-from daq.cli.app import main
 from daq.configuration.cell_file import load_cell
-from daq.errors import ExitCode
 from daq.record import network_of
 from drivers.errors import BusError
 from tests.two_buses import LEFT, RIGHT, on_two_buses
-from tests.vcan.cells import simulated, write_cell, write_simulation
+from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE
 
-PERIOD_US = 20_000
+PERIOD_US = 40_000
 """Four capture processes, the recorder and the cell share the one processor of the guest."""
 SO_TIMESTAMPNS, SO_RCVBUFFORCE = 35, 33  # asm-generic/socket.h
-ATTEMPTS = 5
-"""A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the recorder, and the run is
-ended or marked invalid as at a real cell. One records again."""
 
 pytestmark = pytest.mark.skipif(
     not (Path("/sys/class/net") / SECOND_INTERFACE).exists(),
@@ -67,25 +59,6 @@ class SyncTimes:
             times.append(1_000_000_000 * seconds + nanoseconds)
 
 
-def _say(*arguments: str) -> dict[str, Any]:
-    with redirect_stdout(io.StringIO()) as out:
-        code = main([*arguments, "--json"])
-    assert code == ExitCode.OK, f"drivegain {' '.join(arguments)} ended with {code}"
-    document: dict[str, Any] = json.loads(out.getvalue())
-    return document
-
-
-def _record(cell: Path, plan: Path, log: Path) -> dict[str, Any]:
-    """What `record` said; a run that supervision ended is as invalid as one that is marked so."""
-    with redirect_stdout(io.StringIO()) as out:
-        code = main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion", "--json"])
-    if code == ExitCode.DEVICE_FAULT:
-        return {"valid": False, "reason": "ended by supervision, see above"}
-    assert code in (ExitCode.OK, ExitCode.DATA_UNFIT)
-    document: dict[str, Any] = json.loads(out.getvalue())
-    return document
-
-
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The cell file; its amplifiers serve in a process of their own."""
@@ -99,7 +72,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_scan_tells_the_bus_of_each_node(cell: Path) -> None:
-    found = [(node["bus"], node["node_id"], node["verdict"]) for node in _say("scan", str(cell))["nodes"]]
+    found = [(node["bus"], node["node_id"], node["verdict"]) for node in say("scan", str(cell))["nodes"]]
     assert found == [("left", node, "ok") for node in LEFT] + [("right", node, "ok") for node in RIGHT]
 
 
@@ -108,11 +81,11 @@ def test_a_run_is_complete_and_its_syncs_are_near_together(
 ) -> None:
     plan = tmp_path / "plan.yaml"
     how = ("--seed", "3", "--condition", "1e9", "--duration", "8", "--exchanges", "20")
-    _say("plan", str(cell), "--out", str(plan), *how)
+    say("plan", str(cell), "--out", str(plan), *how)
     with SyncTimes(INTERFACE) as left, SyncTimes(SECOND_INTERFACE) as right:
         for attempt in range(1, ATTEMPTS + 1):
             log = tmp_path / f"{attempt}.mcap"
-            done = _record(cell, plan, log)
+            done = record_once(cell, plan, log)
             syncs = left.taken(), right.taken()
             if done["valid"]:
                 break
