@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shlex
 from collections.abc import Sequence
@@ -24,8 +23,8 @@ from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.errors import CalibrationRefused, DaqError, OutputFailed, UsageError
+from daq.history.in_force import stds_in_force
 from daq.history.store import HistoryStore
-from daq.recalibration.past import Past
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
 from daq.write_back.audit import told_of
@@ -113,7 +112,7 @@ def apply_verb(
         calibration_file=calibration,
         calibration_content=content,
     )
-    stds = _stds_in_file(declared, proposal, now)
+    stds = _stds_in_file(declared, proposal)
     if not json:
         show(proposal, Console(), stds)
     try:
@@ -197,13 +196,14 @@ def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier)
         raise OutputFailed.of(proposal.file, error) from error
 
 
-def _stds_in_file(declared: Cell, proposal: Proposal, now: datetime) -> dict[str, float]:
+def _stds_in_file(declared: Cell, proposal: Proposal) -> dict[str, float]:
     """σ of the gains in the controller's file where the history knows it; a history that cannot be read knows none."""
     if declared.history is None:
         return {}
     try:
-        with Past(declared, declared.history, proposal.file, lambda: now, "") as past:
-            return past.stds_in_force({change.axis: change.old for change in proposal.changes})
+        with HistoryStore(declared.history.store) as store:
+            in_force = store.in_force(str(followed(proposal.file)))
+            return stds_in_force(store.entries(), in_force, {change.axis: change.old for change in proposal.changes})
     except DaqError:  # `tell_history` says so, once something is written
         return {}
 
@@ -219,7 +219,7 @@ def _enter(
     store: HistoryStore,
 ) -> None:
     """The controller has these gains; also where an earlier command wrote them and was killed before it told so."""
-    digest, target = hashlib.sha256(content).hexdigest(), str(followed(proposal.file))
+    digest, target = sha256(content), str(followed(proposal.file))
     store.add(fitted, digest=digest, at=now)
     if written is None and store.in_force(target) == digest:
         return

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import shlex
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,9 @@ from daq.configuration.cell import Cell
 from daq.errors import OutputFailed
 from daq.history.store import HistoryStore
 from daq.report.proposal import change_table
-from daq.write_back.drive_base_gate import drive_base_refusals
-from daq.write_back.drive_proposal import DriveProposal, canonical, drives_of, propose_to_drives, refused
+from daq.write_back.drive_proposal import DriveProposal, propose_to_drives, refused
 from daq.write_back.drive_record import record_folder
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives
-from daq.write_back.gates import Gate
-from daq.write_back.looked_at import change_of, look, other_change
 from drivers.parameter_write import Saving
 from ident.calibration import Calibration
 
@@ -69,12 +65,11 @@ def apply_drives(
             policy=policy,
             configuration_changed=configuration_changed,
             entered_kg=entered_kg,
+            looked_at=looked_at,
             appliers=appliers,
             calibration_file=calibration_file,
             calibration_content=calibration_content,
         )
-        if looked_at is not None:
-            proposal = _compared(proposal, looked_at)
         if not json:
             _show(proposal, Console())
         if yes and proposal.refusals and json:
@@ -94,23 +89,6 @@ def apply_drives(
         _say_outcome(proposal, written, saving, cell_file)
 
 
-def _compared(proposal: DriveProposal, looked_at: str) -> DriveProposal:
-    """Held against what somebody says that they have looked at, which outweighs the records."""
-    before, after = _contents(proposal)
-    looked, subject = look(looked_at, before), drives_of(proposal.cell)
-    refusals = (
-        *(refusal for refusal in proposal.refusals if refusal.gate is not Gate.BASE),
-        *drive_base_refusals(subject, proposal.base, proposal.base_sha256, proposal.folder, looked.base_sha256),
-        *other_change(looked, subject, before, after),
-    )
-    return replace(proposal, refusals=refusals)
-
-
-def _contents(proposal: DriveProposal) -> tuple[bytes, bytes]:
-    """What stands, and would stand, in the drives."""
-    return canonical(proposal.base), canonical(proposal.base, tuple(write.word for write in proposal.writes))
-
-
 def _show(proposal: DriveProposal, console: Console) -> None:
     table = change_table(proposal.changes)
     table.columns[1].header = "in the drive"
@@ -124,7 +102,7 @@ def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[s
     return {
         "cell": proposal.cell,
         "base_sha256": proposal.base_sha256,
-        "base": change_of(*_contents(proposal)),
+        "base": proposal.looked_at,
         "applied": written is not None,
         **({} if written is None else outcome(written)),
         "changes": [
@@ -180,4 +158,4 @@ def _say_outcome(proposal: DriveProposal, written: DrivesWritten | None, saving:
     if proposal.unchanged:
         console.print("The drives have these gains already; --yes would only let them save.")
     console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
-    console.print(f"  --yes --base {change_of(*_contents(proposal))}")
+    console.print(f"  --yes --base {proposal.looked_at}")

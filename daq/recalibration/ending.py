@@ -11,12 +11,12 @@ from daq.atomic_file import replace_file
 from daq.configuration.cell import Cell
 from daq.configuration.recalibration import Recalibration
 from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code
+from daq.history.in_force import digests_in_force
 from daq.history.store import HistoryStore
 from daq.recalibration import session as sessions
 from daq.recalibration.fitting import calibration_of_session
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.metrics import Figures, write_metrics
-from daq.recalibration.past import digests_in_force
 from daq.recalibration.recording import GainTarget
 from daq.recalibration.report import SUMMARY_JSON, SUMMARY_TEXT, Conclusion, document, text
 from daq.recalibration.session import Outcome, Session, SessionState
@@ -116,7 +116,7 @@ class Ending:
     def _remove_old(self) -> None:
         try:
             with HistoryStore(self.target.history.store) as store:
-                in_force = digests_in_force(store)
+                in_force = digests_in_force(store.events())
         except HistoryUnreadable as error:
             # What a controller rests on is not known: nothing of it may go.
             self.journal.say(Level.WARNING, "no old session removed", text=str(error))

@@ -12,16 +12,15 @@ import numpy as np
 
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
+from daq.history.in_force import stds_in_force
 from daq.history.store import HistoryStore
 from daq.history.watch import of_each_recording, watch
 from daq.history.words import alarm_words
 from daq.recalibration.session import WatchedGain, digest_of
+from daq.write_back.audit import told_of
 from daq.write_back.link import followed
 from ident.calibration import Calibration
 from ident.drift import DISPERSION, dispersions
-
-SAME_SIGMAS = 0.5
-"""A number in the controller's file that is that near to a gain of the history is that gain, rounded for the file."""
 
 
 class Past:
@@ -68,14 +67,18 @@ class Past:
         self._digest = digest_of(path) or ""
         self._store.add(calibration, digest=self._digest, at=self._now())
 
-    def note_applied(self, audit_sha256: str | None = None) -> None:
+    def note_applied(self, audit: Path, sha256_after: str) -> None:
         """The controller has this session's gains; noted once. Raises as `keep`.
 
         Args:
-            audit_sha256: of the audit's entry about the write, where it is known.
+            audit: which tells of the write.
+            sha256_after: of the controller's file with these gains, by which a later way back to it is known.
         """
         if self._store.in_force(self._target) != self._digest:
-            self._store.applied(self._digest, at=self._now(), who=self._who, target=self._target, audit=audit_sha256)
+            told = told_of(audit, self._target, sha256_after)
+            self._store.applied(
+                self._digest, at=self._now(), who=self._who, target=self._target, audit=told, sha256_after=sha256_after
+            )
 
     def watched(self) -> tuple[WatchedGain, ...]:
         """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
@@ -83,12 +86,7 @@ class Past:
         return tuple(WatchedGain(axis=one.axis, alarm=alarm_words(one) or "") for one in series)
 
     def stds_in_force(self, gains: dict[str, float]) -> dict[str, float]:
-        """σ of gains in the controller's file, by axis.
-
-        That of the calibration which the history has as in force, where the number is still that calibration's; else
-        that of the newest earlier calibration whose number it is, since a write is not always told to the history (a
-        process was killed behind it, a backup was copied back by hand); 0 for a number of no calibration, which
-        somebody entered: then only the new one's σ counts.
+        """σ of gains in the controller's file, by axis (`daq.history.in_force`).
 
         Args:
             gains: in the file now, by axis.
@@ -96,13 +94,7 @@ class Past:
         in_force = self._store.in_force(self._target)
         # This session's own calibration is what is judged: a number that happens to be near to it is not it.
         entries = [one for one in self._store.entries() if one.digest == in_force or one.digest != self._digest]
-        entries.sort(key=lambda entry: entry.digest == in_force)
-        stds = dict.fromkeys(gains, 0.0)
-        for entry in entries:  # the last one that fits counts
-            for gain in entry.gains:
-                if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
-                    stds[gain.axis] = gain.std
-        return stds
+        return stds_in_force(entries, in_force, gains)
 
     def dispersions(self) -> dict[str, float]:
         """How much more this cell's calibrations scatter than their σ says, by axis (`ident.drift.dispersions`)."""
@@ -115,9 +107,3 @@ class Past:
             np.array([[getattr(row[axis], part) for row in whole] for axis in self._axes]) for part in ("value", "std")
         )
         return dict(zip(self._axes, map(float, dispersions(values, stds)), strict=True))
-
-
-def digests_in_force(store: HistoryStore) -> frozenset[str]:
-    """Digests of the calibrations whose gains some controller has, as far as a history knows."""
-    newest = {event.target: event.digest for event in store.events()}
-    return frozenset(digest for digest in newest.values() if digest is not None)

@@ -37,7 +37,7 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
         ControllerChanged, ControllerBusy, ControllerUnfit, AuditUnusable, OutputFailed: see `daq.write_back.apply`.
     """
-    session = _written_before(session, past, journal)
+    session = _written_before(side, session, past, journal)
     if session.state.outcome is not None:
         return session
     path, now = session.folder / CALIBRATION, side.tools.now()
@@ -69,7 +69,7 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         journal.say(
             Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
         )
-    past.note_applied(None if written is None else written.audit_sha256)
+    past.note_applied(side.target.history.audit, after)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 
@@ -120,7 +120,7 @@ def judge(proposal: Proposal, calibration: Calibration, past: Past) -> Decision:
     return Decision(gains=gains, remark=found.words)
 
 
-def _written_before(session: Session, past: Past, journal: Journal) -> Session:
+def _written_before(side: Cellside, session: Session, past: Past, journal: Journal) -> Session:
     """A job that was killed behind its write has written all the same: it is noted, and never done twice."""
     target = session.state.target
     if target is None or target.base_sha256 == target.after_sha256:
@@ -128,7 +128,7 @@ def _written_before(session: Session, past: Past, journal: Journal) -> Session:
     if digest_of(Path(target.file)) != target.after_sha256:
         return session
     journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
-    past.note_applied()
+    past.note_applied(side.target.history.audit, target.after_sha256)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 

@@ -23,6 +23,7 @@ from daq.write_back.evidence import evidence_of
 from daq.write_back.fit_gates import fit_refusals
 from daq.write_back.gain_gates import GainChange, gain_refusals
 from daq.write_back.gates import Refusal
+from daq.write_back.looked_at import change_of, look, other_change
 from daq.write_back.signature_gate import signature_refusals
 from daq.write_back.source_gates import source_refusals
 from drivers.network import CanopenNetwork
@@ -58,6 +59,16 @@ class DriveProposal:
         return digest(self.base)
 
     @property
+    def contents(self) -> tuple[bytes, bytes]:
+        """What stands, and would stand, in the drives."""
+        return canonical(self.base), canonical(self.base, tuple(write.word for write in self.writes))
+
+    @property
+    def looked_at(self) -> str:
+        """What --base takes from whoever has looked at this change: they want this one and no other."""
+        return change_of(*self.contents)
+
+    @property
     def unchanged(self) -> bool:
         """Whether the drives have these gains already, in their RAM at least."""
         return all(value.word == write.word for value, write in zip(self.base, self.writes, strict=True))
@@ -90,7 +101,7 @@ def propose_to_drives(
         network: of all axes of the cell, open, and not prepared for recording.
         now, policy, configuration_changed, entered_kg, appliers, calibration_file, calibration_content: see
             `daq.write_back.apply.propose_for`.
-        looked_at: `base_sha256` that somebody has looked at.
+        looked_at: `DriveProposal.looked_at` of the change that somebody has looked at, or `base_sha256` alone.
 
     Raises:
         ConfigurationInconsistent: the cell has no objects for the gains.
@@ -118,10 +129,13 @@ def propose_to_drives(
     signed = encode(calibration) if calibration_content is None else calibration_content
     configuration = None if configuration_changed else declared.digest
     subject, folder = drives_of(declared.name), record_folder(declared)
+    before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
+    looked = look(looked_at, before)
     refusals = (
         *fit_refusals(calibration, declared.name, configuration, policy, declared.recording_digest),
         *source_refusals(calibration, policy, circumstances(declared, now, entered_kg or {})),
-        *drive_base_refusals(subject, base, digest(base), folder, looked_at),
+        *drive_base_refusals(subject, base, digest(base), folder, looked.base_sha256),
+        *other_change(looked, subject, before, after),
         *signature_refusals(calibration_file, signed, policy, appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
