@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from collections.abc import Iterable
 from math import radians
@@ -101,6 +102,21 @@ def silent_at_first(bus: ScriptedBus, cycles: int) -> None:
         return ()
 
     bus.tamper = tamper
+
+
+def test_no_search_for_garbage_delays_a_sync(timed: Rig) -> None:
+    settled: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if timed.bus.cycle % 200 == 0:  # counting them takes long
+            settled.append(gc.get_freeze_count())
+        return (message,)
+
+    timed.bus.tamper = tamper
+    timed.run()
+    assert len(settled) > 2
+    assert min(settled) > 0
+    assert gc.get_freeze_count() == 0
 
 
 @pytest.mark.parametrize("pacing", ["lockstep", "timed"])

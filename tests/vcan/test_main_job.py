@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import re
 import time
 from collections.abc import Callable
@@ -72,8 +71,6 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
             nodes = say("scan", str(cell))["nodes"]
             mass = str(load_cell(cell).payloads[0].mass_kg)
             mounted = [] if payload is None else ["--payload", payload, "--mass", mass]
-            gc.collect()
-            gc.freeze()  # what pytest and the fit hold is not searched while SYNC waits
             for attempt in range(1, ATTEMPTS + 1):
                 log = folder / f"{name}-{attempt}.mcap"
                 begun = time.monotonic()
@@ -81,6 +78,7 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
                 recorded[name] = {**one, "seconds": time.monotonic() - begun, "attempt": attempt}
                 if one["valid"] and _in_time(log):
                     break
+                figure(f"{name}, attempt {attempt}: {one['reason'] or 'a step off by half a period'}")
             assert one["valid"], f"{name}: {one['reason']}"
     fitting = time.monotonic()
     logs = [str(one["log"]) for one in recorded.values()]

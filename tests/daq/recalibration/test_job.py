@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
@@ -58,6 +59,18 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_i
     assert 'drivegain_recalibration_outcome{cell="demo",outcome="applied"} 1.0' in metrics
     assert 'drivegain_recalibration_gain_drift_sigma{axis="J4",cell="demo"}' in metrics
     assert {event["level"] for event in rig.events} <= {"info", "notice", "warning"}
+
+
+def test_the_way_back_and_back_again_to_what_a_job_wrote_is_known(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.job()
+    target, digest = str(rig.controller), rig.audit[-1].details["calibration_sha256"]
+    known: list[str | None] = []
+    for _ in range(2):
+        assert main(["rollback", "--cell", str(rig.cell_file), "--by", "a person"]) == ExitCode.OK
+        with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+            known.append(store.in_force(target))
+    assert known == [None, digest]
 
 
 def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -> None:
