@@ -27,6 +27,7 @@ from daq.report.fit import draw
 from daq.resources import shipped_configurations
 from daq.write_back.apply import Proposal, apply, propose_for
 from daq.write_back.controller_write import Written
+from daq.write_back.request import Request
 from drivers.bus import open_bus
 from drivers.scan import FoundNode
 from drivers.simulated.cell import SimulatedCell
@@ -276,7 +277,7 @@ def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) 
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
     target = out / "controller.yaml"
     shutil.copyfile(source, target)
-    proposal = propose_for(cell, calibration, target, now=now)
+    proposal = propose_for(cell, Request(calibration, now), target)
     return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
 
 

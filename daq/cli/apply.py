@@ -31,6 +31,7 @@ from daq.write_back.audit import told_of
 from daq.write_back.controller_write import Written, sha256
 from daq.write_back.gates import Gate
 from daq.write_back.link import followed
+from daq.write_back.request import Request
 from ident.calibration import Calibration
 
 
@@ -69,60 +70,41 @@ def apply_verb(
 
     The gates are those of the cell's `policy: {apply: ...}`; see docs/write-back.md.
     """
-    declared, now, doer = load_cell(cell), datetime.now(UTC), applier(by)
+    declared, doer = load_cell(cell), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
-    policy = tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent)
-    masses_kg = entered_masses(payload_mass or (), fitted)
+    request = Request(
+        fitted,
+        datetime.now(UTC),
+        policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
+        configuration_changed=configuration_changed,
+        entered_kg=entered_masses(payload_mass or (), fitted),
+        looked_at=base,
+        appliers=doer.names,
+        file=calibration,
+        content=content,
+    )
     book = audit_of(declared, (cell, calibration, to))
     if drives:
         if to is not None:
             raise UsageError(
                 "--drives", found="--to beside it", expected="one target", remedy="leave out one of the two"
             )
-        apply_drives(
-            declared,
-            cell,
-            fitted,
-            now=now,
-            doer=doer,
-            policy=policy,
-            configuration_changed=configuration_changed,
-            entered_kg=masses_kg,
-            looked_at=base,
-            appliers=doer.names,
-            calibration_file=calibration,
-            calibration_content=content,
-            saving=saving_of(ram_only, save_unknown),
-            audit=book,
-            yes=yes,
-            json=json,
-        )
+        saving = saving_of(ram_only, save_unknown)
+        apply_drives(declared, cell, request, doer=doer, saving=saving, audit=book, yes=yes, json=json)
         return
-    proposal = propose_for(
-        declared,
-        fitted,
-        to,
-        now=now,
-        policy=policy,
-        configuration_changed=configuration_changed,
-        entered_kg=masses_kg,
-        looked_at=base,
-        appliers=doer.names,
-        calibration_file=calibration,
-        calibration_content=content,
-    )
+    proposal = propose_for(declared, request, to)
     stds = _stds_in_file(declared, proposal)
     if not json:
         show(proposal, Console(), stds)
     try:
-        written = _write(proposal, now, book, doer) if yes else None
+        written = _write(proposal, request.now, book, doer) if yes else None
     except CalibrationRefused:
         if json:
             print_json({**describe(proposal, None, stds), "base": proposal.looked_at})
         raise
     if yes and not proposal.refusals:
-        tell_history(declared, partial(_enter, proposal, written, fitted, content, now, doer, book))
+        tell_history(declared, partial(_enter, proposal, written, request, doer, book))
     if json:
         print_json({**describe(proposal, written, stds), "base": proposal.looked_at})
     if proposal.refusals:
@@ -211,23 +193,21 @@ def _stds_in_file(declared: Cell, proposal: Proposal) -> dict[str, float]:
 def _enter(
     proposal: Proposal,
     written: Written | None,
-    fitted: Calibration,
-    content: bytes,
-    now: datetime,
+    request: Request,
     doer: Applier,
     audit: Path | None,
     store: HistoryStore,
 ) -> None:
     """The controller has these gains; also where an earlier command wrote them and was killed before it told so."""
-    digest, target = sha256(content), str(followed(proposal.file))
-    store.add(fitted, digest=digest, at=now)
+    digest, target = sha256(request.signed), str(followed(proposal.file))
+    store.add(request.calibration, digest=digest, at=request.now)
     if written is None and store.in_force(target) == digest:
         return
     after = sha256(proposal.after_content)
     told = None if written is None else written.audit_sha256
     if written is None and audit is not None:
         told = told_of(audit, target, after)
-    store.applied(digest, at=now, who=str(doer), target=target, audit=told, sha256_after=after)
+    store.applied(digest, at=request.now, who=str(doer), target=target, audit=told, sha256_after=after)
 
 
 def _say_way_on(proposal: Proposal) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import shlex
-from collections.abc import Collection, Mapping
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,32 +11,24 @@ from rich.console import Console
 from daq.cli.applier import Applier, tell_history
 from daq.cli.drives import kept, on_the_bus, outcome
 from daq.cli.verb import print_json
-from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.errors import OutputFailed
 from daq.history.store import HistoryStore
 from daq.report.proposal import change_table
+from daq.write_back.controller_write import sha256
 from daq.write_back.drive_proposal import DriveProposal, propose_to_drives, refused
 from daq.write_back.drive_record import record_folder
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives
+from daq.write_back.request import Request
 from drivers.parameter_write import Saving
-from ident.calibration import Calibration
 
 
 def apply_drives(
     declared: Cell,
     cell_file: Path,
-    calibration: Calibration,
+    request: Request,
     *,
-    now: datetime,
     doer: Applier,
-    policy: ApplyPolicy,
-    configuration_changed: bool,
-    entered_kg: Mapping[str, float],
-    looked_at: str | None,
-    appliers: Collection[str],
-    calibration_file: Path,
-    calibration_content: bytes,
     saving: Saving,
     audit: Path | None,
     yes: bool,
@@ -49,38 +38,27 @@ def apply_drives(
 
     Args:
         declared, cell_file: the cell, and where it is.
-        calibration, calibration_file, calibration_content: to be written.
-        now, doer, policy, configuration_changed, entered_kg, looked_at, appliers, audit: as for a controller's file.
+        request: what is to be written.
+        doer: who writes it.
         saving: whether the drives keep it.
+        audit: where it is written down, None for nowhere.
         yes: write.
         json: tell it to a program.
     """
     written: DrivesWritten | None = None
     with on_the_bus(declared) as network:
-        proposal = propose_to_drives(
-            declared,
-            calibration,
-            network,
-            now=now,
-            policy=policy,
-            configuration_changed=configuration_changed,
-            entered_kg=entered_kg,
-            looked_at=looked_at,
-            appliers=appliers,
-            calibration_file=calibration_file,
-            calibration_content=calibration_content,
-        )
+        proposal = propose_to_drives(declared, request, network)
         if not json:
             _show(proposal, Console())
         if yes and proposal.refusals and json:
             print_json(_described(proposal, None))
         if yes:
             try:
-                written = apply_to_drives(proposal, network, now, saving=saving, audit=audit, who=str(doer))
+                written = apply_to_drives(proposal, network, request.now, saving=saving, audit=audit, who=str(doer))
             except OSError as error:
                 raise OutputFailed.of(record_folder(declared), error) from error
     if written is not None:
-        _enter(declared, calibration, calibration_content, now, doer, written)
+        _enter(declared, request, doer, written)
     if json:
         print_json(_described(proposal, written))
     if proposal.refusals:
@@ -130,16 +108,14 @@ def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[s
     }
 
 
-def _enter(
-    declared: Cell, calibration: Calibration, content: bytes, now: datetime, doer: Applier, written: DrivesWritten
-) -> None:
-    digest = hashlib.sha256(content).hexdigest()
+def _enter(declared: Cell, request: Request, doer: Applier, written: DrivesWritten) -> None:
+    digest = sha256(request.signed)
 
     def enter(store: HistoryStore) -> None:
-        store.add(calibration, digest=digest, at=now)
+        store.add(request.calibration, digest=digest, at=request.now)
         store.applied(
             digest,
-            at=now,
+            at=request.now,
             who=str(doer),
             target=written.target,
             audit=written.audit_sha256,

@@ -23,6 +23,7 @@ from daq.write_back.audit import read as read_audit
 from daq.write_back.controller_write import Written, sha256
 from daq.write_back.gates import Gate
 from daq.write_back.link import followed
+from daq.write_back.request import Request
 from ident.calibration import Calibration
 from ident.drift import FALSE_ALARM, decide
 
@@ -41,8 +42,8 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
     if session.state.outcome is not None:
         return session
     path, now = session.folder / CALIBRATION, side.tools.now()
-    content = read(path)
-    proposal = side.tools.propose(side.cell, calibration, now=now, calibration_file=path, calibration_content=content)
+    request = Request(calibration, now, file=path, content=read(path))
+    proposal = side.tools.propose(side.cell, request)
     decision = judge(proposal, calibration, past)
     differs, touched = any(gain.differs for gain in decision.gains), _written_since(side, session)
     if differs and touched:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import combinations
 from pathlib import Path
 
-from daq.calibration_file import encode
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.controller_target import ControllerFormat
@@ -26,6 +25,7 @@ from daq.write_back.gain_gates import GainChange, gain_refusals
 from daq.write_back.gates import Refusal
 from daq.write_back.link import followed, require_there
 from daq.write_back.looked_at import change_of, look, other_change
+from daq.write_back.request import Request
 from daq.write_back.scalar import Scalar, respell
 from daq.write_back.signature_gate import signature_refusals
 from daq.write_back.source_gates import source_refusals
@@ -77,30 +77,13 @@ class Proposal:
         return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
 
 
-def propose_for(
-    declared: Cell,
-    calibration: Calibration,
-    file: Path | None = None,
-    *,
-    now: datetime,
-    policy: ApplyPolicy | None = None,
-    configuration_changed: bool = False,
-    entered_kg: Mapping[str, float] | None = None,
-    looked_at: str | None = None,
-    appliers: Collection[str] = (),
-    calibration_file: Path | None = None,
-    calibration_content: bytes | None = None,
-) -> Proposal:
+def propose_for(declared: Cell, request: Request, file: Path | None = None) -> Proposal:
     """Work out what a calibration changes in the controller file of a cell, with every gate there is; reads only.
 
     Args:
         declared: the cell as it is now.
-        calibration: with the identified gains.
+        request: what is to be applied.
         file: the controller's file, where it is not the one that the cell names.
-        now: for the age of the logs.
-        policy: bounds; the cell's when None.
-        configuration_changed: somebody has looked at what changed in the cell's configuration since the recording.
-        entered_kg, looked_at, appliers, calibration_file, calibration_content: see `propose`.
 
     Raises:
         ConfigurationInconsistent: the cell names no controller file, or no keys in it.
@@ -116,56 +99,40 @@ def propose_for(
         )
     names, controller = declared.axis_names, declared.controller
     return propose(
-        calibration,
+        replace(request, policy=request.policy or declared.apply),
         target,
         dict(zip(names, controller.gains, strict=True)),
         cell=declared.name,
-        configuration_sha256=None if configuration_changed else declared.digest,
+        configuration_sha256=declared.digest,
         recording_configuration_sha256=declared.recording_digest,
-        policy=policy or declared.apply,
-        held=circumstances(declared, now, entered_kg or {}),
-        looked_at=looked_at,
-        appliers=appliers,
-        calibration_file=calibration_file,
-        calibration_content=calibration_content,
+        held=circumstances(declared, request.now, request.entered_kg),
         format=controller.format,
         factors=dict(zip(names, controller.factors, strict=True)) if controller.factors else {},
     )
 
 
 def propose(
-    calibration: Calibration,
+    request: Request,
     file: Path,
     keys: Mapping[str, str],
     *,
     cell: str,
     configuration_sha256: str | None = None,
     recording_configuration_sha256: str | None = None,
-    policy: ApplyPolicy | None = None,
     held: Circumstances | None = None,
-    looked_at: str | None = None,
-    appliers: Collection[str] = (),
-    calibration_file: Path | None = None,
-    calibration_content: bytes | None = None,
     format: ControllerFormat | None = None,  # noqa: A002 - as the cell file calls it
     factors: Mapping[str, float] | None = None,
 ) -> Proposal:
     """Work out what a calibration changes in a controller file; reads only. `propose_for` takes all of it from a cell.
 
     Args:
-        calibration: with the identified gains.
+        request: what is to be applied; the default bounds where it has none.
         file: the controller's file.
         keys: key of each axis's gain in it, by the axis's name.
         cell: name of the cell that the controller drives.
         configuration_sha256: digest of that cell's configuration, None where it is not to be compared.
         recording_configuration_sha256: of what of it a recording depends on.
-        policy: bounds; the default ones when None.
         held: what the logs are held against; what it does not tell is not compared.
-        looked_at: `Proposal.looked_at` of the change that somebody has looked at, or the digest of the controller file
-            alone: then whatever the calibration changes in it.
-        appliers: names of whoever applies it; their signatures do not count.
-        calibration_file: where signatures are looked for.
-        calibration_content: of that file, as it was read.
         format: of the controller's file; None where its name tells.
         factors: number in the file = gain × factor, by the axis's name; 1 where it is not there.
 
@@ -174,7 +141,7 @@ def propose(
         CalibrationRefused: the calibration has other axes than the cell.
         ConfigurationInconsistent: a signer's public key is none.
     """
-    policy, held, factors = policy or ApplyPolicy(), held or Circumstances(), factors or {}
+    calibration, policy, factors = request.calibration, request.policy or ApplyPolicy(), factors or {}
     _check_axes(calibration, keys)
     require_there(file)
     content = read_bytes(file)
@@ -186,9 +153,8 @@ def propose(
         for gain, scalar in zip(calibration.gains, scalars, strict=True)
     )
     _check_apart(str(file), scalars)
-    signed = encode(calibration) if calibration_content is None else calibration_content
     after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
-    looked = look(looked_at, content)
+    looked = look(request.looked_at, content)
     # Who has looked at the file matters where something is lost: not where these gains stand in it already.
     base = (
         ()
@@ -199,10 +165,16 @@ def propose(
         )
     )
     refusals = (
-        *fit_refusals(calibration, cell, configuration_sha256, policy, recording_configuration_sha256),
-        *source_refusals(calibration, policy, held),
+        *fit_refusals(
+            calibration,
+            cell,
+            None if request.configuration_changed else configuration_sha256,
+            policy,
+            recording_configuration_sha256,
+        ),
+        *source_refusals(calibration, policy, held or Circumstances()),
         *base,
-        *signature_refusals(calibration_file, signed, policy, appliers),
+        *signature_refusals(request.file, request.signed, policy, request.appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
     return Proposal(
@@ -215,7 +187,7 @@ def propose(
         content,
         after.content,
         format,
-        evidence_of(calibration, signed, calibration_file),
+        evidence_of(calibration, request.signed, request.file),
     )
 
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 
-from daq.calibration_file import encode
-from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.controller_target import GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
@@ -24,11 +21,12 @@ from daq.write_back.fit_gates import fit_refusals
 from daq.write_back.gain_gates import GainChange, gain_refusals
 from daq.write_back.gates import Refusal
 from daq.write_back.looked_at import change_of, look, other_change
+from daq.write_back.request import Request
 from daq.write_back.signature_gate import signature_refusals
 from daq.write_back.source_gates import source_refusals
 from drivers.network import CanopenNetwork
 from drivers.parameter_write import ParameterValue, ParameterWrite, read_parameters
-from ident.calibration import Calibration, Gain
+from ident.calibration import Gain
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,29 +77,13 @@ def drives_of(cell: str) -> str:
     return f"drives of cell {cell}"
 
 
-def propose_to_drives(
-    declared: Cell,
-    calibration: Calibration,
-    network: CanopenNetwork,
-    *,
-    now: datetime,
-    policy: ApplyPolicy | None = None,
-    configuration_changed: bool = False,
-    entered_kg: Mapping[str, float] | None = None,
-    looked_at: str | None = None,
-    appliers: Collection[str] = (),
-    calibration_file: Path | None = None,
-    calibration_content: bytes | None = None,
-) -> DriveProposal:
+def propose_to_drives(declared: Cell, request: Request, network: CanopenNetwork) -> DriveProposal:
     """Work out what a calibration changes in the drives of a cell, with the gates of a controller file; reads only.
 
     Args:
         declared: the cell as it is now, with `controller.objects`.
-        calibration: with the identified gains.
+        request: what is to be applied; `DriveProposal.looked_at` stands for the change that somebody has looked at.
         network: of all axes of the cell, open, and not prepared for recording.
-        now, policy, configuration_changed, entered_kg, appliers, calibration_file, calibration_content: see
-            `daq.write_back.apply.propose_for`.
-        looked_at: `DriveProposal.looked_at` of the change that somebody has looked at, or `base_sha256` alone.
 
     Raises:
         ConfigurationInconsistent: the cell has no objects for the gains.
@@ -109,7 +91,7 @@ def propose_to_drives(
         ControllerUnfit: an object holds no such gain, or only one that is farther off than σ.
         DriverError: see `drivers.parameter_write.read_parameters`.
     """
-    objects = _objects(declared)
+    objects, calibration = _objects(declared), request.calibration
     gains = {gain.axis: gain for gain in calibration.gains}
     if sorted(gains) != sorted(declared.axis_names) or len(gains) != len(calibration.gains):
         raise CalibrationRefused(
@@ -118,7 +100,7 @@ def propose_to_drives(
             expected=f"one of each axis of the cell: {', '.join(declared.axis_names)}",
             remedy="give the calibration and the configuration of the same cell",
         )
-    policy = policy or declared.apply
+    policy = request.policy or declared.apply
     pairs = [(axis, told.parameter) for axis, told in zip(network.axes, objects, strict=True)]
     base = read_parameters(network, pairs)
     changes, writes = [], []
@@ -126,20 +108,19 @@ def propose_to_drives(
         change, word = _change(gains[value.axis.name], value, told)
         changes.append(change)
         writes.append(ParameterWrite(value.axis, told.parameter, word))
-    signed = encode(calibration) if calibration_content is None else calibration_content
-    configuration = None if configuration_changed else declared.digest
+    configuration = None if request.configuration_changed else declared.digest
     subject, folder = drives_of(declared.name), record_folder(declared)
     before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
-    looked = look(looked_at, before)
+    looked = look(request.looked_at, before)
     refusals = (
         *fit_refusals(calibration, declared.name, configuration, policy, declared.recording_digest),
-        *source_refusals(calibration, policy, circumstances(declared, now, entered_kg or {})),
+        *source_refusals(calibration, policy, circumstances(declared, request.now, request.entered_kg)),
         *drive_base_refusals(subject, base, digest(base), folder, looked.base_sha256),
         *other_change(looked, subject, before, after),
-        *signature_refusals(calibration_file, signed, policy, appliers),
+        *signature_refusals(request.file, request.signed, policy, request.appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
-    evidence = evidence_of(calibration, signed, calibration_file)
+    evidence = evidence_of(calibration, request.signed, request.file)
     return DriveProposal(declared.name, folder, base, tuple(writes), tuple(changes), refusals, evidence)
 
 

@@ -25,6 +25,7 @@ from daq.write_back.audit import AuditAction, read
 from daq.write_back.backups import backups
 from daq.write_back.controller_write import roll_back
 from daq.write_back.one_writer import only_writer
+from daq.write_back.request import Request
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, KEYS, demo_calibration
 
@@ -42,7 +43,7 @@ def controller(tmp_path: Path) -> Path:
 
 
 def _propose(calibration: Calibration, controller: Path) -> Proposal:
-    return propose(calibration, controller, KEYS, cell="demo")
+    return propose(Request(calibration, NOW), controller, KEYS, cell="demo")
 
 
 def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
@@ -88,7 +89,7 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
         _propose(fewer, controller)
     with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
-        propose(demo_calibration(), controller, {**KEYS, "J2": "drives.J1.gain"}, cell="demo")
+        propose(Request(demo_calibration(), NOW), controller, {**KEYS, "J2": "drives.J1.gain"}, cell="demo")
 
 
 @pytest.mark.parametrize(
@@ -188,7 +189,7 @@ def test_two_names_of_one_number_are_refused(tmp_path: Path, name: str, content:
     file.write_text(content)
     two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
     with pytest.raises(ControllerUnfit, match="which name the same number"):
-        propose(two, file, dict(zip(("J1", "J2"), keys, strict=True)), cell="demo")
+        propose(Request(two, NOW), file, dict(zip(("J1", "J2"), keys, strict=True)), cell="demo")
 
 
 def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from daq.write_back.apply import apply, propose
 from daq.write_back.audit import AuditAction, read
 from daq.write_back.controller_file import decode
 from daq.write_back.gain_spelling import spell
+from daq.write_back.request import Request
 from daq.write_back.yaml_document import YamlDocument
 from ident.calibration import Calibration, Gain
 from ident.relative_error import RelativeError
@@ -151,9 +152,10 @@ def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, dat
         calibration = _of_axes(gains)
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
-        proposal = propose(calibration, file, keys, cell="demo", calibration_content=b"a calibration")
+        now = datetime(2025, 1, 2, tzinfo=UTC)
+        proposal = propose(Request(calibration, now, content=b"a calibration"), file, keys, cell="demo")
         assert proposal.refusals == ()
-        written = apply(proposal, datetime(2025, 1, 2, tzinfo=UTC), audit=audit, who="Ada")
+        written = apply(proposal, now, audit=audit, who="Ada")
         assert file.read_bytes() == case.text(spelt).encode()
         if spelt != case.numbers:
             assert written is not None

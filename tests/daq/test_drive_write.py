@@ -28,6 +28,7 @@ from daq.write_back.drive_record import read_record, read_records, record_folder
 from daq.write_back.drive_way_back import way_back_of_drives
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives, roll_back_drives
 from daq.write_back.gates import Gate
+from daq.write_back.request import Request
 from drivers.bus import BusAddress
 from drivers.errors import (
     BusBusy,
@@ -73,9 +74,8 @@ def listener(address: BusAddress) -> Iterator[Listener]:
 def _propose(
     cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, looked_at: str | None = None
 ) -> DriveProposal:
-    return propose_to_drives(
-        cell, calibration or demo_calibration(), network, now=NOW, configuration_changed=True, looked_at=looked_at
-    )
+    request = Request(calibration or demo_calibration(), NOW, configuration_changed=True, looked_at=looked_at)
+    return propose_to_drives(cell, request, network)
 
 
 def _write(

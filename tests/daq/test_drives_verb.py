@@ -22,6 +22,7 @@ from daq.configuration.cell import Bus, Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.history.store import HistoryStore
 from daq.write_back.audit import AuditAction, read
+from daq.write_back.request import Request
 from drivers.bus import BusAddress
 from drivers.parameter_write import Saving
 from drivers.sdo import ObjectAccess
@@ -63,16 +64,17 @@ def _apply(
     apply_drives(
         cell,
         Path("cells/demo.yaml"),
-        calibration,
-        now=NOW,
+        Request(
+            calibration,
+            NOW,
+            policy=cell.apply,
+            configuration_changed=True,
+            looked_at=base,
+            appliers=DOER.names,
+            file=Path("calibration.yaml"),
+            content=encode(calibration),
+        ),
         doer=DOER,
-        policy=cell.apply,
-        configuration_changed=True,
-        entered_kg={},
-        looked_at=base,
-        appliers=DOER.names,
-        calibration_file=Path("calibration.yaml"),
-        calibration_content=encode(calibration),
         saving=saving,
         audit=cell.history.audit,
         yes=yes,

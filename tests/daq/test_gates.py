@@ -23,6 +23,7 @@ from daq.write_back.apply import Proposal, apply, propose, propose_for, refused
 from daq.write_back.audit import AuditAction, read
 from daq.write_back.controller_write import sha256
 from daq.write_back.gates import Gate
+from daq.write_back.request import Request
 from ident.calibration import Calibration, Gain, Source
 from ident.relative_error import RelativeError
 from tests.daq.calibrations import AXES, KEYS, RECORDED, demo_calibration, demo_recording, recorded, with_recordings
@@ -54,18 +55,17 @@ class Scene:
             self.file.write_bytes(content)
             for name in self.signed:
                 sign(self.file, self.file.parent / f"{name}.key", name, at=NOW)
-        return propose_for(
-            self.cell,
+        request = Request(
             self.calibration,
-            self.controller,
-            now=self.now,
+            self.now,
             policy=self.policy,
             entered_kg=self.entered_kg,
             looked_at=self.looked_at,
             appliers=self.appliers,
-            calibration_file=self.file,
-            calibration_content=content,
+            file=self.file,
+            content=content,
         )
+        return propose_for(self.cell, request, self.controller)
 
 
 @pytest.fixture
@@ -523,9 +523,8 @@ def test_an_age_below_a_day_is_told_in_hours(scene: Scene) -> None:
 
 def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
     cell = _payload(mass_kg=5.0)(scene).cell
-    proposal = propose_for(
-        cell, scene.calibration, scene.controller, now=NOW, configuration_changed=True, policy=ApplyPolicy()
-    )
+    request = Request(scene.calibration, NOW, policy=ApplyPolicy(), configuration_changed=True)
+    proposal = propose_for(cell, request, scene.controller)
     assert {(one.gate, one.found) for one in proposal.refusals} == {(Gate.MASS, "fitted with 4.59 kg")}
 
 
@@ -578,7 +577,7 @@ def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
 
 def test_a_library_that_tells_no_circumstances_is_not_asked_for_them(scene: Scene) -> None:
     old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
-    assert propose(old, scene.controller, KEYS, cell="demo").refusals == ()
+    assert propose(Request(old, NOW), scene.controller, KEYS, cell="demo").refusals == ()
     assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {Gate.SOURCES, Gate.HOLDOUT}
 
 

@@ -19,6 +19,7 @@ from daq.write_back.audit import AuditAction, AuditVerdict, Content, verify
 from daq.write_back.backups import backups
 from daq.write_back.controller_file import decode
 from daq.write_back.controller_write import roll_back
+from daq.write_back.request import Request
 from ident.calibration import Calibration
 from ident.relative_error import RelativeError
 from tests.daq import killing
@@ -60,13 +61,13 @@ class Place:
 
     def apply(self, gain: float, minutes: int = 0) -> None:
         """Write a gain."""
-        proposal = propose(_calibration(gain), self.file, KEYS, cell="demo")
+        proposal = propose(Request(_calibration(gain), NOW), self.file, KEYS, cell="demo")
         assert proposal.refusals == ()
         apply(proposal, NOW + timedelta(minutes=minutes), audit=self.audit, who="Ada")
 
     def to_apply(self) -> Callable[[], object]:
         """The write itself, everything before it done: another gain goes in."""
-        proposal = propose(_calibration(33.9), self.file, KEYS, cell="demo")
+        proposal = propose(Request(_calibration(33.9), NOW), self.file, KEYS, cell="demo")
         return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
 
     def to_roll_back(self) -> Callable[[], object]:

@@ -18,6 +18,7 @@ from daq.cli.apply_drives import apply_drives
 from daq.configuration.cell import Bus, Cell
 from daq.errors import CalibrationRefused, UsageError
 from daq.write_back.looked_at import LookedAt, change_of, look, other_change
+from daq.write_back.request import Request
 from drivers.bus import BusAddress
 from drivers.parameter_write import Saving
 from drivers.simulated.cell import SimulatedCell
@@ -74,16 +75,17 @@ def _apply(cell: Cell, calibration: Calibration, *, base: str | None, yes: bool)
     apply_drives(
         cell,
         Path("cells/demo.yaml"),
-        calibration,
-        now=NOW,
+        Request(
+            calibration,
+            NOW,
+            policy=cell.apply,
+            configuration_changed=True,
+            looked_at=base,
+            appliers=DOER.names,
+            file=Path("calibration.yaml"),
+            content=encode(calibration),
+        ),
         doer=DOER,
-        policy=cell.apply,
-        configuration_changed=True,
-        entered_kg={},
-        looked_at=base,
-        appliers=DOER.names,
-        calibration_file=Path("calibration.yaml"),
-        calibration_content=encode(calibration),
         saving=Saving.KNOWN,
         audit=cell.history.audit,
         yes=yes,

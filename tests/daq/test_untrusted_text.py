@@ -26,6 +26,7 @@ from daq.report.proposal import show
 from daq.report.spreadsheet import inert
 from daq.report.terminal_text import terminal_lines, terminal_text
 from daq.write_back.apply import Proposal, propose
+from daq.write_back.request import Request
 from ident.calibration import Gain
 from tests.daq.calibrations import AXES, demo_calibration, recorded
 from tests.daq.histories import calibration_of, enter
@@ -109,7 +110,9 @@ def _proposal(folder: Path, unit: str) -> Proposal:
     file.write_text("".join(f"{axis}: 30.0  # tab\t[/]\n" for axis in AXES))
     demo = demo_calibration()
     made = replace(demo, gains=tuple(replace(gain, unit=unit) for gain in demo.gains))
-    return propose(made, file, dict(zip(AXES, AXES, strict=True)), cell="demo")
+    return propose(
+        Request(made, datetime(2025, 1, 2, tzinfo=UTC)), file, dict(zip(AXES, AXES, strict=True)), cell="demo"
+    )
 
 
 @pytest.mark.parametrize("unit", ["[/]", "[red]Nm/A", "Nm\x1b[2J", "\x9b2J"])

@@ -16,6 +16,7 @@ from daq.errors import CalibrationMissing, ControllerUnfit
 from daq.write_back.apply import apply, propose
 from daq.write_back.audit import AuditAction, Content, append, read, verify
 from daq.write_back.controller_write import roll_back
+from daq.write_back.request import Request
 from tests.daq.calibrations import KEYS, demo_calibration
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -59,7 +60,7 @@ def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
     path = tmp_path / "x.yaml"
     made(path)
     with pytest.raises(ControllerUnfit):
-        propose(demo_calibration(), path, KEYS, cell="demo")
+        propose(Request(demo_calibration(), NOW), path, KEYS, cell="demo")
     with pytest.raises(CalibrationMissing):
         calibration_file.load(path)
 
@@ -68,7 +69,7 @@ def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(tmp_path / "gone" / "demo.yaml")
     with pytest.raises(ControllerUnfit, match=r"a symbolic link to .*gone/demo\.yaml, which is not there"):
-        propose(demo_calibration(), link, KEYS, cell="demo")
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
 
 
 def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
@@ -76,7 +77,7 @@ def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
     one.symlink_to(other)
     other.symlink_to(one)
     with pytest.raises(ControllerUnfit, match="round in a circle"):
-        propose(demo_calibration(), one, KEYS, cell="demo")
+        propose(Request(demo_calibration(), NOW), one, KEYS, cell="demo")
     with pytest.raises(ControllerUnfit, match="round in a circle"):
         roll_back(one, NOW)
     with pytest.raises(CalibrationMissing):
@@ -88,11 +89,11 @@ def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controlle
     link.symlink_to(controller)
     controller.parent.chmod(0o777)
     with pytest.raises(ControllerUnfit, match="everybody may write"):
-        propose(demo_calibration(), link, KEYS, cell="demo")
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
     # Whoever names the file itself has chosen it.
-    assert propose(demo_calibration(), controller, KEYS, cell="demo").refusals == ()
+    assert propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo").refusals == ()
     controller.parent.chmod(0o755)
-    assert propose(demo_calibration(), link, KEYS, cell="demo").refusals == ()
+    assert propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo").refusals == ()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
@@ -101,9 +102,9 @@ def test_the_link_of_a_stranger_is_not_followed(controller: Path, tmp_path: Path
     link.symlink_to(controller)
     os.lchown(link, 4711, 4711)
     with pytest.raises(ControllerUnfit, match="user 4711 has made"):
-        propose(demo_calibration(), link, KEYS, cell="demo")
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
     os.chown(controller, 4711, 4711)
-    written = apply(propose(demo_calibration(), link, KEYS, cell="demo"), NOW)
+    written = apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW)
     assert written is not None
     assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
 
@@ -114,18 +115,18 @@ def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, 
     other.hardlink_to(controller)
     for name in (controller, other):
         with pytest.raises(ControllerUnfit, match=r"2 names \(hard links\)") as caught:
-            propose(demo_calibration(), name, KEYS, cell="demo")
+            propose(Request(demo_calibration(), NOW), name, KEYS, cell="demo")
     remedy = str(caught.value).rpartition("of its own: ")[2]
     assert subprocess.run(remedy, shell=True, check=False).returncode == 0
     assert controller.stat().st_nlink == 1
     assert other.read_bytes() == controller.read_bytes()
-    assert propose(demo_calibration(), other, KEYS, cell="demo").refusals == ()
-    assert apply(propose(demo_calibration(), controller, KEYS, cell="demo"), NOW) is not None
+    assert propose(Request(demo_calibration(), NOW), other, KEYS, cell="demo").refusals == ()
+    assert apply(propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo"), NOW) is not None
 
 
 def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path, tmp_path: Path) -> None:
     """The lock's name is no way to another file either."""
-    proposal = propose(demo_calibration(), controller, KEYS, cell="demo")
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
     victim = tmp_path / "victim"
     (controller.parent / ".demo.yaml.lock").symlink_to(victim)
     with pytest.raises(OSError, match="symbolic link"):
@@ -137,7 +138,7 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_written_down(controll
     audit, link = tmp_path / "audit.jsonl", tmp_path / "link.yaml"
     link.symlink_to(controller)
     before = controller.read_bytes()
-    apply(propose(demo_calibration(), link, KEYS, cell="demo"), NOW, audit=audit, who="Ada")
+    apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW, audit=audit, who="Ada")
     controller.unlink()
     assert roll_back(link, NOW, audit=audit, who="Bob").file == controller
     assert controller.read_bytes() == before
@@ -151,7 +152,7 @@ def test_what_fails_within_a_write_is_written_down_as_failed(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     audit, before = tmp_path / "audit.jsonl", controller.read_bytes()
-    proposal = propose(demo_calibration(), controller, KEYS, cell="demo")
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
@@ -178,7 +179,8 @@ def test_an_end_that_cannot_be_written_down_leaves_the_write_and_a_warning(
         return append(path, action, **rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr("daq.write_back.written_down.append", full_at_the_end)
-    assert apply(propose(demo_calibration(), controller, KEYS, cell="demo"), NOW, audit=audit, who="Ada") is not None
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    assert apply(proposal, NOW, audit=audit, who="Ada") is not None
     assert "the audit could not be told that it is applied" in caplog.text
     (left,) = verify(audit).open_writes
     assert left.content is Content.AFTER
