@@ -179,7 +179,7 @@ def show(
     console: Console,
 ) -> None:
     """The same for a person."""
-    console.print(link_table(robot, updates, updated))
+    console.print(link_table(updates, updated))
     change = robot.parameters.torque_change_percent
     if robot.parameters.exact:
         console.print("These bodies need exactly the identified torque.")
@@ -210,7 +210,7 @@ def show(
     say_written(console, out)
 
 
-def link_table(robot: PhysicalRobot, updates: dict[str, JointUpdate], updated: Updated) -> Table:
+def link_table(updates: dict[str, JointUpdate], updated: Updated) -> Table:
     """Mass and centre of mass of each link, friction of its joint."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     table.add_column("joint", no_wrap=True)

@@ -14,7 +14,7 @@ from daq.configuration.yaml_file import Fault, StrictModel
 _Percent = Annotated[float, Field(ge=0)]
 
 
-class Applier(Enum):
+class AppliedBy(Enum):
     """Who applies what a scheduled job has found."""
 
     PERSON = "person"
@@ -57,7 +57,7 @@ class ApplyPolicy:
     max_axis_error_percent: float = 50.0
     max_age_days: float | None = 30.0
     max_saturated_percent: float = 2.0
-    by: Applier = Applier.PERSON
+    by: AppliedBy = AppliedBy.PERSON
     signatures: int = 0
     signers: Mapping[str, str] = field(default_factory=dict)
     holdout: HoldOut = HoldOut.OPTIONAL
@@ -77,7 +77,7 @@ class ApplyPolicyModel(StrictModel):
     max_axis_error_percent: _Percent = DEFAULT_APPLY_POLICY.max_axis_error_percent
     max_age_days: Annotated[float, Field(gt=0)] | None = DEFAULT_APPLY_POLICY.max_age_days
     max_saturated_percent: _Percent = DEFAULT_APPLY_POLICY.max_saturated_percent
-    by: Applier = DEFAULT_APPLY_POLICY.by
+    by: AppliedBy = DEFAULT_APPLY_POLICY.by
     signatures: Annotated[int, Field(ge=0)] = DEFAULT_APPLY_POLICY.signatures
     signers: dict[str, str] = Field(default_factory=dict)
     holdout: HoldOut | None = None
@@ -91,14 +91,14 @@ class ApplyPolicyModel(StrictModel):
 
     @model_validator(mode="after")
     def _put_to_the_test(self) -> ApplyPolicyModel:
-        if self.by is Applier.JOB and self.holdout is HoldOut.OPTIONAL:
+        if self.by is AppliedBy.JOB and self.holdout is HoldOut.OPTIONAL:
             raise ValueError("`holdout: required` where the job applies by itself")
         return self
 
     @property
     def policy(self) -> ApplyPolicy:
         """As the gates take it; nothing is written unseen and untested unless somebody looks at it first."""
-        wanted = self.holdout or (HoldOut.REQUIRED if self.by is Applier.JOB else HoldOut.OPTIONAL)
+        wanted = self.holdout or (HoldOut.REQUIRED if self.by is AppliedBy.JOB else HoldOut.OPTIONAL)
         return ApplyPolicy(**{**self.model_dump(), "holdout": wanted})
 
 

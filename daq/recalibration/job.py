@@ -169,13 +169,13 @@ def _taken_up_or_new(section: Recalibration, cell: Cell, now: datetime, journal:
 
 def _both(one: Undisturbed, other: Undisturbed) -> Undisturbed:
     @contextmanager
-    def neither() -> Iterator[None]:
+    def both() -> Iterator[None]:
         with ExitStack() as stack:
             stack.enter_context(one())
             stack.enter_context(other())
             yield
 
-    return neither
+    return both
 
 
 def _nearest(folder: Path) -> Path:

@@ -7,6 +7,7 @@ from datetime import datetime, timedelta
 from daq.configuration.cell import Cell, MotionPolicy
 from daq.configuration.recalibration import Recalibration
 from daq.errors import ClockWentBack, ConfigurationInconsistent, DiskSpaceShort, OutputFailed
+from daq.history.store import HistoryStore
 from daq.payload_mass import agree
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.recording import Cellside, GainTarget
@@ -100,9 +101,10 @@ def due_in(found: tuple[Session, ...], every_h: float, now: datetime) -> timedel
 
 
 def before_motion(side: Cellside, journal: Journal) -> None:
-    """Room on the disk, the interlock, and the drives.
+    """Room on the disk, the history, the interlock, and the drives.
 
     Raises:
+        HistoryUnreadable: what the gains would be compared with; nothing has moved.
         DiskSpaceShort, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder has gone.
     """
@@ -118,6 +120,8 @@ def before_motion(side: Cellside, journal: Journal) -> None:
             expected=f"{section.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
+    with HistoryStore(side.target.history.store) as store:
+        store.entries()
     require_release(section.interlock, side.tools.run, side.tools.now, section.working_folder)
     journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
     side.tools.drives(side.cell, side.undisturbed)

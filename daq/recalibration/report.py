@@ -78,11 +78,12 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     session, outcome = conclusion.session, conclusion.outcome
     if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
         calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file))
-        base = f"{session.state.target.base_sha256[:12]}-{session.state.target.after_sha256[:12]}"
+        sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
         return [
+            *([sign] if session.state.target.unsigned else []),
             f"drivegain apply {calibration} --cell {cell}",
             "look at the change, and if it is right, write it:",
-            f"drivegain apply {calibration} --cell {cell} --yes --base {base}",
+            f"drivegain apply {calibration} --cell {cell} --yes --base {session.state.target.looked_at}",
         ]
     if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
         return [

@@ -79,7 +79,8 @@ class Fitted(StrictModel):
 class JudgedGain(StrictModel):
     """A gain against the one in the controller: both, their σ, and whether they differ by more than chance.
 
-    The drift is their difference in σ of the difference, None where nothing is known of one of them.
+    The drift is their difference in σ of the difference, None where both σ are 0; the σ of a number that nobody knows
+    anything of is 0. The change is None where the number in the controller is 0.
     """
 
     axis: str
@@ -101,11 +102,17 @@ class Decision(StrictModel):
 
 
 class Target(StrictModel):
-    """What is about to be written, noted before it is: after a kill the file's digest says whether it was."""
+    """What is about to be written, noted before it is: after a kill the file's digest says whether it was.
+
+    `looked_at` is what `apply --base` takes from whoever has looked at the change; `unsigned` where the policy wants
+    signatures that the calibration has not got yet.
+    """
 
     file: str
     base_sha256: str
     after_sha256: str
+    looked_at: str = ""
+    unsigned: bool = False
 
 
 class WatchedGain(StrictModel):

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from daq.atomic_file import replace_file
 from daq.calibration_file import read
-from daq.configuration.apply_policy import Applier
-from daq.errors import OutputFailed
+from daq.configuration.apply_policy import AppliedBy
+from daq.errors import DaqError, OutputFailed
 from daq.recalibration import session as sessions
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.past import Past
@@ -50,7 +50,13 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         decision = decision.model_copy(update={"remark": f"{decision.remark} {TOUCHED}"})
     journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(proposal.after_content)
-    target = Target(file=str(proposal.file), base_sha256=proposal.base_sha256, after_sha256=after)
+    target = Target(
+        file=str(proposal.file),
+        base_sha256=proposal.base_sha256,
+        after_sha256=after,
+        looked_at=proposal.looked_at,
+        unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
+    )
     _write_proposal(session, proposal, after)
     # Before anything is written: whoever finds this state after a kill sees by the file's digest whether it was.
     session = sessions.save(replace(session, state=session.state.with_(decision=decision, target=target)))
@@ -70,7 +76,7 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         journal.say(
             Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
         )
-    past.note_applied(side.target.history.audit, after)
+    _note(side, past, after, journal)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 
@@ -81,9 +87,17 @@ def _apply(side: Cellside, proposal: Proposal, now: datetime) -> Written | None:
         raise OutputFailed.of(proposal.file, error) from error
 
 
+def _note(side: Cellside, past: Past, after_sha256: str, journal: Journal) -> None:
+    """The history's turn. The controller has its gains, and no trouble of the history's may call that undone."""
+    try:
+        past.note_applied(side.target.history.audit, after_sha256)
+    except DaqError as error:
+        journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
+
+
 def by_a_person(side: Cellside) -> bool:
     """Whether a person applies: by the cell's policy, and wherever drives are written to."""
-    return side.cell.apply.by is Applier.PERSON or bool(side.target.controller.objects)
+    return side.cell.apply.by is AppliedBy.PERSON or bool(side.target.controller.objects)
 
 
 def judge(proposal: Proposal, calibration: Calibration, past: Past) -> Decision:
@@ -114,7 +128,7 @@ def judge(proposal: Proposal, calibration: Calibration, past: Past) -> Decision:
             new_std=change.std,
             change_percent=_finite(told.percent),
             drift_sigma=_finite(told.sigmas),
-            differs=found.differs and probability <= FALSE_ALARM,
+            differs=probability <= FALSE_ALARM,
         )
         for change, old_std, told, probability in zip(changes, stds, found.changes, found.adjusted, strict=True)
     )
@@ -129,7 +143,7 @@ def _written_before(side: Cellside, session: Session, past: Past, journal: Journ
     if digest_of(Path(target.file)) != target.after_sha256:
         return session
     journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
-    past.note_applied(side.target.history.audit, target.after_sha256)
+    _note(side, past, target.after_sha256, journal)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from daq.errors import AuditUnusable
 from daq.folder import fsync_folder
 from daq.write_back.audit_chain import (
+    GONE,
     AuditFlaw,
     AuditVerdict,
     Content,
@@ -217,9 +218,9 @@ def _read_all(descriptor: int) -> bytes:
 
 
 def digest_now(subject: str) -> str | None:
-    """SHA-256 of the file that an entry is about, as it is now; None where it is none, or cannot be read."""
+    """SHA-256 of the file that an entry is about, as it is now; `GONE` without one, None where it cannot be read."""
     path = Path(subject)
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None if path.exists() else GONE
     except OSError:
         return None

@@ -11,6 +11,8 @@ from enum import Enum
 from daq.write_back.audit_entry import FIRST, AuditAction, AuditEntry, decode, is_fragment
 
 _BEGUN = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
+GONE = "gone"
+"""In the place of the digest of a file that is not there."""
 _ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
 
 
@@ -44,7 +46,7 @@ class Content(Enum):
 
     BEFORE = "as before the write"
     AFTER = "the new content"
-    OTHER = "neither: somebody has changed it since"
+    OTHER = "neither: somebody has changed or removed it since"
     UNKNOWN = "not known: the file cannot be read, or the entry has no digests"
 
 
@@ -93,7 +95,7 @@ def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collec
 
     Args:
         content: of the audit.
-        digest_now: SHA-256 of a controller file by its path, None where it cannot be read.
+        digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where it cannot be read.
         heads: digests of entries that somebody noted elsewhere. A chain cannot tell that its last lines are missing;
             one of these that is not in it does.
     """
@@ -170,7 +172,7 @@ class _Chain:
         """Lines that are no entries: left by a killed writer, or made so by somebody."""
         fragments = [self.lines[index] for index in self.unfinished]
         told = follower is not None and follower.action is AuditAction.TORN_LINE
-        if told and follower is not None and follower.details != torn_details(fragments):
+        if follower is not None and told and follower.details != torn_details(fragments):
             says = f"entry {follower.number} tells of an unfinished line that is not there as it was"
             self._tell(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
         elif told or (follower is None and all(map(is_fragment, fragments))):
@@ -209,8 +211,14 @@ def _content_after(begun: AuditEntry, later: Sequence[AuditEntry], digest_now: C
     following = (one for one in later if one.action in _BEGUN and one.subject == begun.subject)
     witness = next(following, None)
     # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
-    found = digest_now(begun.subject) if witness is None else witness.details.get("sha256_before")
-    before, after = begun.details.get("sha256_before"), begun.details.get("sha256_after")
-    if not isinstance(found, str) or not isinstance(before, str) or not isinstance(after, str):
+    found = digest_now(begun.subject) if witness is None else _digest_before(witness)
+    before, after = _digest_before(begun), begun.details.get("sha256_after")
+    if found is None or before is None or not isinstance(after, str):
         return Content.UNKNOWN
     return {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER)
+
+
+def _digest_before(begun: AuditEntry) -> str | None:
+    """Of the file when the write began, or that there was none; None where the entry does not tell."""
+    told = begun.details.get("sha256_before", 0)
+    return GONE if told is None else told if isinstance(told, str) else None

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from daq.calibration_file import encode
-from daq.configuration.apply_policy import Applier, ApplyPolicy, ApplyPolicyModel, HoldOut
+from daq.configuration.apply_policy import AppliedBy, ApplyPolicy, ApplyPolicyModel, HoldOut
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
@@ -493,7 +493,7 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
 )
 def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: HoldOut) -> None:
     policy = ApplyPolicyModel.model_validate_json(json.dumps(told)).policy
-    assert (policy.holdout, policy.by) == (wanted, Applier(told.get("by", "person")))
+    assert (policy.holdout, policy.by) == (wanted, AppliedBy(told.get("by", "person")))
     with pytest.raises(ValueError, match="holdout: required"):
         ApplyPolicyModel.model_validate_json('{"by": "job", "holdout": "optional"}')
 

@@ -74,6 +74,10 @@ class Place:
         """The way back from a write before."""
         return lambda: roll_back(self.file, NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
 
+    def content(self) -> bytes | None:
+        """Of the file; None where it is gone."""
+        return self.file.read_bytes() if self.file.exists() else None
+
     def kinds_left(self) -> set[str]:
         """Endings of what lies about; nothing else does."""
         names = [path.name for path in self.folder.iterdir()]
@@ -100,6 +104,12 @@ def _written_once(folder: Path) -> Place:
     return place
 
 
+def _deleted(folder: Path) -> Place:
+    place = _written_once(folder)
+    place.file.unlink()
+    return place
+
+
 def _told(verdict: AuditVerdict) -> Content:
     """Which of the two the audit says the file is, after the one write that was killed."""
     # Before it, nothing or one finished write.
@@ -122,6 +132,7 @@ def _told(verdict: AuditVerdict) -> Content:
         pytest.param(_fresh, Place.to_apply, id="apply, first of all"),
         pytest.param(_written_once, Place.to_apply, id="apply, once more"),
         pytest.param(_written_once, Place.to_roll_back, id="rollback"),
+        pytest.param(_deleted, Place.to_roll_back, id="rollback of a file that was deleted"),
     ],
 )
 def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_which(
@@ -132,9 +143,9 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = prepare(tmp_path / "model")
-    before = model.file.read_bytes()
+    before = model.content()
     work(model)()
-    after = model.file.read_bytes()
+    after = model.content()
     assert before != after
     outcomes: Counter[Content] = Counter()
     left: set[str] = set()
@@ -175,12 +186,13 @@ def test_where_ptrace_is_not_permitted_it_is_skipped_by_people_and_fails_in_ci(
         killing.killed_at(1, lambda: None)
 
 
-def _check(place: Place, before: bytes, after: bytes) -> Content:
-    """Whole, with its mode, and known by the audit."""
-    content = place.file.read_bytes()
+def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
+    """Whole, with its mode, and known by the audit; gone only where it was."""
+    content = place.content()
     assert content in {before, after}
-    decode(content, "x.yaml").locate(tuple(KEYS.values()))
-    assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
+    if content is not None:
+        decode(content, "x.yaml").locate(tuple(KEYS.values()))
+        assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
     verdict = verify(place.audit)
     assert verdict.holds
     told = _told(verdict)
@@ -190,10 +202,14 @@ def _check(place: Place, before: bytes, after: bytes) -> Content:
     return told
 
 
-def _check_next_write(place: Place, before: bytes, after: bytes) -> None:
+def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -> None:
     """Whoever comes next is not hindered, and the audit still tells what the killed one has done."""
-    was = place.file.read_bytes()
+    was = place.content()
     told = [one.content for one in verify(place.audit).open_writes]
+    if was is None:
+        assert roll_back(place.file, NOW + timedelta(minutes=2), audit=place.audit).after == after
+        assert [one.content for one in verify(place.audit).open_writes] == told
+        return
     place.apply(31.5, minutes=2)
     assert b"31.5" in place.file.read_bytes()
     verdict = verify(place.audit)

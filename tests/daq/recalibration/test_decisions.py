@@ -15,6 +15,7 @@ from daq.cli.app import main
 from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable, ModelContradicted
 from daq.history.store import HistoryStore
 from daq.recalibration.session import Outcome
+from daq.signature import generate
 from daq.write_back.audit import AuditAction
 from drivers.errors import DriveFault
 from tests.daq.recalibration.made import Made, made_rig
@@ -181,6 +182,48 @@ def test_nothing_is_removed_while_nobody_knows_what_is_in_force(tmp_path: Path, 
         rig.job()
     assert len(rig.sessions) == 3
     assert "no old session removed" in {event["event"] for event in rig.events}
+
+
+def test_what_is_written_stays_told_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB)
+    apply = rig.tools.apply
+
+    def breaks_the_history(*given: Any, **further: Any) -> Any:
+        written = apply(*given, **further)
+        with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
+            history.execute("DROP TABLE event")
+            history.commit()
+        return written
+
+    rig.tools = replace(rig.tools, apply=breaks_the_history)
+    before = rig.controller.read_bytes()
+    assert rig.job().outcome is Outcome.APPLIED
+    assert rig.controller.read_bytes() != before
+    assert "the history does not know of this write" in {event["event"] for event in rig.events}
+    assert "drivegain rollback" in " ".join(json.loads((rig.session.folder / "summary.json").read_text())["to_do"])
+
+
+def test_a_history_that_cannot_be_read_is_told_before_anything_moves(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    with pytest.raises(HistoryUnreadable):
+        rig.job()
+    assert rig.session.state.runs == ()
+
+
+def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
+    tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    public = generate(tmp_path, "bob")[1].line
+    signed = {"by": "person", "max_std_percent": 8, "max_age_days": None, "signatures": 1, "signers": {"bob": public}}
+    rig = made_rig(tmp_path / "cell", made, policy={**BY_A_PERSON, "apply": signed})
+    assert rig.job().outcome is Outcome.PROPOSED
+    sign, _, _, apply = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    assert main(apply.split()[1:]) == ExitCode.CALIBRATION_REFUSED
+    options = sign.partition("drivegain ")[2].replace("KEY", str(tmp_path / "bob.key"))
+    assert main(options.replace("NAME", "bob").split()) == ExitCode.OK
+    assert main(apply.split()[1:]) == ExitCode.OK
+    capsys.readouterr()
 
 
 def failing_once(rig: Rig) -> Any:
