@@ -33,7 +33,7 @@ _MEAN_OF_CUT = float(1.0 - 2.0 * norm.sf(_CUT) - 2.0 * _CUT * norm.pdf(_CUT) + 2
 """E min(Z², c²) of a standard normal Z."""
 _MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
 _STEPS = 20
-"""Each brings the scale nearer to its end by a factor of two and more, unless outliers are nearly a third."""
+"""Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +80,14 @@ def change_significance(
         dispersion: scatter of repeated calibrations over their σ.
 
     Raises:
-        ValueError: a number is not finite, or a σ negative.
+        ValueError: a number is not finite, or a σ or the dispersion negative.
     """
     numbers = np.array([old, old_std, new, new_std, dispersion])
     if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
-        raise ValueError(f"expected finite gains and σ ≥ 0, found {old} ± {old_std} and {new} ± {new_std}")
+        raise ValueError(
+            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± {new_std} "
+            f"and dispersion {dispersion}"
+        )
     change = (new - old) * (np.sign(old) or 1.0)
     std = dispersion * np.hypot(old_std, new_std)
     sigmas = _ratio(float(change), float(std))
@@ -113,7 +116,7 @@ def decide(
         false_alarm: share of recalibrations without change in which one is found, at most.
 
     Raises:
-        ValueError: shapes do not fit, or a number is not finite.
+        ValueError: shapes do not fit, a number is not finite, or a σ or a dispersion is negative.
     """
     n = len(axes)
     columns = [np.broadcast_to(np.asarray(c, float), (n,)) for c in (old, old_std, new, new_std, dispersion)]

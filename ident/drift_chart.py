@@ -88,15 +88,16 @@ class Drift:
 
     Attributes:
         baseline, baseline_std: what the newest calibrations are compared with, in the unit of the gains: the chart's
-            baseline, up to the onset where there is an alarm; where that is a trend, the beginning of the line.
+            baseline, up to the onset while there is an alarm; while that is a trend, the beginning of the line.
         deviations: z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
         upper, lower: C⁺ and C⁻, shape (n,).
         trend: t of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
-        alarms: in the order of the calibrations.
-        onset: index of the last calibration before the change that the last alarm tells of, the first calibration for a
-            trend; None without alarm.
-        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset if fewer);
-            where the last alarm is a trend, along the line [% of the baseline's magnitude].
+        alarms: in the order of the calibrations, also those that have passed; nothing else here hangs on these.
+        onset: index of the last calibration before the change that `alarm` tells of, the first calibration for a trend;
+            None where the newest calibration raises no alarm.
+        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset, without
+            alarm those behind the baseline, if fewer); while there is a trend, along the line [% of the baseline's
+            magnitude].
         change_sigmas: the same over its σ.
     """
 
@@ -112,14 +113,19 @@ class Drift:
     change_sigmas: float
 
     @property
+    def alarm(self) -> Alarm | None:
+        """Of the newest calibration; None where it raises none, whatever earlier ones did."""
+        return _present(self.alarms, len(self.deviations))
+
+    @property
     def alarmed(self) -> bool:
         """Whether the newest calibration raises an alarm."""
-        return bool(self.alarms) and self.alarms[-1].index == len(self.deviations) - 1
+        return self.alarm is not None
 
     @property
     def steady(self) -> bool:
         """Whether the change is told along the line."""
-        return bool(self.alarms) and self.alarms[-1].kind is AlarmKind.TREND
+        return self.alarm is not None and self.alarm.kind is AlarmKind.TREND
 
 
 def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION, chart: Chart = CHART) -> Drift:
@@ -148,8 +154,10 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
     slopes = trend(sign * values, stds, dispersion)
     found = [_alarm(*one, chart) for one in enumerate(zip(deviations, upper, lower, slopes, strict=True))]
     alarms = tuple(alarm for alarm in found if alarm is not None)
-    onset = _onset(alarms[-1], upper, lower) if alarms else None
-    if alarms and alarms[-1].kind is AlarmKind.TREND:
+    # An alarm that has passed tells of a change that is none any more: its onset bounds no baseline.
+    present = _present(alarms, len(values))
+    onset = None if present is None else _onset(present, upper, lower)
+    if present is not None and present.kind is AlarmKind.TREND:
         change = _along_line(values, stds)
     else:
         change = _newest(values, stds, onset, chart)
@@ -218,7 +226,9 @@ def _newest(values: FloatArray, stds: FloatArray, onset: int | None, chart: Char
     last = len(values) - 1
     # What came after the onset is no part of what it is compared with.
     first = max(1, min(last if onset is None else onset + 1, chart.baseline))
-    newest = max(1, min(_RECENT, len(values) - first))
+    # Nor is what came between baseline and onset part of what is new.
+    since = first if onset is None else max(first, onset + 1)
+    newest = max(1, min(_RECENT, len(values) - since))
     baseline, baseline_std = _mean(values[:first], stds[:first])
     recent, recent_std = _mean(values[-newest:], stds[-newest:])
     change = recent - baseline if last else 0.0
@@ -247,6 +257,11 @@ def _alarm(index: int, found: tuple[float, float, float, float], chart: Chart) -
     if abs(slope) > chart.trend:
         return Alarm(index, AlarmKind.TREND, bool(slope > 0))
     return None
+
+
+def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:
+    """The alarm of the newest of `count` calibrations."""
+    return alarms[-1] if alarms and alarms[-1].index == count - 1 else None
 
 
 def _onset(alarm: Alarm, upper: FloatArray, lower: FloatArray) -> int:

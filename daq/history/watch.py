@@ -87,7 +87,7 @@ class Series:
 
     @property
     def onset(self) -> datetime | None:
-        """When the last calibration before the change was recorded; None without alarm."""
+        """When the last calibration before the change was recorded; None where the newest one raises no alarm."""
         if self.drift is None or self.drift.onset is None:
             return None
         return self.points[self.began + self.drift.onset].entry.recorded
@@ -114,12 +114,47 @@ def watch(
     """
     if not entries:
         return ()
-    found = [_known(entries, gain.axis) for gain in entries[-1].gains]
-    factors = _dispersions(found)
+    axes = {gain.axis: gain.unit for gain in entries[-1].gains}
+    factors = dispersions_of(entries, tuple(axes))
     return tuple(
-        _series(gain.axis, gain.unit, known, factor, [a for a in acknowledgements if a.axis == gain.axis], chart)
-        for gain, known, factor in zip(entries[-1].gains, found, factors, strict=True)
+        _series(
+            axis,
+            unit,
+            _known(entries, axis),
+            factors[axis],
+            [noted for noted in acknowledgements if noted.axis == axis],
+            chart,
+        )
+        for axis, unit in axes.items()
     )
+
+
+def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, float]:
+    """How much more a cell's calibrations scatter than their σ says, by axis, in the order of `axes`.
+
+    Of the calibrations that identified an axis, one for the same logs (`of_each_recording`). Axes that the same
+    recordings identified are told together (`ident.drift.dispersions`), also where a gain of one of them was held fixed
+    when these were fitted again; an axis that was identified from others is told by itself.
+
+    Args:
+        entries: of one cell.
+        axes: names; without an entry that identified it, an axis has what is said before there is a history.
+
+    Returns:
+        at least 1 each, `ident.drift.DISPERSION` before there are five recordings of the axis.
+    """
+    alike: dict[tuple[str, ...], dict[str, list[Gain]]] = {}
+    for axis in axes:
+        known = _known(entries, axis)
+        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = [gain for _, gain in known]
+    factors: dict[str, float] = {}
+    for together in alike.values():
+        values, stds = (
+            np.array([[getattr(gain, part) for gain in gains] for gains in together.values()])
+            for part in ("value", "std")
+        )
+        factors |= zip(together, map(float, dispersions(values, stds)), strict=True)
+    return {axis: factors[axis] for axis in axes}
 
 
 def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
@@ -175,12 +210,3 @@ def _series(
 
 def _change(before: Gain, after: Gain, dispersion: float) -> Change:
     return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
-
-
-def _dispersions(found: list[list[tuple[Entry, Gain]]]) -> list[float]:
-    """Of all axes together where the same calibrations identified them all, else of each by itself."""
-    values = [[gain.value for _, gain in known] for known in found]
-    stds = [[gain.std for _, gain in known] for known in found]
-    if len({tuple(entry.digest for entry, _ in known) for known in found}) == 1:
-        return [float(factor) for factor in dispersions(values, stds)]
-    return [float(dispersions(np.array([v]), np.array([s]))[0]) for v, s in zip(values, stds, strict=True)]

@@ -37,12 +37,12 @@ _SEVERAL = (
 def alarm_words(series: Series) -> str | None:
     """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
     drift, onset = series.drift, series.onset
-    if drift is None or onset is None or not drift.alarmed:
+    if drift is None or drift.alarm is None or onset is None:
         return None
     rose, since = drift.change_percent > 0, f"since {onset:%Y-%m-%d}"
     percent, sigmas = f"{abs(drift.change_percent):.1f} %", f"{abs(drift.change_sigmas):.1f} σ"
     moved = "rose" if rose else "fell"
-    match drift.alarms[-1].kind:
+    match drift.alarm.kind:
         case AlarmKind.DRIFT:
             told = f"{moved} {percent} {since}"
         case AlarmKind.JUMP:

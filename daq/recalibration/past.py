@@ -8,19 +8,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.history.in_force import stds_in_force
 from daq.history.store import HistoryStore
-from daq.history.watch import of_each_recording, watch
+from daq.history.watch import dispersions_of, watch
 from daq.history.words import alarm_words
 from daq.recalibration.session import WatchedGain, digest_of
 from daq.write_back.audit import told_of
 from daq.write_back.link import followed
 from ident.calibration import Calibration
-from ident.drift import DISPERSION, dispersions
 
 
 class Past:
@@ -97,13 +94,8 @@ class Past:
         return stds_in_force(entries, in_force, gains)
 
     def dispersions(self) -> dict[str, float]:
-        """How much more this cell's calibrations scatter than their σ says, by axis (`ident.drift.dispersions`)."""
-        entries = of_each_recording([entry for entry in self._store.entries() if entry.digest != self._digest])
-        rows = [{gain.axis: gain for gain in entry.gains if gain.std > 0} for entry in entries]
-        whole = [row for row in rows if set(self._axes) <= row.keys()]
-        if not whole:
-            return dict.fromkeys(self._axes, DISPERSION)
-        values, stds = (
-            np.array([[getattr(row[axis], part) for row in whole] for axis in self._axes]) for part in ("value", "std")
-        )
-        return dict(zip(self._axes, map(float, dispersions(values, stds)), strict=True))
+        """How much more this cell's calibrations scatter than their σ says, by axis, as the charts have it.
+
+        Without this session's own calibration, which is what is judged by it.
+        """
+        return dispersions_of([entry for entry in self._store.entries() if entry.digest != self._digest], self._axes)

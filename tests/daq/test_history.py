@@ -16,6 +16,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from daq.calibration_file import save
@@ -26,13 +27,16 @@ from daq.configuration.history_place import HistoryPlace
 from daq.history.entry import Deed, Entry, Event, logs_of, recorded_at
 from daq.history.store import HistoryStore
 from daq.history.table import COLUMNS
-from daq.history.watch import Series, watch
+from daq.history.watch import Series, dispersions_of, watch
 from daq.history.words import alarm_words, questions
+from daq.recalibration.past import Past
 from daq.recalibration.session import Basis, begin
 from daq.recalibration.session import save as save_session
 from daq.write_back.audit import AuditAction, append, read
 from daq.write_back.controller_file import decode as read_controller
 from daq.write_back.scalar import respell
+from ident.calibration import Calibration, Gain
+from ident.drift import DISPERSION, dispersions
 from tests.daq.calibrations import AXES, recorded, with_recordings
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, fill
 
@@ -183,6 +187,19 @@ def test_a_drift_from_the_first_day_is_told_as_steady(cell: Path, capsys: pytest
     assert b"steady change" in picture.read_bytes()
 
 
+def test_an_alarm_that_has_passed_has_no_date(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """5 % on one day, the fourth: its row keeps the alarm, and what is told of the gain is as of any other."""
+    _filled(cell, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
+    series = _series(cell)[3]
+    assert series.alarm_at(3) is not None
+    assert (series.alarmed, series.onset, alarm_words(series)) == (False, None, None)
+    (axis,) = _json(capsys, str(cell), "--axis", "J4")["axes"]
+    assert (axis["alarmed"], axis["alarm"], axis["since"]) == (False, None, None)
+    known = [point.gain.value for point in series.points[:12]]
+    stds = [point.gain.std for point in series.points[:12]]
+    assert axis["baseline"] == pytest.approx(np.average(known, weights=np.array(stds) ** -2.0))
+
+
 def test_without_a_drift_there_is_no_alarm(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _filled(cell, 25, lambda _: FLAT)
     assert main(["history", str(cell)]) == 0
@@ -274,6 +291,74 @@ def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.Cap
     assert [len(series.points) for series in _series(cell)] == [3, 4, 4, 4, 4, 4]
     assert main(["history", str(cell)]) == 0
     assert "J1" in capsys.readouterr().out
+
+
+def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, float]:
+    """Those that a job judges by, which has kept its own calibration where one is given."""
+    declared = load_cell(cell)
+    controller = declared.controller_path
+    assert controller is not None
+    with Past(declared, _place(cell), controller, lambda: BEGIN, "job") as past:
+        if own is not None:
+            file = cell.parent / "own.yaml"
+            save(own, file)
+            past.keep(own, file)
+        return past.dispersions()
+
+
+def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
+    """Also where a session was fitted again with a gain held fixed, and where that is its only fit."""
+    _filled(cell, 12, lambda week: (1.0 + 0.012 * (-1) ** week,) * 6)
+    before = {series.axis: series.dispersion for series in _series(cell)}
+    assert min(before.values()) > 1.5
+    assert _job_s_dispersions(cell) == before
+    fitted = calibration_of(5, (1.0 - 0.012,) * 6)
+    again = replace(fitted, gains=(replace(fitted.gains[0], std=0.0), *fitted.gains[1:]))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, again)
+    charts = _series(cell)
+    assert [len(series.points) for series in charts] == [12] * 6
+    refitted = {series.axis: series.dispersion for series in charts}
+    assert _job_s_dispersions(cell) == refitted
+    assert refitted == pytest.approx(before, rel=0.05)  # the same recordings of all axes as before
+    alone = calibration_of(12)
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:])))
+    charts = _series(cell)
+    assert [len(series.points) for series in charts] == [12, 13, 13, 13, 13, 13]
+    found = {series.axis: series.dispersion for series in charts}
+    assert _job_s_dispersions(cell) == found
+    # What a session has found itself is not what it is judged by.
+    assert _job_s_dispersions(cell, calibration_of(13, (1.2,) * 6)) == found
+    assert {series.axis: series.dispersion for series in _series(cell)} != found
+
+
+def test_the_scatter_of_axes_is_told_together_where_the_same_recordings_know_them() -> None:
+    rng = np.random.default_rng(12)
+    names = tuple(f"J{number}" for number in range(1, 4))
+    values = rng.normal(10.0, 0.3, (9, 3))
+    entries = [
+        replace(
+            _entry(str(week)),
+            logs=str(week),
+            recorded=BEGIN + timedelta(weeks=week),
+            # J3 was held fixed once.
+            gains=tuple(
+                Gain(axis, float(value), 0.0 if (axis, week) == ("J3", 4) else 0.1, "Nm/A", 10.0)
+                for axis, value in zip(names, row, strict=True)
+            ),
+        )
+        for week, row in enumerate(values)
+    ]
+    found = dispersions_of(entries, names)
+    assert tuple(found) == names
+    np.testing.assert_allclose([found["J1"], found["J2"]], dispersions(values[:, :2].T, np.full((2, 9), 0.1)))
+    alone = np.delete(values[:, 2], 4)
+    np.testing.assert_allclose(found["J3"], dispersions([alone], np.full((1, 8), 0.1))[0])
+    assert dispersions_of(entries[:4], names) == dict.fromkeys(names, DISPERSION)
+    assert dispersions_of((), names) == dict.fromkeys(names, DISPERSION)
+    assert dispersions_of(entries, ("J9",)) == {"J9": DISPERSION}
+    assert dispersions_of(entries, ()) == {}
 
 
 def test_an_axis_has_a_table_of_its_own(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,12 @@ def test_what_is_known_exactly_changes_surely_or_not_at_all() -> None:
             change_significance(*wrong)
 
 
+@pytest.mark.parametrize("wrong", [-0.5, math.nan, math.inf])
+def test_a_dispersion_that_is_none_is_shown(wrong: float) -> None:
+    with pytest.raises(ValueError, match=rf"dispersion ≥ 0, found .* dispersion {wrong}$"):
+        change_significance(1.0, 0.1, 1.0, 0.1, dispersion=wrong)
+
+
 def test_probabilities_of_no_change_are_uniform() -> None:
     rng = np.random.default_rng(1)
     found = [
@@ -188,6 +194,17 @@ def test_a_step_is_told_with_its_size_its_time_and_its_side() -> None:
     assert found.alarms[0].kind is AlarmKind.DRIFT  # 14 σ at once are beyond both limits
 
 
+@pytest.mark.parametrize(("count", "newest"), [(15, 1), (16, 2), (17, 3), (18, 3)])
+def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int) -> None:
+    """What lies before the onset is no part of what came after it."""
+    values = np.r_[np.full(14, 10.0), np.full(count - 14, 9.4)]
+    found = cusum(values, np.full(count, 0.04))
+    assert found.alarmed
+    assert found.onset == 13
+    assert found.change_percent == pytest.approx(-6.0)
+    assert found.change_sigmas == pytest.approx(-0.6 / (DISPERSION * 0.04 * math.sqrt(1 / newest + 1 / 12)))
+
+
 def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None:
     values = np.r_[np.full(5, 10.0), np.full(4, 10.6)]
     found = cusum(values, np.full(9, 0.04))
@@ -204,6 +221,41 @@ def test_one_calibration_far_off_is_a_jump() -> None:
     calm = cusum(np.r_[values, 10.0, 10.0], np.full(17, 0.04))
     assert calm.alarms == found.alarms
     assert not calm.alarmed
+    assert (found.alarm, calm.alarm) == (found.alarms[0], None)
+
+
+def test_an_alarm_that_has_passed_changes_nothing_of_what_is_told() -> None:
+    """After a jump on the fourth day: twelve calibrations are the baseline again, that one among them."""
+    values = np.full(20, 10.0)
+    values[3] = 10.0 + 0.04 * DISPERSION * 6.5
+    assert cusum(values[:4], np.full(4, 0.04)).onset == 2
+    found = cusum(values, np.full(20, 0.04))
+    assert [alarm.index for alarm in found.alarms] == [3]
+    assert (found.alarmed, found.alarm, found.onset, found.steady) == (False, None, None, False)
+    assert found.baseline == pytest.approx(values[:12].mean())
+    assert found.baseline_std == pytest.approx(DISPERSION * 0.04 / math.sqrt(12))
+    assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
+
+
+def test_a_slope_that_has_ended_is_not_told_along_its_line() -> None:
+    """It rises by 0.7 σ a calibration for eight of them, and is back where it was."""
+    values = 10.0 * (1.0 + 0.0028 * np.r_[np.arange(8), np.zeros(8)])
+    assert cusum(values[:8], np.full(8, 0.04)).steady
+    found = cusum(values, np.full(16, 0.04))
+    assert found.alarms[-1].kind is AlarmKind.TREND
+    assert (found.alarmed, found.alarm, found.onset, found.steady) == (False, None, None, False)
+    assert found.baseline == pytest.approx(values[:12].mean())
+    assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.sampled_from([10.0, 10.0, 10.05, 9.95, 10.6, 9.4]), min_size=2, max_size=30))
+def test_an_onset_is_told_in_alarm_only(values: list[float]) -> None:
+    found = cusum(values, np.full(len(values), 0.04))
+    assert found.alarmed == (found.onset is not None) == (found.alarm is not None)
+    if not found.alarmed:
+        assert not found.steady
+        assert found.baseline == pytest.approx(np.mean(values[: min(len(values) - 1, CHART.baseline)]))
 
 
 def test_one_calibration_is_its_own_baseline() -> None:
