@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import getpass
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,8 +11,13 @@ from typing import Annotated
 import typer
 
 from daq.configuration.cell import Cell
-from daq.errors import AuditUnusable
+from daq.errors import AuditUnusable, DaqError
+from daq.history.judgement import NOTHING, Known, known_of
 from daq.history.store import HistoryStore
+from daq.login import login
+from daq.write_back.controller_write import sha256
+from daq.write_back.gain_gates import GainChange
+from daq.write_back.request import Request
 
 _LOG = logging.getLogger("drivegain")
 
@@ -43,8 +47,8 @@ class Applier:
 
 def applier(by: str | None) -> Applier:
     """Whoever runs this, by the name given."""
-    login = getpass.getuser()
-    return Applier(by or login, login)
+    user = login()
+    return Applier(by or user, user)
 
 
 def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
@@ -84,6 +88,17 @@ def _is_same(audit: Path, other: Path) -> bool:
         return audit.samefile(other)
     except OSError:
         return False
+
+
+def ask_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
+    """What the cell's history knows that a change is judged by; one that cannot be read knows nothing."""
+    if cell.history is None:
+        return NOTHING
+    try:
+        with HistoryStore(cell.history.store) as store:
+            return known_of(store, target, sha256(request.signed), changes)
+    except DaqError:  # `tell_history` says so, once something is written
+        return NOTHING
 
 
 def tell_history(cell: Cell, tell: Callable[[HistoryStore], object]) -> None:

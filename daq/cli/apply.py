@@ -15,15 +15,13 @@ import typer
 from rich.console import Console
 
 from daq.calibration_file import decode, read
-from daq.cli.applier import Applier, ByOption, applier, audit_of, tell_history
+from daq.cli.applier import Applier, ByOption, applier, ask_history, audit_of, tell_history
 from daq.cli.apply_drives import apply_drives
 from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
-from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
-from daq.errors import CalibrationRefused, DaqError, OutputFailed, UsageError
-from daq.history.in_force import stds_in_force
+from daq.errors import CalibrationRefused, OutputFailed, UsageError
 from daq.history.store import HistoryStore
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
@@ -94,19 +92,19 @@ def apply_verb(
         apply_drives(declared, cell, request, doer=doer, saving=saving, audit=book, yes=yes, json=json)
         return
     proposal = propose_for(declared, request, to)
-    stds = _stds_in_file(declared, proposal)
+    known = ask_history(declared, str(followed(proposal.file)), request, proposal.changes)
     if not json:
-        show(proposal, Console(), stds)
+        show(proposal, Console(), known)
     try:
         written = _write(proposal, request.now, book, doer) if yes else None
     except CalibrationRefused:
         if json:
-            print_json({**describe(proposal, None, stds), "base": proposal.looked_at})
+            print_json({**describe(proposal, None, known), "base": proposal.looked_at})
         raise
     if yes and not proposal.refusals:
         tell_history(declared, partial(_enter, proposal, written, request, doer, book))
     if json:
-        print_json({**describe(proposal, written, stds), "base": proposal.looked_at})
+        print_json({**describe(proposal, written, known), "base": proposal.looked_at})
     if proposal.refusals:
         if not yes and not json:
             _say_way_on(proposal)
@@ -176,18 +174,6 @@ def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier)
         return apply(proposal, now, audit=audit, who=str(doer))
     except OSError as error:
         raise OutputFailed.of(proposal.file, error) from error
-
-
-def _stds_in_file(declared: Cell, proposal: Proposal) -> dict[str, float]:
-    """σ of the gains in the controller's file where the history knows it; a history that cannot be read knows none."""
-    if declared.history is None:
-        return {}
-    try:
-        with HistoryStore(declared.history.store) as store:
-            in_force = store.in_force(str(followed(proposal.file)))
-            return stds_in_force(store.entries(), in_force, {change.axis: change.old for change in proposal.changes})
-    except DaqError:  # `tell_history` says so, once something is written
-        return {}
 
 
 def _enter(

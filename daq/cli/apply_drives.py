@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from daq.cli.applier import Applier, tell_history
+from daq.cli.applier import Applier, ask_history, tell_history
 from daq.cli.drives import kept, on_the_bus, outcome
 from daq.cli.verb import print_json
 from daq.configuration.cell import Cell
 from daq.errors import OutputFailed
+from daq.history.judgement import Known
 from daq.history.store import HistoryStore
-from daq.report.proposal import change_table
+from daq.report.proposal import show_changes
 from daq.write_back.controller_write import sha256
-from daq.write_back.drive_proposal import DriveProposal, propose_to_drives, refused
+from daq.write_back.drive_proposal import DriveProposal, drives_of, propose_to_drives, refused
 from daq.write_back.drive_record import record_folder
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives
 from daq.write_back.request import Request
@@ -49,7 +51,7 @@ def apply_drives(
     with on_the_bus(declared) as network:
         proposal = propose_to_drives(declared, request, network)
         if not json:
-            _show(proposal, Console())
+            _show(proposal, ask_history(declared, drives_of(declared.name), request, proposal.changes), Console())
         if yes and proposal.refusals and json:
             print_json(_described(proposal, None))
         if yes:
@@ -67,11 +69,8 @@ def apply_drives(
         _say_outcome(proposal, written, saving, cell_file)
 
 
-def _show(proposal: DriveProposal, console: Console) -> None:
-    table = change_table(proposal.changes)
-    table.columns[1].header = "in the drive"
-    console.print(table)
-    console.print()
+def _show(proposal: DriveProposal, known: Known, console: Console) -> None:
+    show_changes(proposal.changes, console, known, "in the drive")
     for change, value in zip(proposal.changes, proposal.base, strict=True):
         console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}", markup=False, highlight=False)
 
@@ -95,16 +94,7 @@ def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[s
             }
             for change in proposal.changes
         ],
-        "refusals": [
-            {
-                "gate": one.gate.value,
-                "subject": one.subject,
-                "found": one.found,
-                "expected": one.expected,
-                "remedy": one.remedy,
-            }
-            for one in proposal.refusals
-        ],
+        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals],
     }
 
 

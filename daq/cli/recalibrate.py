@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import os
 import sys
 from dataclasses import replace
@@ -17,6 +16,7 @@ from daq.cli.residual_report import save_report
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell_file import load_cell
 from daq.errors import DaqError, ExitCode, exit_code
+from daq.login import login
 from daq.recalibration.job import preview, recalibrate
 from daq.recalibration.journal import Form, Journal, Level, form_of
 from daq.recalibration.report import document, text
@@ -67,7 +67,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     declared = load_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
-    who = f"drivegain recalibrate, {getpass.getuser()}"
+    who = f"drivegain recalibrate, {login()}"
     tools = Tools(save_report=save_report)
     with interruptible() as undisturbed:
         if dry_run:

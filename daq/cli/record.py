@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import shlex
 import uuid
 from pathlib import Path
@@ -18,6 +17,7 @@ from daq.configuration.cell import Cell, MotionPolicy, Pacing
 from daq.configuration.cell_bus import bus_loads
 from daq.configuration.cell_file import load_cell
 from daq.errors import DiskSpaceShort, ExitCode, OutputExists, OutputFailed, UsageError
+from daq.login import login
 from daq.payload_mass import check_entered_mass
 from daq.plan import slowed
 from daq.plan_file import load_plan
@@ -55,7 +55,7 @@ def record_verb(
     """
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
-    who = operator or getpass.getuser()
+    who = operator or login()
     carried = mounted(declared, payload)
     check_entered_mass(declared, carried, mass)
     if carried is not None and mass is None:

@@ -12,6 +12,11 @@ FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)
 """Without power in the motor, and with nobody's wish for it."""
 
+LEFT_BEHIND = (
+    " (so a recorder that was killed leaves a drive to which no SYNC comes any more: `drivegain record` takes it over, "
+    "or switch it off and on)"
+)
+
 
 def check_drives(cell: Cell, undisturbed: Undisturbed) -> None:
     """Read identity and state of every drive; nothing is changed and nothing moves.
@@ -33,4 +38,5 @@ def check_drives(cell: Cell, undisturbed: Undisturbed) -> None:
                 reason = f"{state} before the job began; find its cause, then reset it"
                 raise DriveFault(axis.node_id, reason, statusword)
             if state not in IDLE:
-                raise StateRefused(axis.node_id, "no power before a job begins", str(state), statusword)
+                left = LEFT_BEHIND if state is State.QUICK_STOP_ACTIVE else ""
+                raise StateRefused(axis.node_id, "no power before a job begins", f"{state}{left}", statusword)

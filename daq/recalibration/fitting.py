@@ -54,14 +54,16 @@ def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Ses
 
 
 def calibration_of_session(session: Session) -> Calibration | None:
-    """The calibration that the state speaks of, None where there is none or where the file is another one."""
+    """The calibration that the state speaks of, None where there is none, or where it is not of the session's logs."""
     path, fitted = session.folder / CALIBRATION, session.state.fitted
     if fitted is None or digest_of(path) != fitted.calibration_sha256:
         return None
     try:
-        return _loaded(path, fitted.calibration_sha256)
+        found = _loaded(path, fitted.calibration_sha256)
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
+    own = {run.sha256 for run in session.state.runs}
+    return found if {source.sha256 for source in found.sources} == own else None
 
 
 @lru_cache(maxsize=2)

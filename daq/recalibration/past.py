@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -10,12 +10,13 @@ from typing import Self
 
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
-from daq.history.in_force import stds_in_force
+from daq.history.judgement import Known, known_of
 from daq.history.store import HistoryStore
-from daq.history.watch import dispersions_of, watch
+from daq.history.watch import watch
 from daq.history.words import alarm_words
 from daq.recalibration.session import WatchedGain, digest_of
 from daq.write_back.audit import told_of
+from daq.write_back.gain_gates import GainChange
 from daq.write_back.link import followed
 from ident.calibration import Calibration
 
@@ -34,7 +35,6 @@ class Past:
     def __init__(
         self, cell: Cell, place: HistoryPlace, controller: Path, now: Callable[[], datetime], who: str
     ) -> None:
-        self._axes = cell.axis_names
         self._target = str(followed(controller))
         self._now = now
         self._who = who
@@ -82,20 +82,6 @@ class Past:
         series = watch(self._store.entries(), self._store.acknowledgements())
         return tuple(WatchedGain(axis=one.axis, alarm=alarm_words(one) or "") for one in series)
 
-    def stds_in_force(self, gains: dict[str, float]) -> dict[str, float]:
-        """σ of gains in the controller's file, by axis (`daq.history.in_force`).
-
-        Args:
-            gains: in the file now, by axis.
-        """
-        in_force = self._store.in_force(self._target)
-        # This session's own calibration is what is judged: a number that happens to be near to it is not it.
-        entries = [one for one in self._store.entries() if one.digest == in_force or one.digest != self._digest]
-        return stds_in_force(entries, in_force, gains)
-
-    def dispersions(self) -> dict[str, float]:
-        """How much more this cell's calibrations scatter than their σ says, by axis, as the charts have it.
-
-        Without this session's own calibration, which is what is judged by it.
-        """
-        return dispersions_of([entry for entry in self._store.entries() if entry.digest != self._digest], self._axes)
+    def known(self, changes: Sequence[GainChange]) -> Known:
+        """What the changes by this session's calibration are judged by. Raises as `keep`."""
+        return known_of(self._store, self._target, self._digest, changes)

@@ -47,7 +47,7 @@ class GainTarget:
 
 @dataclass(frozen=True, slots=True)
 class Cellside:
-    """What every recording of a job needs.
+    """What every step of a job needs.
 
     Attributes:
         file, cell, section: the cell file, what it says, and its `recalibration`.

@@ -22,8 +22,11 @@ from pydantic import ValidationError
 from daq.atomic_file import replace_file
 from daq.configuration.yaml_file import StrictModel
 from daq.errors import OutputFailed
+from daq.regular_file import open_regular, read_regular
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
+LARGEST_STATE_BYTES = 4 << 20
+"""A job writes a few kilobytes."""
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 
@@ -290,15 +293,15 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
 
 
 def digest_of(path: Path) -> str | None:
-    """SHA-256 of a file, hex; None where there is none."""
-    with suppress(FileNotFoundError), path.open("rb") as stream:
+    """SHA-256 of a file, hex; None where there is no regular file that can be read."""
+    with suppress(OSError), open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
     return None
 
 
 def _read(path: Path) -> SessionState | None:
     with suppress(OSError, ValidationError, ValueError):
-        state = SessionState.model_validate_json(path.read_bytes())
+        state = SessionState.model_validate_json(read_regular(path, LARGEST_STATE_BYTES))
         # Ages are counted from them, so each must be a time, and of a known zone.
         if all(time.utcoffset() is not None for time in _times(state)):
             return state

@@ -12,6 +12,7 @@ from daq.atomic_file import replace_file
 from daq.calibration_file import read
 from daq.configuration.apply_policy import AppliedBy
 from daq.errors import DaqError, OutputFailed
+from daq.history.judgement import judge
 from daq.recalibration import session as sessions
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.past import Past
@@ -25,7 +26,7 @@ from daq.write_back.gates import Gate
 from daq.write_back.link import followed
 from daq.write_back.request import Request
 from ident.calibration import Calibration
-from ident.drift import FALSE_ALARM, decide
+from ident.drift import FALSE_ALARM
 
 TOUCHED = "The controller's file was written or rolled back since the session began: a person decides."
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
@@ -44,7 +45,7 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
     path, now = session.folder / CALIBRATION, side.tools.now()
     request = Request(calibration, now, file=path, content=read(path))
     proposal = side.tools.propose(side.cell, request)
-    decision = judge(proposal, calibration, past)
+    decision = decision_of(proposal, past)
     differs, touched = any(gain.differs for gain in decision.gains), _written_since(side, session)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {TOUCHED}"})
@@ -100,37 +101,27 @@ def by_a_person(side: Cellside) -> bool:
     return side.cell.apply.by is AppliedBy.PERSON or bool(side.target.controller.objects)
 
 
-def judge(proposal: Proposal, calibration: Calibration, past: Past) -> Decision:
-    """Whether any gain differs from the controller's by more than chance (`ident.drift.decide`).
+def decision_of(proposal: Proposal, past: Past) -> Decision:
+    """Whether any gain differs from the controller's by more than chance (`daq.history.judgement`).
 
     An axis differs by itself where its probability among all of them says so.
     """
-    units = {gain.axis: gain.unit for gain in calibration.gains}
-    # What is no number is refused by a gate of its own.
-    changes = [change for change in proposal.changes if all(map(math.isfinite, (change.old, change.new, change.std)))]
-    in_force, dispersion = past.stds_in_force({change.axis: change.old for change in changes}), past.dispersions()
-    stds = [in_force[change.axis] for change in changes]
-    found = decide(
-        tuple(change.axis for change in changes),
-        [change.old for change in changes],
-        stds,
-        [change.new for change in changes],
-        [change.std for change in changes],
-        dispersion=[dispersion[change.axis] for change in changes],
-    )
+    known = past.known(proposal.changes)
+    found = judge(proposal.changes, known)
+    changes = {change.axis: change for change in proposal.changes}
     gains = tuple(
         JudgedGain(
-            axis=change.axis,
-            unit=units[change.axis],
-            old=change.old,
-            old_std=old_std,
-            new=change.new,
-            new_std=change.std,
+            axis=axis,
+            unit=changes[axis].unit,
+            old=changes[axis].old,
+            old_std=known.stds[axis],
+            new=changes[axis].new,
+            new_std=changes[axis].std,
             change_percent=_finite(told.percent),
             drift_sigma=_finite(told.sigmas),
             differs=probability <= FALSE_ALARM,
         )
-        for change, old_std, told, probability in zip(changes, stds, found.changes, found.adjusted, strict=True)
+        for axis, told, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
     )
     return Decision(gains=gains, remark=found.words)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from rich import box
@@ -11,50 +11,58 @@ from rich.console import Console
 from rich.syntax import Syntax
 from rich.table import Table
 
+from daq.history.judgement import NOTHING, Known, judge
 from daq.report.gain_table import with_deviation
 from daq.report.terminal_text import terminal_lines, terminal_text
 from daq.write_back.apply import Proposal
 from daq.write_back.controller_write import Written
 from daq.write_back.gain_gates import GainChange
-from ident.drift import FALSE_ALARM, ChangeDecision, decide
-
-_NOTHING_KNOWN: Mapping[str, float] = {}
+from ident.drift import FALSE_ALARM
 
 
-def show(proposal: Proposal, console: Console, stds_in_file: Mapping[str, float] = _NOTHING_KNOWN) -> None:
-    """The change as a table and as a diff; `stds_in_file` as of `significant`."""
-    console.print(change_table(proposal.changes, stds_in_file))
-    exact = [change.axis for change in proposal.changes if not stds_in_file.get(change.axis)]
-    whose = "all axes" if len(exact) == len(proposal.changes) else ", ".join(exact)
-    taken = f"the number in the file taken as exact ({whose})" if exact else "σ of both"
-    told = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
-    console.print(terminal_text(told), style="dim")
-    console.print()
+def show(proposal: Proposal, console: Console, known: Known = NOTHING) -> None:
+    """The change as a table and as a diff, judged by what a history knows."""
+    show_changes(proposal.changes, console, known)
     if proposal.diff:
         console.print(Syntax(terminal_lines(proposal.diff), "diff", background_color="default", word_wrap=True))
 
 
-def change_table(changes: tuple[GainChange, ...], stds_in_file: Mapping[str, float] = _NOTHING_KNOWN) -> Table:
+def show_changes(
+    changes: tuple[GainChange, ...], console: Console, known: Known = NOTHING, place: str = "in the file"
+) -> None:
+    """The table of `change_table`, and what its stars say."""
+    console.print(change_table(changes, known, place))
+    exact = [change.axis for change in changes if not known.stds.get(change.axis)]
+    whose = "all axes" if len(exact) == len(changes) else ", ".join(exact)
+    taken = f"the number {place} taken as exact ({whose})" if exact else "σ of both"
+    told = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
+    console.print(terminal_text(told), style="dim")
+    console.print()
+
+
+def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place: str = "in the file") -> Table:
     """Old and new gain of each axis with what there is to judge the change by; fits a terminal of 80 columns.
 
     Args:
         changes: one an axis.
-        stds_in_file: as of `significant`.
+        known: by a history.
+        place: heading of the gains that are in the controller now.
     """
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
     table.add_column("axis", no_wrap=True)
-    for heading in ("in the file", "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %"):
+    for heading in (place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
-    beyond_noise = significant(changes, stds_in_file)
+    judged = _by_axis(changes, known)
     for change in changes:
+        sigmas, beyond_noise = judged.get(change.axis, (math.nan, False))
         table.add_row(
             terminal_text(change.axis),
             f"{change.old:.5g}",
             with_deviation(change.new, change.std),
             f"{change.std_percent:.2f}",
             f"{change.change_percent:+.1f}",
-            f"{_sigmas(change, stds_in_file):.1f} {'*' if change.axis in beyond_noise else ' '}",
+            f"{sigmas:.1f} {'*' if beyond_noise else ' '}",
             f"{change.nameplate:.5g}",
             f"{change.nameplate_percent:+.1f}",
             terminal_text(change.unit),
@@ -62,42 +70,23 @@ def change_table(changes: tuple[GainChange, ...], stds_in_file: Mapping[str, flo
     return table
 
 
-def significant(changes: tuple[GainChange, ...], stds_in_file: Mapping[str, float] = _NOTHING_KNOWN) -> frozenset[str]:
-    """Axes whose gain differs from the controller's by more than noise (`ident.drift`).
-
-    Args:
-        changes: one an axis.
-        stds_in_file: σ of the numbers that are in the controller now, by axis [unit of the gain]; one that is not
-            there, or 0, is taken as exact: somebody has entered it, or nothing is known of it.
-    """
-    comparable = [
-        change
-        for change in changes
-        if all(map(math.isfinite, (change.old, change.new, change.std))) and change.std >= 0.0
-    ]
-    if not comparable:
-        return frozenset()
-    found: ChangeDecision = decide(
-        tuple(change.axis for change in comparable),
-        [change.old for change in comparable],
-        [stds_in_file.get(change.axis, 0.0) for change in comparable],
-        [change.new for change in comparable],
-        [change.std for change in comparable],
-    )
-    return frozenset(axis for axis, p in zip(found.axes, found.adjusted, strict=True) if p <= FALSE_ALARM)
+def significant(changes: tuple[GainChange, ...], known: Known = NOTHING) -> frozenset[str]:
+    """Axes whose gain differs from the controller's by more than noise."""
+    return frozenset(axis for axis, (_, beyond_noise) in _by_axis(changes, known).items() if beyond_noise)
 
 
-def _sigmas(change: GainChange, stds_in_file: Mapping[str, float]) -> float:
-    """Change over σ of both; inf for a gain that was held fixed."""
-    std = math.hypot(change.std, stds_in_file.get(change.axis, 0.0))
-    return abs(change.new - change.old) / std if change.std else math.inf
+def _by_axis(changes: tuple[GainChange, ...], known: Known) -> dict[str, tuple[float, bool]]:
+    """Change in σ of both as calibrations scatter, and whether it is more than noise; of axes that can be compared."""
+    found = judge(changes, known)
+    return {
+        axis: (abs(change.sigmas), probability <= FALSE_ALARM)
+        for axis, change, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
+    }
 
 
-def describe(
-    proposal: Proposal, written: Written | None, stds_in_file: Mapping[str, float] = _NOTHING_KNOWN
-) -> dict[str, Any]:
-    """The proposal and its outcome for --json; `stds_in_file` as of `significant`."""
-    beyond_noise = significant(proposal.changes, stds_in_file)
+def describe(proposal: Proposal, written: Written | None, known: Known = NOTHING) -> dict[str, Any]:
+    """The proposal and its outcome for --json."""
+    judged = _by_axis(proposal.changes, known)
     return {
         "file": str(proposal.file),
         "base_sha256": proposal.base_sha256,
@@ -111,8 +100,8 @@ def describe(
                 "old": change.old,
                 "new": change.new,
                 "change_percent": change.change_percent,
-                "change_sigmas": _sigmas(change, stds_in_file),
-                "significant": change.axis in beyond_noise,
+                "change_sigmas": judged.get(change.axis, (None, False))[0],
+                "significant": judged.get(change.axis, (None, False))[1],
                 "std_percent": change.std_percent,
                 "nameplate": change.nameplate,
                 "nameplate_percent": change.nameplate_percent,
@@ -120,15 +109,6 @@ def describe(
             }
             for change in proposal.changes
         ],
-        "refusals": [
-            {
-                "gate": refusal.gate.value,
-                "subject": refusal.subject,
-                "found": refusal.found,
-                "expected": refusal.expected,
-                "remedy": refusal.remedy,
-            }
-            for refusal in proposal.refusals
-        ],
+        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals],
         "diff": proposal.diff,
     }

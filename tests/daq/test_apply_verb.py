@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import json
 import os
@@ -20,10 +19,13 @@ from daq.cli.apply import entered_masses, tightened
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
 from daq.errors import ExitCode, UsageError
+from daq.history.judgement import Known
 from daq.history.store import HistoryStore
+from daq.login import login
 from daq.report.proposal import significant
 from daq.write_back.audit import AuditAction, read, verify
 from daq.write_back.gain_gates import GainChange
+from ident.drift import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -79,7 +81,7 @@ def test_a_dry_run_is_a_table_a_diff_and_no_trace(bench: Bench, capsys: pytest.C
     shown = capsys.readouterr().out
     fourth = next(line for line in shown.splitlines() if line.startswith("J4"))
     # Old, new ± σ, σ %, change %, change in σ with its mark, nameplate, distance from it.
-    assert " ".join(fourth.split()) == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 62.7 * -11.52 -20.1 Nm/A"
+    assert " ".join(fourth.split()) == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
     assert "+    gain: -9.2100" in shown
     assert "nothing was written" in shown
     assert bench.controller.read_bytes() == before
@@ -116,7 +118,7 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
     assert bench.controller.read_bytes() == before
     there, back = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED], [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
-    assert read(bench.audit)[2].who == f"Ada (login {getpass.getuser()})"
+    assert read(bench.audit)[2].who == f"Ada (login {login()})"
     with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
         assert [event.target for event in store.events()] == [str(bench.controller)] * 2
 
@@ -127,7 +129,7 @@ def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     begun, applied = read(bench.audit)
     assert (begun.action, begun.who, begun.subject) == (
         AuditAction.APPLY_BEGUN,
-        getpass.getuser(),
+        login(),
         str(bench.controller),
     )
     assert applied.details == {"begun": begun.number}
@@ -301,7 +303,7 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
-    assert significant((middle,), {"J4": 0.07}) == frozenset()
+    assert significant((middle,), Known({"J4": 0.07})) == frozenset()
 
 
 def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
@@ -313,14 +315,14 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
         found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
         return found
 
-    assert fourth()["change_sigmas"] == pytest.approx(2.31 / 0.03684)  # entered by hand: exact
+    assert fourth()["change_sigmas"] == pytest.approx(2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
     assert bench.apply("--yes") == ExitCode.OK
     known = decode(bench.calibration.read_bytes(), "")
     gain = known.gains[3]
     moved = replace(gain, value=gain.value * 1.015)
     save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
     found = fourth()
-    assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (0.03684 * 2**0.5), rel=0.01)
+    assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01)
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
     assert bench.apply() == ExitCode.OK
     assert "σ of both" in capsys.readouterr().out

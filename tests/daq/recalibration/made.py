@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import shutil
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -13,6 +11,7 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.fit import Fit
 from daq.plan import Plan
+from daq.recalibration.session import digest_of
 from daq.recalibration.tools import Tools
 from daq.record import Recorded
 from daq.resources import shipped_configurations
@@ -49,15 +48,16 @@ class Made:
 
         def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **further: Any) -> Recorded:
             further["before_motion"]()
-            shutil.copyfile(self.logs[out.stem], out)
+            # Logs of another day are other logs; the fit that would read them knows its result already.
+            out.write_bytes(self.logs[out.stem].read_bytes() + str(rig.clock.at).encode())
             return replace(self.recorded[out.stem], path=out)
 
         def in_this_cell(_fit: Fit, created: datetime) -> Calibration:
-            # Logs of another day are other logs.
+            session = rig.sessions[-1].folder
             sources = tuple(
                 replace(
                     source,
-                    sha256=hashlib.sha256(f"{source.sha256} {created}".encode()).hexdigest(),
+                    sha256=digest_of(session / f"{source.name}.mcap") or "",
                     recording=source.recording
                     and replace(source.recording, controller_sha256=None, recorded_s=created.timestamp()),
                 )

@@ -213,6 +213,43 @@ def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, mo
     assert name("Nowhere") == name("nowhere") == "drivegain-socketcand-can0-nowhere-29536.lock"
 
 
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::", "::1", "::ffff:127.0.0.1", "::ffff:0.0.0.0", "::FFFF:7f00:1"],
+)
+def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
+    assert lock_name(hub) == lock_name(replace(hub, host="localhost")) == "drivegain-socketcand-can0-localhost-29536.lock"
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("::ffff:10.0.0.7", "10.0.0.7"), ("::ffff:a00:7", "10.0.0.7"), ("fd00:0::7", "fd00::7")]
+)
+def test_an_address_of_a_hub_may_be_spelt_in_several_ways(one: str, other: str, tmp_path: Path, made: Made) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    names = [
+        lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
+        for host in (one, other, "10.0.0.8")
+    ]
+    assert names[0] == names[1] != names[2]
+
+
+def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
+    tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As getaddrinfo answers where it maps; the IPv4 address goes before others as it does unmapped."""
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    known = {"hub": ["2001:db8::1", "::ffff:10.0.0.7"], "10.0.0.7": ["10.0.0.7"]}
+
+    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
+        return [(socket.AF_INET6 if ":" in one else socket.AF_INET, 1, 6, "", (one, port)) for one in known[host]]
+
+    monkeypatch.setattr(socket, "getaddrinfo", addresses)
+    hub = replace(bus, interface="socketcand", channel="can0", host="hub", port=29536)
+    assert lock_name(hub) == lock_name(replace(hub, host="10.0.0.7"))
+
+
 def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
     rig = make_rig(tmp_path / "cell", one_move)
     powered = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -14,9 +15,21 @@ from hypothesis import strategies as st
 
 from daq.configuration.cell_file import load_cell
 from daq.errors import ClockWentBack
+from daq.recalibration.fitting import calibration_of_session
 from daq.recalibration.metrics import file_stem
 from daq.recalibration.preflight import CLOCK_SLACK, require_clock
-from daq.recalibration.session import STATE, Basis, Outcome, Session, SessionState, begin, remove_old, save, sessions
+from daq.recalibration.session import (
+    STATE,
+    Basis,
+    Outcome,
+    Session,
+    SessionState,
+    begin,
+    digest_of,
+    remove_old,
+    save,
+    sessions,
+)
 from tests.daq.recalibration.made import Made, made_rig
 from tests.daq.recalibration.rig import BEGAN, make_rig
 
@@ -51,6 +64,26 @@ def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
             begin(tmp_path, replace(BASIS, cell=cell), BEGAN + timedelta(days=7 * week))
     assert len(remove_old(sessions(tmp_path, "demo"), 1, ())) == 2
     assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
+
+
+def test_nobody_waits_for_a_pipe_in_the_place_of_a_state_a_log_or_a_plan(tmp_path: Path) -> None:
+    session = begin(tmp_path, BASIS, BEGAN)
+    (session.folder / STATE).unlink()
+    os.mkfifo(session.folder / STATE)
+    assert sessions(tmp_path) == ()
+    assert digest_of(session.folder / STATE) is None
+    assert digest_of(session.folder) is None
+    assert digest_of(Path("/dev/zero")) is None
+
+
+def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.job()
+    session = rig.session
+    assert calibration_of_session(session) is not None
+    first, *others = session.state.runs
+    for runs in ((first.model_copy(update={"sha256": "0" * 64}), *others), tuple(others)):
+        assert calibration_of_session(replace(session, state=session.state.with_(runs=runs))) is None
 
 
 @pytest.mark.parametrize("key", ["began", "attempt_began", "ended"])

@@ -1,0 +1,26 @@
+"""Who runs the program is not what the environment says."""
+
+from __future__ import annotations
+
+import os
+import pwd
+
+import pytest
+
+from daq.cli.applier import applier
+from daq.login import login
+
+
+@pytest.mark.parametrize("variable", ["LOGNAME", "USER", "LNAME", "USERNAME"])
+def test_a_name_of_one_s_own_choice_is_nobody(monkeypatch: pytest.MonkeyPatch, variable: str) -> None:
+    monkeypatch.setenv(variable, "carol")
+    assert login() == pwd.getpwuid(os.getuid()).pw_name
+    assert applier("Ada").names == ("Ada", login())
+
+
+def test_a_user_without_a_name_has_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody(_number: int) -> pwd.struct_passwd:
+        raise KeyError
+
+    monkeypatch.setattr(pwd, "getpwuid", nobody)
+    assert login() == f"uid {os.getuid()}"
