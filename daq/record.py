@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -18,6 +17,7 @@ from daq.configuration.cell_bus import cell_address, drive_axes, load_warnings
 from daq.configuration.cell_file import bundle
 from daq.conversion import Scaling, scaling
 from daq.current_check import check_currents
+from daq.digest import sha256
 from daq.disk_space import DiskRoom, FreeBytes, free_bytes, largest_log_bytes
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.garbage import settled
@@ -214,7 +214,7 @@ def controller_digest(cell: Cell) -> str | None:
     """SHA-256 of the controller's file as it is now; None where the cell names none, or it is not to be had."""
     path = cell.controller_path
     try:
-        return None if path is None else hashlib.sha256(read_bytes(path)).hexdigest()
+        return None if path is None else sha256(read_bytes(path))
     except ControllerUnfit:
         return None
 

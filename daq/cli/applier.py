@@ -11,11 +11,11 @@ from typing import Annotated
 import typer
 
 from daq.configuration.cell import Cell
+from daq.digest import sha256
 from daq.errors import AuditUnusable, DaqError
 from daq.history.judgement import NOTHING, Known, known_of
 from daq.history.store import HistoryStore
 from daq.login import login
-from daq.write_back.controller_write import sha256
 from daq.write_back.gain_gates import GainChange
 from daq.write_back.request import Request
 

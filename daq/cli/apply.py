@@ -21,12 +21,13 @@ from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, savin
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
+from daq.digest import sha256
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
 from daq.history.store import HistoryStore
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
 from daq.write_back.audit import told_of
-from daq.write_back.controller_write import Written, sha256
+from daq.write_back.controller_write import Written
 from daq.write_back.gates import Gate
 from daq.write_back.link import followed
 from daq.write_back.request import Request

@@ -13,11 +13,11 @@ from daq.cli.applier import Applier, ask_history, tell_history
 from daq.cli.drives import kept, on_the_bus, outcome
 from daq.cli.verb import print_json
 from daq.configuration.cell import Cell
+from daq.digest import sha256
 from daq.errors import OutputFailed
 from daq.history.judgement import Known
 from daq.history.store import HistoryStore
 from daq.report.proposal import show_changes
-from daq.write_back.controller_write import sha256
 from daq.write_back.drive_proposal import DriveProposal, drives_of, propose_to_drives, refused
 from daq.write_back.drive_record import record_folder
 from daq.write_back.drive_write import DrivesWritten, apply_to_drives

@@ -17,8 +17,9 @@ from daq.cli.rollback_drives import rollback_drives
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
+from daq.digest import sha256
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
-from daq.write_back.controller_write import Restored, roll_back, sha256
+from daq.write_back.controller_write import Restored, roll_back
 
 
 def rollback(

@@ -7,11 +7,12 @@ from functools import lru_cache
 from pathlib import Path
 
 from daq.calibration_file import load, save
+from daq.digest import sha256_of
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, DataError, OutputFailed
 from daq.recalibration import session as sessions
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.recording import Cellside, log_of
-from daq.recalibration.session import CALIBRATION, REPORT, Fitted, Outcome, Session, digest_of
+from daq.recalibration.session import CALIBRATION, REPORT, Fitted, Outcome, Session
 from daq.report.fit import start_of
 from daq.report.residual_summary import summary
 from ident.calibration import Calibration
@@ -47,7 +48,7 @@ def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Ses
     except OSError as error:
         raise OutputFailed.of(path, error) from error
     side.tools.save_report(closed, changed, calibration, report)
-    fit = Fitted(calibration_sha256=digest_of(path) or "", sentences=summary(closed, changed))
+    fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
     for sentence in fit.sentences:
         journal.say(Level.INFO, "found", text=sentence)
     return sessions.save(replace(session, state=session.state.with_(fitted=fit))), calibration
@@ -56,7 +57,7 @@ def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Ses
 def calibration_of_session(session: Session) -> Calibration | None:
     """The calibration that the state speaks of, None where there is none, or where it is not of the session's logs."""
     path, fitted = session.folder / CALIBRATION, session.state.fitted
-    if fitted is None or digest_of(path) != fitted.calibration_sha256:
+    if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
     try:
         found = _loaded(path, fitted.calibration_sha256)

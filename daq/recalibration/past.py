@@ -10,11 +10,12 @@ from typing import Self
 
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
+from daq.digest import sha256_of
 from daq.history.judgement import Known, known_of
 from daq.history.store import HistoryStore
 from daq.history.watch import watch
 from daq.history.words import alarm_words
-from daq.recalibration.session import WatchedGain, digest_of
+from daq.recalibration.session import WatchedGain
 from daq.write_back.audit import told_of
 from daq.write_back.gain_gates import GainChange
 from daq.write_back.link import followed
@@ -61,7 +62,7 @@ class Past:
         Raises:
             HistoryMixed, HistoryUnreadable, OutputFailed: see `daq.history.store`.
         """
-        self._digest = digest_of(path) or ""
+        self._digest = sha256_of(path) or ""
         self._store.add(calibration, digest=self._digest, at=self._now())
 
     def note_applied(self, audit: Path, sha256_after: str) -> None:

@@ -14,13 +14,14 @@ from daq.configuration.cell import Cell
 from daq.configuration.controller_target import Controller
 from daq.configuration.history_place import HistoryPlace
 from daq.configuration.recalibration import PlannedRun, Recalibration
+from daq.digest import sha256_of
 from daq.errors import ConfigurationError, LogUnreadable, OutputFailed, RunInvalid
 from daq.log.framing import UNFINISHED
 from daq.plan import Plan
 from daq.plan_file import load_plan, save_plan
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.release import mount, require_release
-from daq.recalibration.session import Basis, RecordedRun, Session, digest_of, save
+from daq.recalibration.session import Basis, RecordedRun, Session, save
 from daq.recalibration.tools import Tools
 from daq.record import Recorded
 from daq.salvage import salvage
@@ -73,13 +74,13 @@ def log_of(session: Session, name: str) -> Path:
 
 def basis_of(cell: Cell, section: Recalibration) -> Basis:
     """What a session of this cell rests on now; a plan that is not there is another one."""
-    plans = [digest_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
+    plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
     return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
 
 
 def standing_runs(session: Session) -> Session:
     """The session without the runs whose logs are not what its state says."""
-    runs = tuple(run for run in session.state.runs if digest_of(log_of(session, run.name)) == run.sha256)
+    runs = tuple(run for run in session.state.runs if sha256_of(log_of(session, run.name)) == run.sha256)
     return replace(session, state=session.state.with_(runs=runs))
 
 
@@ -154,7 +155,7 @@ def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: P
             journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
             return RecordedRun(
                 name=planned.name,
-                sha256=digest_of(out) or "",
+                sha256=sha256_of(out) or "",
                 attempts=attempt,
                 samples=log.samples,
                 lost_cycles=lost,

@@ -6,7 +6,6 @@ the state, or not as the state has it, was left by a job that was killed.
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shutil
 from collections.abc import Collection
@@ -22,7 +21,7 @@ from pydantic import ValidationError
 from daq.atomic_file import replace_file
 from daq.configuration.yaml_file import StrictModel
 from daq.errors import OutputFailed
-from daq.regular_file import open_regular, read_regular
+from daq.regular_file import read_regular
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
 LARGEST_STATE_BYTES = 4 << 20
@@ -290,13 +289,6 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
                 shutil.rmtree(session.folder)
                 removed.append(session.folder)
     return tuple(removed)
-
-
-def digest_of(path: Path) -> str | None:
-    """SHA-256 of a file, hex; None where there is no regular file that can be read."""
-    with suppress(OSError), open_regular(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-    return None
 
 
 def _read(path: Path) -> SessionState | None:

@@ -11,17 +11,18 @@ from pathlib import Path
 from daq.atomic_file import replace_file
 from daq.calibration_file import read
 from daq.configuration.apply_policy import AppliedBy
+from daq.digest import sha256, sha256_of
 from daq.errors import DaqError, OutputFailed
 from daq.history.judgement import judge
 from daq.recalibration import session as sessions
 from daq.recalibration.journal import Journal, Level
 from daq.recalibration.past import Past
 from daq.recalibration.recording import Cellside
-from daq.recalibration.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, digest_of
+from daq.recalibration.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target
 from daq.write_back.apply import Proposal
 from daq.write_back.audit import AuditAction, append
 from daq.write_back.audit import read as read_audit
-from daq.write_back.controller_write import Written, sha256
+from daq.write_back.controller_write import Written
 from daq.write_back.gates import Gate
 from daq.write_back.link import followed
 from daq.write_back.request import Request
@@ -131,7 +132,7 @@ def _written_before(side: Cellside, session: Session, past: Past, journal: Journ
     target = session.state.target
     if target is None or target.base_sha256 == target.after_sha256:
         return session
-    if digest_of(Path(target.file)) != target.after_sha256:
+    if sha256_of(Path(target.file)) != target.after_sha256:
         return session
     journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
     _note(side, past, target.after_sha256, journal)
@@ -165,7 +166,7 @@ def _propose(side: Cellside, session: Session, target: Target, journal: Journal)
         subject=str(followed(side.target.file)),
         details={
             "session": session.state.session,
-            "calibration_sha256": digest_of(session.folder / CALIBRATION) or "",
+            "calibration_sha256": sha256_of(session.folder / CALIBRATION) or "",
             "sha256_before": target.base_sha256,
             "sha256_after": target.after_sha256,
         },

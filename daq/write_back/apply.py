@@ -13,12 +13,13 @@ from pathlib import Path
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell import Cell
 from daq.configuration.controller_target import ControllerFormat
+from daq.digest import sha256
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
 from daq.write_back.base_gate import base_refusals
 from daq.write_back.circumstances import Circumstances, circumstances
 from daq.write_back.closed_gates import closed
 from daq.write_back.controller_file import decode, read_bytes
-from daq.write_back.controller_write import Written, sha256, write
+from daq.write_back.controller_write import Written, write
 from daq.write_back.evidence import evidence_of
 from daq.write_back.fit_gates import fit_refusals
 from daq.write_back.gain_gates import GainChange, gain_refusals

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import os
 import stat
 import time
@@ -17,6 +16,7 @@ from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
+from daq.digest import sha256_of
 from daq.errors import AuditUnusable
 from daq.folder import fsync_folder
 from daq.write_back.audit_chain import (
@@ -221,6 +221,6 @@ def digest_now(subject: str) -> str | None:
     """SHA-256 of the file that an entry is about, as it is now; `GONE` without one, None where it cannot be read."""
     path = Path(subject)
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None if path.exists() else GONE
+        return sha256_of(path) if path.exists() else GONE
     except OSError:
         return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from pathlib import Path
 
 from daq.atomic_file import replace_file
 from daq.configuration.controller_target import ControllerFormat
+from daq.digest import sha256
 from daq.errors import BackupMissing, ControllerChanged
 from daq.write_back.audit import AuditAction
 from daq.write_back.backups import Backup, back_up, backups, put_back, short_digest
@@ -58,11 +58,6 @@ class Restored:
     before: bytes
     after: bytes
     audit_sha256: str | None = None
-
-
-def sha256(content: bytes) -> str:
-    """Digest by which a base file is recognised."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def write(

@@ -12,9 +12,9 @@ from datetime import datetime
 from functools import partial
 from pathlib import Path
 
+from daq.digest import sha256
 from daq.errors import ControllerChanged
 from daq.write_back.audit import AuditAction
-from daq.write_back.controller_write import sha256
 from daq.write_back.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
 from daq.write_back.drive_record import DriveNote, write_record
 from daq.write_back.drive_way_back import DriveWayBack

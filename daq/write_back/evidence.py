@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
+from daq.digest import sha256
 from ident.calibration import Calibration
 
 
@@ -19,7 +19,7 @@ def evidence_of(calibration: Calibration, content: bytes, file: Path | None) -> 
     return {
         "calibration": {
             "file": None if file is None else str(file.absolute()),
-            "sha256": hashlib.sha256(content).hexdigest(),
+            "sha256": sha256(content),
             "cell": calibration.cell,
             "created": calibration.created,
             "software": calibration.software,

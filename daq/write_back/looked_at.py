@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from daq.digest import sha256
 from daq.errors import UsageError
 from daq.write_back.backups import short_digest
-from daq.write_back.controller_write import sha256
 from daq.write_back.gates import Gate, Refusal
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TypeVar
 
+from daq.digest import sha256
 from daq.errors import AuditUnusable, CalibrationRefused
 from daq.write_back.audit import AuditAction, AuditEntry, append, digest_now
 from daq.write_back.gates import Refusal
@@ -63,7 +63,7 @@ class Chronicle:
         """
         if self.audit is None:
             return write(), None
-        digests = {"sha256_before": None if before is None else _sha256(before), "sha256_after": _sha256(after)}
+        digests = {"sha256_before": None if before is None else sha256(before), "sha256_after": sha256(after)}
         entry = self._append(self.audit, begun, target, {**digests, **details})
         try:
             done = write()
@@ -83,7 +83,7 @@ class Chronicle:
     def nothing_to_do(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
         """Somebody asked for a write of what stands there already."""
         if self.audit is not None:
-            self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": _sha256(content), **details})
+            self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": sha256(content), **details})
 
     @contextlib.contextmanager
     def of_question(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
@@ -109,10 +109,6 @@ class Chronicle:
             # What was done stands, and the beginning with the digests tells of it: no reason to call it undone.
             _LOG.warning("the audit could not be told that it is %s: %s", action.value, error)
             return None
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def _said(error: BaseException) -> str:

@@ -16,12 +16,12 @@ from daq.calibration_file import encode
 from daq.configuration.apply_policy import AppliedBy, ApplyPolicy, ApplyPolicyModel, HoldOut
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
+from daq.digest import sha256
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.signature import generate, sign
 from daq.write_back import fit_gates
 from daq.write_back.apply import Proposal, apply, propose, propose_for, refused
 from daq.write_back.audit import AuditAction, read
-from daq.write_back.controller_write import sha256
 from daq.write_back.gates import Gate
 from daq.write_back.request import Request
 from ident.calibration import Calibration, Gain, Source

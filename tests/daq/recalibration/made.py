@@ -9,9 +9,9 @@ from typing import Any
 
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
+from daq.digest import sha256_of
 from daq.fit import Fit
 from daq.plan import Plan
-from daq.recalibration.session import digest_of
 from daq.recalibration.tools import Tools
 from daq.record import Recorded
 from daq.resources import shipped_configurations
@@ -57,7 +57,7 @@ class Made:
             sources = tuple(
                 replace(
                     source,
-                    sha256=digest_of(session / f"{source.name}.mcap") or "",
+                    sha256=sha256_of(session / f"{source.name}.mcap") or "",
                     recording=source.recording
                     and replace(source.recording, controller_sha256=None, recorded_s=created.timestamp()),
                 )

@@ -20,7 +20,6 @@ from daq.recalibration.session import (
     Fitted,
     Outcome,
     begin,
-    digest_of,
     last_good,
     remove_old,
     save,
@@ -122,10 +121,3 @@ def test_two_sessions_of_one_second_have_folders_of_their_own(tmp_path: Path) ->
     names = [begin(tmp_path, BASIS, BEGAN).folder.name for _ in range(3)]
     assert names == ["20260105T020000Z", "20260105T020000Z-02", "20260105T020000Z-03"]
     assert [session.folder.name for session in sessions(tmp_path)] == names
-
-
-def test_a_digest_is_that_of_the_content(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    assert digest_of(path) is None
-    path.write_bytes(b"a")
-    assert digest_of(path) == "ca978112ca1bbdcafac231b39a23dc4da786eff8147c4e72b9807785afee48bb"

@@ -25,7 +25,6 @@ from daq.recalibration.session import (
     Session,
     SessionState,
     begin,
-    digest_of,
     remove_old,
     save,
     sessions,
@@ -66,14 +65,11 @@ def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
     assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
 
 
-def test_nobody_waits_for_a_pipe_in_the_place_of_a_state_a_log_or_a_plan(tmp_path: Path) -> None:
+def test_nobody_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None:
     session = begin(tmp_path, BASIS, BEGAN)
     (session.folder / STATE).unlink()
     os.mkfifo(session.folder / STATE)
     assert sessions(tmp_path) == ()
-    assert digest_of(session.folder / STATE) is None
-    assert digest_of(session.folder) is None
-    assert digest_of(Path("/dev/zero")) is None
 
 
 def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made: Made) -> None:
