@@ -6,27 +6,36 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import can
 
+from daq.calibration_file import encode
+from daq.cli.applier import Applier
+from daq.cli.apply_drives import apply_drives
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import drive_axes
 from daq.configuration.cell_file import load_cell
 from daq.configuration.controller_target import Controller, GainObject
 from daq.configuration.history_place import HistoryPlace
 from daq.configuration.simulation import load_simulation
+from daq.write_back.request import Request
 from drivers.axis import Axis
 from drivers.bus import BusAddress, open_bus
 from drivers.network import Bounds, CanopenNetwork
 from drivers.parameter import Parameter, ParameterKind
+from drivers.parameter_write import Saving
 from drivers.profile import Mapping
 from drivers.sdo import SdoPolicy
 from drivers.simulated.cell import SimulatedCell
 from drivers.simulated.fault import FaultSpec
 from drivers.simulated.node import Node
-from tests.daq.calibrations import NAMEPLATE
+from ident.calibration import Calibration
+from tests.daq.calibrations import NAMEPLATE, demo_calibration
 
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+DOER = Applier("Kim", "kim")
 CONFIGS = Path(__file__).parents[2] / "configs"
 WHOLE = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
 REAL = GainObject(Parameter(0x2003, 2, ParameterKind.F32), 1.0)
@@ -111,3 +120,36 @@ class Listener:
     def close(self) -> None:
         """Hear no more."""
         self._bus.shutdown()
+
+
+def apply_in_drives(
+    cell: Cell,
+    *,
+    calibration: Calibration | None = None,
+    yes: bool = False,
+    base: str | None = None,
+    as_json: bool = False,
+    saving: Saving = Saving.KNOWN,
+) -> None:
+    """As `drivegain apply --drives` does it, in Kim's name."""
+    calibration = calibration or demo_calibration()
+    assert cell.history is not None
+    apply_drives(
+        cell,
+        Path("cells/demo.yaml"),
+        Request(
+            calibration,
+            NOW,
+            policy=cell.apply,
+            configuration_changed=True,
+            looked_at=base,
+            appliers=DOER.names,
+            file=Path("calibration.yaml"),
+            content=encode(calibration),
+        ),
+        doer=DOER,
+        saving=saving,
+        audit=cell.history.audit,
+        yes=yes,
+        json=as_json,
+    )

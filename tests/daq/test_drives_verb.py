@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -14,25 +13,18 @@ import typer
 
 from daq.bus_lock import bus_lock
 from daq.calibration_file import encode
-from daq.cli.applier import Applier
-from daq.cli.apply_drives import apply_drives
 from daq.cli.drives import saving_of
 from daq.cli.rollback_drives import rollback_drives
 from daq.configuration.cell import Bus, Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.history.store import HistoryStore
 from daq.write_back.audit import AuditAction, read
-from daq.write_back.request import Request
 from drivers.bus import BusAddress
 from drivers.parameter_write import Saving
 from drivers.sdo import ObjectAccess
 from drivers.simulated.cell import SimulatedCell
-from ident.calibration import Calibration
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import demo_cell, entered_gain, saved_gain, simulated
-
-NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-DOER = Applier("Kim", "kim")
+from tests.daq.drives import DOER, NOW, apply_in_drives, demo_cell, entered_gain, saved_gain, simulated
 
 
 @pytest.fixture
@@ -50,45 +42,13 @@ def simulation(cell: Cell) -> Iterator[SimulatedCell]:
         yield running
 
 
-def _apply(
-    cell: Cell,
-    *,
-    calibration: Calibration | None = None,
-    yes: bool = False,
-    base: str | None = None,
-    as_json: bool = False,
-    saving: Saving = Saving.KNOWN,
-) -> None:
-    calibration = calibration or demo_calibration()
-    assert cell.history is not None
-    apply_drives(
-        cell,
-        Path("cells/demo.yaml"),
-        Request(
-            calibration,
-            NOW,
-            policy=cell.apply,
-            configuration_changed=True,
-            looked_at=base,
-            appliers=DOER.names,
-            file=Path("calibration.yaml"),
-            content=encode(calibration),
-        ),
-        doer=DOER,
-        saving=saving,
-        audit=cell.history.audit,
-        yes=yes,
-        json=as_json,
-    )
-
-
 def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
     assert cell.history is not None
     rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
 
 
 def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
-    _apply(cell)
+    apply_in_drives(cell)
     shown = capsys.readouterr().out
     assert "in the drive" in shown
     assert "node 4, 2003h:01: -11520 -> -9210" in shown
@@ -96,12 +56,12 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     base = shown.split("--base ")[1].split()[0]
 
-    _apply(cell, yes=True, base=base)
+    apply_in_drives(cell, yes=True, base=base)
     told = capsys.readouterr().out
     assert "Written to the drives and read back" in told
     assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in told
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
-    _apply(cell)
+    apply_in_drives(cell)
     assert "The drives have these gains already" in capsys.readouterr().out
 
     _back(cell, yes=False)
@@ -146,11 +106,11 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
 
 @pytest.mark.usefixtures("simulation")
 def test_a_program_is_told_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
-    _apply(cell, as_json=True)
+    apply_in_drives(cell, as_json=True)
     looked = json.loads(capsys.readouterr().out)
     assert (looked["applied"], looked["refusals"]) == (False, [])
     assert looked["changes"][3]["new"] == -9.21
-    _apply(cell, as_json=True, yes=True, saving=Saving.RAM)
+    apply_in_drives(cell, as_json=True, yes=True, saving=Saving.RAM)
     written = json.loads(capsys.readouterr().out)
     assert (written["applied"], written["saved"]) == (True, False)
     assert written["base_sha256"] == looked["base_sha256"]
@@ -170,7 +130,7 @@ def test_a_closed_gate_is_told_and_nothing_written(
     calibration = demo_calibration()
     far = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
     with pytest.raises(CalibrationRefused, match="J1: found σ"):
-        _apply(cell, calibration=far, yes=yes, as_json=as_json)
+        apply_in_drives(cell, calibration=far, yes=yes, as_json=as_json)
     shown = capsys.readouterr().out
     if as_json:
         assert [one["gate"] for one in json.loads(shown)["refusals"]] == ["uncertainty"]
@@ -194,7 +154,7 @@ def test_an_interrupt_puts_back_what_was_written(
 
     monkeypatch.setattr(ObjectAccess, "read", interrupted)
     with pytest.raises(typer.Exit) as caught:
-        _apply(cell, yes=True)
+        apply_in_drives(cell, yes=True)
     assert caught.value.exit_code == 130
     assert "interrupted: kept: the old values stand again in J1, J2, J3" in capsys.readouterr().err
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
@@ -203,8 +163,8 @@ def test_an_interrupt_puts_back_what_was_written(
 @pytest.mark.usefixtures("simulation")
 def test_a_bus_that_somebody_else_has_is_left_alone(cell: Cell) -> None:
     with bus_lock(cell), pytest.raises(BusTaken):
-        _apply(cell)
-    _apply(cell)
+        apply_in_drives(cell)
+    apply_in_drives(cell)
 
 
 def test_the_two_options_of_saving() -> None:

@@ -5,29 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.calibration_file import encode
-from daq.cli.applier import Applier
-from daq.cli.apply_drives import apply_drives
 from daq.configuration.cell import Bus, Cell
 from daq.errors import CalibrationRefused, UsageError
 from daq.write_back.looked_at import LookedAt, change_of, look, other_change
-from daq.write_back.request import Request
 from drivers.bus import BusAddress
-from drivers.parameter_write import Saving
 from drivers.simulated.cell import SimulatedCell
-from ident.calibration import Calibration
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import demo_cell, entered_gain, simulated
-
-NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-DOER = Applier("Kim", "kim")
+from tests.daq.drives import apply_in_drives, demo_cell, entered_gain, simulated
 
 
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
@@ -70,41 +60,18 @@ def simulation(cell: Cell) -> Iterator[SimulatedCell]:
         yield running
 
 
-def _apply(cell: Cell, calibration: Calibration, *, base: str | None, yes: bool) -> None:
-    assert cell.history is not None
-    apply_drives(
-        cell,
-        Path("cells/demo.yaml"),
-        Request(
-            calibration,
-            NOW,
-            policy=cell.apply,
-            configuration_changed=True,
-            looked_at=base,
-            appliers=DOER.names,
-            file=Path("calibration.yaml"),
-            content=encode(calibration),
-        ),
-        doer=DOER,
-        saving=Saving.KNOWN,
-        audit=cell.history.audit,
-        yes=yes,
-        json=False,
-    )
-
-
 def test_the_drives_get_the_change_that_was_looked_at_and_no_other(
     cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = demo_calibration()
-    _apply(cell, calibration, base=None, yes=False)
+    apply_in_drives(cell, calibration=calibration, base=None, yes=False)
     base = capsys.readouterr().out.split("--base ")[1].split(maxsplit=1)[0]
     moved = replace(calibration.gains[3], value=calibration.gains[3].value * 1.01)
     another = replace(calibration, gains=(*calibration.gains[:3], moved, *calibration.gains[4:]))
     with pytest.raises(CalibrationRefused, match="have changed since the dry run"):
-        _apply(cell, another, base=base, yes=True)
+        apply_in_drives(cell, calibration=another, base=base, yes=True)
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
-    _apply(cell, calibration, base=base, yes=True)
+    apply_in_drives(cell, calibration=calibration, base=base, yes=True)
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
     with pytest.raises(CalibrationRefused, match="as --base says"):
-        _apply(cell, another, base=base, yes=True)
+        apply_in_drives(cell, calibration=another, base=base, yes=True)
