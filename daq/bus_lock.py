@@ -13,7 +13,7 @@ import socket
 import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
 from daq.configuration.cell import Bus, Cell
@@ -64,8 +64,15 @@ def _address(bus: Bus) -> str:
     except (OSError, UnicodeError):
         return bus.host.lower()
     # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
-    _, address = min((family is not socket.AF_INET, str(where[0])) for family, _, _, _, where in found)
-    return "localhost" if ip_address(address).is_loopback else address
+    address = min((_unmapped(str(where[0])) for *_, where in found), key=lambda one: (one.version, str(one)))
+    # Who connects to the unspecified address comes to this machine, as by a loopback address.
+    return "localhost" if address.is_loopback or address.is_unspecified else str(address)
+
+
+def _unmapped(written: str) -> IPv4Address | IPv6Address:
+    """An address; of one of IPv4 within IPv6 (::ffff:10.0.0.7) that of IPv4."""
+    address = ip_address(written)
+    return (address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address
 
 
 def _shared_folder() -> Path:

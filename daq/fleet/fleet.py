@@ -54,6 +54,7 @@ def fit_fleet(
 
     Raises:
         UsageError: the workers have gone; what was fitted stays on the shelf.
+        OutputExists: something on the shelf is in the way of a calibration; no cell was fitted.
         OutputFailed: a calibration could not be kept.
     """
     cells, unknown = _surveyed(logs, crew, told)

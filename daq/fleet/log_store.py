@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from daq.errors import ConfigurationMissing, DaqError, LogMissing
+from daq.regular_file import open_regular
 
 ENDING = ".mcap"
 PIECE_BYTES = 2**20
@@ -43,7 +45,9 @@ def is_address(place: str) -> bool:
 
 
 def list_logs(place: str) -> tuple[StoredLog, ...]:
-    """All finished logs at a place and in the folders below it, by name.
+    """Whatever has the name of a finished log at a place and in the folders below it, by name.
+
+    A folder, a pipe or a link that leads nowhere may have such a name: `fingerprint` tells of it.
 
     Raises:
         LogMissing: there is no such folder, or no log in it.
@@ -61,10 +65,11 @@ def at_hand(log: StoredLog, folder: Path) -> Path:
     """A log as a file: itself, or a copy of the same name in a folder of its own below `folder`.
 
     Raises:
-        LogMissing: it cannot be read.
+        LogMissing: it cannot be read, or is no regular file.
     """
     if not log.remote:
-        return Path(log.address)
+        with _told(log.address):
+            return _regular(Path(log.address))
     copy = _copy(log, folder)
     with _told(log.address):
         store, path = _store(log.address)
@@ -90,13 +95,13 @@ def fingerprint(log: StoredLog) -> str:
     """What changes when the log does: the digest of a file, what the store tells of an object.
 
     Raises:
-        LogMissing: it cannot be read.
+        LogMissing: it cannot be read, or is no regular file.
     """
     with _told(log.address):
         if log.remote:
             store, path = _store(log.address)
             return str(store.ukey(path))
-        with Path(log.address).open("rb") as stream:
+        with open_regular(_regular(Path(log.address))) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -105,17 +110,34 @@ def _listed_local(folder: Path) -> list[StoredLog]:
         raise LogMissing(
             str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
         )
-    # Absolute: a worker may stand elsewhere. A pipe or a device with that ending would never end.
-    files = (path for path in folder.rglob(f"*{ENDING}") if path.is_file())
-    return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in files]
+    # Absolute: a worker may stand elsewhere. What is no file is not left out: it may stand for a log of a cell.
+    return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
 
 
 def _listed_remote(place: str) -> list[StoredLog]:
     with _told(place):
         store, root = _store(place)
+        if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
+            return _listed_local(Path(root))  # file://: with links, pipes and devices, of which fsspec does not tell
         found = [path for path in store.find(root) if path.endswith(ENDING)]
     below = root.rstrip("/") + "/"
     return [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in found]
+
+
+def _regular(path: Path) -> Path:
+    """A log in a folder, looked at before anybody opens it: a pipe or a device would never end."""
+    if path.is_symlink() and not path.exists():
+        found = f"a link to {path.readlink()}, which leads nowhere"
+        raise _no_log(path, found, "mount or copy what it leads to, or move the link away")
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode):
+        found = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
+        raise _no_log(path, found, f"put the log there, or give this a name without {ENDING}")
+    return path
+
+
+def _no_log(path: Path, found: str, remedy: str) -> LogMissing:
+    return LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
 
 
 def _copy(log: StoredLog, folder: Path) -> Path:

@@ -5,15 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import stat
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from daq.atomic_file import replace_file
+from daq.configuration.yaml_file import MAX_BYTES
 from daq.errors import OutputExists, OutputFailed
 from daq.fleet.cell_fit import Fitted, Loop
 from daq.fleet.summary import Summary, summary_document, summary_from
 from daq.fleet.survey import CellLogs
+from daq.regular_file import read_regular
 from daq.version import software
 
 STATE_VERSION = 1
@@ -41,12 +44,17 @@ class Shelf:
         """What is told of the calibration of these logs, and the seconds that it took; None where it is not there.
 
         The file itself is not parsed: it is the one that was written, by its digest.
+
+        Raises:
+            OutputExists: there is something that no calibration, or no note beside it, can replace.
         """
         file = self.file(cell)
+        for path in (file, _state(file)):
+            _check_replaceable(path)
         try:
-            state = json.loads(_state(file).read_bytes())
-            with file.open("rb") as stream:
-                found = hashlib.file_digest(stream, "sha256").hexdigest()
+            # No pipe is waited for, and no file of somebody else fills the memory: neither is ours.
+            state = json.loads(read_regular(_state(file), MAX_BYTES))
+            found = hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest()
             if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != (
                 FORMAT,
                 self._inputs(cell),
@@ -71,11 +79,11 @@ class Shelf:
             "seconds": fitted.seconds,
             "summary": summary_document(fitted.summary),
         }
-        try:
-            replace_file(file, fitted.content)
-            replace_file(_state(file), json.dumps(state, indent=1).encode())
-        except OSError as error:
-            raise OutputFailed.of(file, error) from error
+        for path, content in ((file, fitted.content), (_state(file), json.dumps(state, indent=1).encode())):
+            try:
+                replace_file(path, content)
+            except OSError as error:
+                raise OutputFailed.of(path, error) from error
         return file
 
     def _inputs(self, cell: CellLogs) -> str:
@@ -105,6 +113,26 @@ def open_shelf(folder: Path, loop: Loop) -> Shelf:
     except OSError as error:
         raise OutputFailed.of(folder, error) from error
     return Shelf(folder, loop)
+
+
+def _check_replaceable(path: Path) -> None:
+    """Refuse a folder, and a link to a device or a pipe: a link is followed, and what it leads to would be replaced."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return  # there is nothing, or who writes it will be told
+    if stat.S_ISDIR(mode):
+        found = "a folder"
+    elif path.is_symlink() and not stat.S_ISREG(mode):
+        found = "a link to something that is no regular file"
+    else:
+        return
+    raise OutputExists(
+        str(path),
+        found=found,
+        expected="a file that an earlier fleet has left, or none",
+        remedy="move it away, or choose another folder",
+    )
 
 
 def _state(file: Path) -> Path:

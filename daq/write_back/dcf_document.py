@@ -1,5 +1,8 @@
 """A device configuration file (CiA 306 DCF): where the gains of drives stand, and the same bytes with others there.
 
+A number is decimal, or hexadecimal after `0x`. An integer with another zero before it (`010`) is octal to CiA 306 and
+decimal to many a tool: it is refused, not guessed.
+
 An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `2003sub1`. Its number is the
 `ParameterValue` of its section. A data sheet (EDS) has none, and none is put there: that would be a new line.
 """
@@ -21,6 +24,9 @@ _ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
 _KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
 _TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
 _DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+_CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
+"""The number of a type: Python's int(…, 0) takes underscores, signs and 0b too."""
+_OCTAL = re.compile(r"[-+]?0[0-9]+")
 _VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
 _VARIABLE = 7
 _BYTE_ORDER_MARK = "ï»¿"
@@ -125,6 +131,14 @@ class DcfDocument:
             )
         kind = self._number(entries, key, _TYPE, 0)
         where = f"line {entry.line}: {entry.value!r:.60}"
+        if kind in (*_REALS, *_INTEGERS) and _OCTAL.fullmatch(entry.value):
+            raise unfit(
+                self.name,
+                key,
+                f"{where}, octal by its leading zero",
+                "write the value that is meant without a zero before it",
+                "a plain decimal number, or an integer after 0x",
+            )
         if kind in _REALS:
             if not _DECIMAL.fullmatch(entry.value):
                 raise unfit(self.name, key, f"{where} in a real object", "write a plain decimal number")
@@ -161,10 +175,10 @@ class DcfDocument:
         entry = entries.get(name)
         if entry is None or not entry.value:
             return default
-        try:
-            return int(entry.value, 0)
-        except ValueError as error:
-            raise unfit(self.name, key, f"line {entry.line}: {entry.value!r:.60}", "correct it", f"a {name}") from error
+        if not _CODE.fullmatch(entry.value):
+            expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
+            raise unfit(self.name, key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
+        return int(entry.value, 0)
 
 
 @dataclass(frozen=True, slots=True)

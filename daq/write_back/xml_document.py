@@ -1,8 +1,9 @@
 """A controller's XML: where its gains stand, and the same bytes with other numbers there.
 
 A number is named by a path from the root as it is written, prefixes included: `Robot/Axis[@name='J1']/Gain` is the text
-of an element, `Robot/Axis[2]/@gain` an attribute. A document type is refused: without one there are no entities of the
-document's own, and nothing to fetch or to unfold.
+of an element, `Robot/Axis[2]/@gain` an attribute. It is read as an xs:double: decimal, whatever zeros it begins with
+(`010` is 10). A document type is refused: without one there are no entities of the document's own, and nothing to fetch
+or to unfold.
 """
 
 from __future__ import annotations

@@ -444,6 +444,46 @@ def test_an_object_that_cannot_be_changed_alone_is_refused(key: str, says: str) 
     assert says in str(caught.value)
 
 
+@pytest.mark.parametrize("number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"])
+@pytest.mark.parametrize("entry", ["DataType", "ObjectType"])
+def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> None:
+    others = {"DataType": "0x0008", "ObjectType": "0x7"} | {entry: number}
+    text = "[2003]\n" + "".join(f"{name}={written}\n" for name, written in others.items()) + "ParameterValue=1.5\n"
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", text).locate(("2003",))
+    line = text.splitlines().index(f"{entry}={number}") + 1
+    assert f"line {line}: '{number}'; expected {entry.lower()} in decimal digits" in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["0x0008", "0X8", "8", "0x00000008", "0x11", "17"])
+def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None:
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n").locate(("2003",))
+    assert scalar.value == 1.5
+
+
+@pytest.mark.parametrize("number", ["010", "-010", "+010", "08", "00", "007"])
+@pytest.mark.parametrize("kind", ["0x0004", "0x0008", "0x0011"])
+def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, number: str) -> None:
+    """10 to a reader of decimals, 8 to one of CiA 306."""
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n").locate(("2003",))
+    assert f"line 3: '{number}'" in str(caught.value)
+    assert "octal" in str(caught.value)
+    assert "nothing was written" in str(caught.value)
+
+
+@pytest.mark.parametrize(("number", "value"), [("0", 0.0), ("0.10", 0.1), ("010.5", 10.5), ("-0.0", 0.0), ("10", 10.0)])
+def test_a_real_of_a_dcf_with_a_point_is_no_octal_number(number: str, value: float) -> None:
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n").locate(("2003",))
+    assert scalar.value == value
+
+
+def test_a_number_of_xml_that_begins_with_zero_is_decimal() -> None:
+    """As xs:double says."""
+    (scalar,) = XmlDocument("robot", "<R><G>010</G></R>", "utf-8").locate(("R/G",))
+    assert scalar.value == 10.0
+
+
 @pytest.mark.parametrize("key", ["200D:0A", "200dsubA", "0x200Dsub0a"])
 def test_an_object_is_its_index_and_subindex_however_its_section_spells_them(key: str) -> None:
     changed = DcfDocument("drive.dcf", _DCF).with_values({key: "2.5000"})

@@ -6,8 +6,10 @@ import csv
 import io
 import json
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -27,14 +29,14 @@ from hypothesis import strategies as st
 from daq.calibration_file import as_document, load
 from daq.cli import main
 from daq.configuration.cell_file import bundle
-from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, UsageError
+from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputExists, OutputFailed, UsageError
 from daq.fit import calibration_of, fit
 from daq.fleet import crew as crew_module
 from daq.fleet import fleet as fleet_module
 from daq.fleet.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell
 from daq.fleet.crew import Crew, Processes, Scheduler, Threads, crew_of
 from daq.fleet.fleet import each, fit_fleet
-from daq.fleet.log_store import StoredLog, list_logs
+from daq.fleet.log_store import StoredLog, at_hand, list_logs
 from daq.fleet.row import FleetRow
 from daq.fleet.shelf import open_shelf
 from daq.fleet.survey import CellLogs, SeenLog, UnknownLog, by_cell, survey
@@ -229,6 +231,70 @@ def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     assert _told(_fitted(few, None)) == [replace(_told(third)[2], file=None)]
 
 
+def _only(few: Path, cell: str) -> CellLogs:
+    """The logs of one of the cells, the others removed."""
+    for folder in few.iterdir():
+        if folder.name != cell:
+            shutil.rmtree(folder)
+    (logs,) = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
+    return logs
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".json"])
+@pytest.mark.parametrize("what", ["pipe", "large"])
+def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
+    ending: str, what: str, few: Path, tmp_path: Path
+) -> None:
+    cell, out = _only(few, "cell-003"), tmp_path / "out"
+    (first,) = _fitted(few, out)
+    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    file.unlink()
+    if what == "pipe":
+        os.mkfifo(file)
+    else:
+        with file.open("wb") as stream:
+            stream.truncate(2**40)
+    assert _told(_fitted(few, out)) == _told((first,))
+    assert file.is_file()
+    assert file.stat().st_size < 2**20
+    (third,) = _fitted(few, out)
+    assert third.kept
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".json"])
+@pytest.mark.parametrize("what", ["folder", "link to a folder", "link to a device"])
+def test_what_cannot_be_replaced_on_the_shelf_is_told_before_anything_is_fitted(
+    ending: str, what: str, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, out = _only(few, "cell-003"), tmp_path / "out"
+    monkeypatch.setattr(fleet_module, "fit_cell", None)
+    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    if what == "folder":
+        file.mkdir()
+    else:
+        # No device of the system: if it were replaced after all, everybody would miss it.
+        target = tmp_path / "there"
+        target.mkdir() if what == "link to a folder" else os.mkfifo(target)
+        file.symlink_to(target)
+    before = file.lstat()
+    with pytest.raises(OutputExists, match=re.escape(str(file))) as caught:
+        _fitted(few, out)
+    assert ("a folder" if "folder" in what else "no regular file") in str(caught.value)
+    assert "move it away" in str(caught.value)
+    assert file.lstat() == before
+    assert main(["fleet", str(few), "--out", str(out)]) == ExitCode.USAGE
+
+
+def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_told_by_its_name(few: Path, tmp_path: Path) -> None:
+    cell = _only(few, "cell-003")
+    shelf, made = open_shelf(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
+    note = shelf.file(cell).with_suffix(".json")
+    note.mkdir()
+    assert isinstance(made, Fitted)
+    with pytest.raises(OutputFailed, match=re.escape(str(note))):
+        shelf.keep(cell, made)
+
+
 def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
     for cell in ("cell-000", "cell-003"):
         shutil.rmtree(few / cell)
@@ -313,6 +379,49 @@ def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
             for logs in (by_path, by_address)]  # fmt: skip
     assert told[0] == told[1]
     assert len(told[0]) == 7
+
+
+@pytest.mark.parametrize("address", ["{}", "file://{}", "local://{}"])
+def test_a_name_of_a_log_that_is_no_file_is_a_row(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """None of them is opened: nobody would ever come to the other end of the pipe."""
+    logs = tmp_path / "logs"
+    (logs / "folder.mcap").mkdir(parents=True)
+    (logs / "folder.mcap" / "gone.mcap").symlink_to(tmp_path / "unmounted.mcap")
+    (logs / "link.mcap").symlink_to(logs / "folder.mcap")
+    (logs / "round.mcap").symlink_to(logs / "round.mcap")
+    (logs / "zero.mcap").symlink_to("/dev/zero")
+    os.mkfifo(logs / "pipe.mcap")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(logs / "socket.mcap"))
+        assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
+    told = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
+    assert {name: cell["error"]["text"].split("; expected")[0] for name, cell in told.items()} == {
+        "folder.mcap": f"{logs}/folder.mcap: found a folder",
+        "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to {tmp_path}/unmounted.mcap, "
+        "which leads nowhere",
+        "link.mcap": f"{logs}/link.mcap: found a folder",
+        "pipe.mcap": f"{logs}/pipe.mcap: found something that is no regular file",
+        "round.mcap": f"{logs}/round.mcap: found a link to {logs}/round.mcap, which leads nowhere",
+        "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
+        "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
+    }
+    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in told.values()} == {("LogMissing", 4)}
+
+
+def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
+    links = tmp_path / "links"
+    links.mkdir()
+    for log in (few / "cell-002").iterdir():
+        (links / log.name).symlink_to(log)
+    assert [row.fitted for row in _fitted(links, None)] == [True]
+
+
+def test_a_pipe_that_takes_the_place_of_a_log_meanwhile_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(LogMissing, match="no regular file"):
+        at_hand(StoredLog(str(tmp_path / "a.mcap"), "a.mcap"), tmp_path)
 
 
 @pytest.mark.parametrize("place", ["nowhere", "memory://nowhere", "."])

@@ -220,7 +220,9 @@ def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, mo
 def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
     (bus,) = made_rig(tmp_path / "cell", made).cell.buses
     hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
-    assert lock_name(hub) == lock_name(replace(hub, host="localhost")) == "drivegain-socketcand-can0-localhost-29536.lock"
+    assert (
+        lock_name(hub) == lock_name(replace(hub, host="localhost")) == "drivegain-socketcand-can0-localhost-29536.lock"
+    )
 
 
 @pytest.mark.parametrize(
