@@ -13,7 +13,7 @@ from rich.console import Console
 from daq.atomic_file import replace_file
 from daq.calibration_file import decode, read
 from daq.cli.applier import applier
-from daq.cli.history_audit import verify_history
+from daq.cli.history_audit import catch_up, verify_history
 from daq.cli.history_deeds import deed_words, in_force
 from daq.cli.history_view import describe, show, show_axis
 from daq.cli.output import say_written
@@ -57,7 +57,8 @@ def history_verb(
         typer.Option("--since", metavar="DATE", help="With --acknowledge: first day that counts for the new baseline."),
     ] = None,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Check the audit's chain and the history's file; exit code 4 if broken.")
+        bool,
+        typer.Option("--verify", help="Check audit and history, by themselves and together; exit code 4 if broken."),
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -80,7 +81,7 @@ def history_verb(
     now = datetime.now(UTC)
     with HistoryStore(place.store) as store:
         if add is not None:
-            _add(store, declared, add, now)
+            _add(store, declared, place, add, now)
         all_series = watch(store.entries(), store.acknowledgements())
         if acknowledge is not None:
             _acknowledge(store, place, _named(all_series, acknowledge, declared), by, why, since, now)
@@ -118,7 +119,7 @@ def _place(cell: Cell, file: Path) -> HistoryPlace:
     return cell.history
 
 
-def _add(store: HistoryStore, cell: Cell, file: Path, now: datetime) -> None:
+def _add(store: HistoryStore, cell: Cell, place: HistoryPlace, file: Path, now: datetime) -> None:
     content = read(file)
     calibration = decode(content, str(file))
     if calibration.cell != cell.name:
@@ -130,7 +131,11 @@ def _add(store: HistoryStore, cell: Cell, file: Path, now: datetime) -> None:
         )
     new = store.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
     told = "entered" if new else "it was in the history already"
-    Console(stderr=True, soft_wrap=True, highlight=False, markup=False).print(f"{file.name}: {told}.")
+    console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    console.print(f"{file.name}: {told}.")
+    # Whoever wrote it may have been killed before the history knew.
+    for write in catch_up(cell, place, store):
+        console.print(f"Entered too: {write}.")
 
 
 def _acknowledge(
@@ -149,8 +154,8 @@ def _acknowledge(
             expected="what happened, for whoever reads this in a year",
             remedy='give it: --why "gearbox changed"',
         )
-    # Of a drift, only the newest calibration surely shows the gain as it is now.
-    begins = series.points[-1].entry.recorded if since is None else _day(since)
+    # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
+    begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
     who = str(applier(by))
     try:
         entry = append(
@@ -166,12 +171,21 @@ def _acknowledge(
     store.acknowledge(Acknowledgement(series.axis, begins, now, who, why, entry.sha256))
 
 
-def _day(text: str) -> datetime:
+def _day(text: str, now: datetime) -> datetime:
     never = datetime.min.replace(tzinfo=UTC)
     found = utc(text, never)
     if found == never:
         raise UsageError(
             "--since", found=repr(text), expected="a date, 2026-03-02, or a time with its zone", remedy="spell it so"
+        )
+    if found > now:
+        # Until then every calibration would be left out, and no alarm of the axis told.
+        raise UsageError(
+            "--since",
+            found=f"{text!r}, which is {found:%Y-%m-%d %H:%M:%S} UTC",
+            expected=f"no later than now, {now:%Y-%m-%d %H:%M:%S} UTC",
+            remedy="give the day of the change, with its zone where the day here is not that of UTC "
+            "(2026-03-02T00:00+10:00); of a change that is still to come acknowledge the alarm when it is told",
         )
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,14 @@ from daq.cli.verb import printable
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.errors import AuditBroken, HistoryUnreadable
+from daq.history.audited import AuditedWrite, acknowledgement_flaws, at_of, event_flaws, unknown_writes, writes_to
+from daq.history.entry import Deed, iso
 from daq.history.store import HistoryStore
 from daq.recalibration.session import sessions
 from daq.write_back.audit import AuditVerdict, verify
+
+_SHOWN = 5
+"""Sentences of a kind in an error; --json has all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +30,17 @@ class Checked:
     Attributes:
         audit, store: the two files.
         verdict: of the audit.
-        broken: what SQLite finds broken in the history.
+        broken: what is broken in the history, and where its rows are not what the audit tells.
+        unknown: writes of which the history does not know.
+        late: whether the history knows of a later write than one of these: it cannot be entered behind that.
     """
 
     audit: Path
     store: Path
     verdict: AuditVerdict
     broken: tuple[str, ...]
+    unknown: tuple[AuditedWrite, ...] = ()
+    late: bool = False
 
     @property
     def document(self) -> dict[str, Any]:
@@ -53,6 +63,17 @@ class Checked:
                 for one in self.verdict.open_writes
             ],
             "history_broken": list(self.broken),
+            "unknown_writes": [
+                {
+                    "number": one.ended.number,
+                    "at": one.ended.at,
+                    "who": one.ended.who,
+                    "file": one.ended.subject,
+                    "action": one.ended.action.value,
+                    "calibration_sha256": one.calibration,
+                }
+                for one in self.unknown
+            ],
         }
 
     def say(self, console: Console) -> None:
@@ -68,14 +89,15 @@ class Checked:
                 f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
                 f"ended; {printable(begun.subject)} was found {one.content.value}."
             )
-        console.print(f"{self.store}: {'sound' if not self.broken else 'BROKEN'}.")
+        console.print(f"{self.store}: {'BROKEN' if self.broken else 'NOT COMPLETE' if self.unknown else 'sound'}.")
 
     def require(self) -> None:
         """Raise what is wrong.
 
         Raises:
             AuditBroken: the audit is not what was written, with the first line that is not and all flaws.
-            HistoryUnreadable: the history's file is broken.
+            HistoryUnreadable: the history's file is broken, its rows are not what the audit tells, or it does not know
+                of a write.
         """
         if not self.verdict.holds:
             first = self.verdict.flaws[0]
@@ -87,21 +109,95 @@ class Checked:
                 remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is "
                 "known trust the controller's file by its backups only, and begin another audit (`history.audit`)",
             )
+        unknown = [printable(f"no event of {one}") for one in self.unknown]
         if self.broken:
             raise HistoryUnreadable(
                 str(self.store),
-                found="; ".join(self.broken[:5]),
-                expected="a sound SQLite file",
-                remedy="keep a copy, and restore the last good one from a backup",
+                found=_first([*self.broken, *unknown]),
+                expected="a sound SQLite file with the rows that drivegain wrote",
+                remedy="keep a copy, ask who can write to it, and restore the last good one from a backup",
+            )
+        if self.unknown:
+            raise HistoryUnreadable(
+                str(self.store),
+                found=_first(unknown),
+                expected="an event of every write to this cell's controller that the audit tells of",
+                remedy="it knows of a later write: restore the last good one from a backup, or build it anew in "
+                "another file (`history.store`) with `drivegain history CELL --add CALIBRATION` for each calibration "
+                "that was written"
+                if self.late
+                else "`drivegain history CELL --add CALIBRATION`, with the calibration that was written (of a rollback "
+                "with any), enters what the audit tells; so does `drivegain apply CALIBRATION --cell CELL --yes`, "
+                "which writes nothing where a controller's file has these gains",
             )
 
 
 def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Checked:
-    """Check both files; what must be in the audit, the history knows, and the sessions of scheduled recalibrations.
+    """Check both files, each by itself and against the other.
 
-    Raises as `daq.write_back.audit.verify` and the store.
+    What must be in the audit, the history knows, and the sessions of scheduled recalibrations; what must be in the
+    history, the audit. Raises as `daq.write_back.audit.verify` and the store.
     """
+    verdict, broken = _verdict(cell, place, store), store.integrity()
+    if not verdict.holds:  # its entries prove nothing
+        return Checked(place.audit, place.store, verdict, broken)
+    entries = verdict.entries
+    told = {one.sha256: one for one in entries}
+    events = [(number, event, told.get(event.audit or "")) for number, event in enumerate(store.events(), start=1)]
+    broken += tuple(
+        printable(f"event {number}: {says}")
+        for number, event, entry in events
+        if entry is not None
+        for says in event_flaws(event, entry, entries)
+    )
+    broken += tuple(
+        printable(f"acknowledgement of {noted.axis} at {iso(noted.at)}: {says}")
+        for noted in store.acknowledgements()
+        if (entry := told.get(noted.audit)) is not None
+        for says in acknowledgement_flaws(noted, entry)
+    )
+    unknown, late = unknown_writes(writes_to(cell, entries), store.audited())
+    return Checked(place.audit, place.store, verdict, broken, tuple(unknown), late != unknown)
+
+
+def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[AuditedWrite, ...]:
+    """Enter writes of which the audit tells and the history does not know, in their order.
+
+    Only those behind the last one of their target that it knows, and of those with calibrations that it has: an event
+    is never entered behind a later one. Of an audit that is not what was written nothing is entered.
+
+    Returns:
+        what was entered.
+
+    Raises:
+        AuditUnusable, HistoryUnreadable, OutputFailed: see `daq.write_back.audit.verify` and the store.
+    """
+    verdict = _verdict(cell, place, store)
+    if not verdict.holds:
+        return ()
+    _, new = unknown_writes(writes_to(cell, verdict.entries), store.audited())
+    known, stopped, entered = {entry.digest for entry in store.entries()}, set[str](), []
+    for write in new:
+        one, after = write.ended, write.sha256_after
+        at, can = at_of(one), after is not None and (write.deed is Deed.ROLLED_BACK or write.calibration in known)
+        if one.subject in stopped or at is None or after is None or not can:
+            stopped.add(one.subject)
+            continue
+        if write.deed is Deed.ROLLED_BACK:
+            store.rolled_back(at=at, who=one.who, target=one.subject, sha256_after=after, audit=one.sha256)
+        else:
+            digest = write.calibration or ""
+            store.applied(digest, at=at, who=one.who, target=one.subject, audit=one.sha256, sha256_after=after)
+        entered.append(write)
+    return tuple(entered)
+
+
+def _verdict(cell: Cell, place: HistoryPlace, store: HistoryStore) -> AuditVerdict:
     past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
     ends = [session.state.audit_sha256 for session in past]
-    heads = store.audited().union(end for end in ends if end is not None)
-    return Checked(place.audit, place.store, verify(place.audit, heads), store.integrity())
+    return verify(place.audit, store.audited().union(end for end in ends if end is not None))
+
+
+def _first(sentences: Sequence[str]) -> str:
+    more = len(sentences) - _SHOWN
+    return "; ".join(sentences[:_SHOWN]) + (f"; and {more} more (--json tells all)" if more > 0 else "")

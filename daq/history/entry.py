@@ -140,3 +140,15 @@ def iso(at: datetime) -> str:
     if at.tzinfo is None:
         raise ValueError(f"expected a time with its zone, found {at}")
     return at.astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def zoned(text: str) -> datetime:
+    """A time as it was written down.
+
+    Raises:
+        ValueError: it is none, or has no zone.
+    """
+    found = datetime.fromisoformat(text)
+    if found.tzinfo is None:
+        raise ValueError(f"{text!r} is a time without its zone")
+    return found

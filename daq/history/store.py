@@ -19,7 +19,16 @@ from daq.calibration_file import encode
 from daq.errors import HistoryMixed
 from daq.history import schema
 from daq.history.database import Access, connect, telling, transaction
-from daq.history.entry import Acknowledgement, Deed, Entry, Event, iso, logs_of, recorded_at, utc
+from daq.history.entry import Acknowledgement, Deed, Entry, Event, iso, zoned
+from daq.history.integrity import (
+    COLUMNS,
+    GAIN_COLUMNS,
+    calibration_flaws,
+    columns_of,
+    early_flaws,
+    gain_columns_of,
+    gap_flaws,
+)
 from ident.calibration import Calibration, Gain
 
 
@@ -68,30 +77,14 @@ class HistoryStore:
             if connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
                 return False
             self._check_like(calibration)
-            holdout = calibration.holdout_error_percent
-            created = utc(calibration.created, at)
-            row = (
-                digest,
-                iso(created),
-                iso(recorded_at(calibration, created)),
-                logs_of(calibration, digest),
-                iso(at),
-                calibration.cell,
-                calibration.configuration_sha256,
-                calibration.method,
-                calibration.software,
-                calibration.relative_error_percent.total,
-                None if holdout is None else holdout.total,
-                calibration.rows,
-                encode(calibration).decode(),
+            connection.execute(
+                f"INSERT INTO calibration (digest, {', '.join(COLUMNS)}, document)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (digest, *columns_of(calibration, digest, at).values(), encode(calibration).decode()),
             )
-            connection.execute("INSERT INTO calibration VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
             connection.executemany(
-                "INSERT INTO gain VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (digest, place, g.axis, g.value, g.std, g.unit, g.nameplate)
-                    for place, g in enumerate(calibration.gains)
-                ],
+                "INSERT INTO gain (digest, place, axis, value, std, unit, nameplate) VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [(digest, place, *gain.values()) for place, gain in enumerate(gain_columns_of(calibration))],
             )
         return True
 
@@ -169,13 +162,13 @@ class HistoryStore:
         """All writes to controllers, oldest first."""
         rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
         with telling(self.path, Access.READ):
-            return tuple(Event(row[0], Deed(row[1]), _time(row[2]), *row[3:]) for row in rows)
+            return tuple(Event(row[0], Deed(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """All of them, oldest first."""
         rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
         with telling(self.path, Access.READ):
-            return tuple(Acknowledgement(row[0], _time(row[1]), _time(row[2]), *row[3:]) for row in rows)
+            return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def audited(self) -> frozenset[str]:
         """SHA-256 of all entries that the audit must have."""
@@ -197,10 +190,34 @@ class HistoryStore:
         return str(rows[0][0]).encode() if rows else None
 
     def integrity(self) -> tuple[str, ...]:
-        """What SQLite finds broken in the file; nothing where all is well."""
+        """What is broken in the file, by itself: what SQLite finds, and rows that contradict each other.
+
+        No key guards the rows: whoever changes all that belongs together is not found.
+
+        Returns:
+            sentences, each with what stands there and what was expected; nothing where all is well.
+        """
         found = [str(row[0]) for row in self._rows("PRAGMA integrity_check")]
         found += [f"row of {row[0]} without its {row[2]}" for row in self._rows("PRAGMA foreign_key_check")]
-        return tuple(text for text in found if text != "ok")
+        found = [text for text in found if text != "ok"]
+        if found:  # what a broken file says of itself is no more to be asked
+            return tuple(found)
+        calibrations = self._rows(
+            f"SELECT digest, document, {', '.join(COLUMNS)} FROM calibration ORDER BY created, digest"
+        )
+        gains = self._rows(f"SELECT digest, {', '.join(GAIN_COLUMNS)} FROM gain ORDER BY digest, place")
+        with telling(self.path, Access.READ):
+            return (
+                *calibration_flaws(calibrations, gains),
+                *(flaw for table in ("event", "acknowledgement") for flaw in gap_flaws(table, *self._numbers(table))),
+                *early_flaws(self.acknowledgements()),
+            )
+
+    def _numbers(self, table: str) -> tuple[set[int], int]:
+        """Of the rows that are there, and the last one that SQLite gave."""
+        there = {int(row[0]) for row in self._rows(f"SELECT number FROM {table}")}
+        given = self._rows("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,))
+        return there, max([*there, *(int(row[0]) for row in given), 0])
 
     def _check_like(self, calibration: Calibration) -> None:
         entries = self.entries()
@@ -259,21 +276,14 @@ class HistoryStore:
             yield self._connection
 
 
-def _time(text: str) -> datetime:
-    found = datetime.fromisoformat(text)
-    if found.tzinfo is None:
-        raise ValueError(f"{text!r} is a time without its zone")
-    return found
-
-
 def _entry(row: tuple[Any, ...], gains: list[Gain], events: tuple[Event, ...]) -> Entry:
     digest, created, recorded, logs, entered, cell, configuration, method, software, error, holdout, rows = row
     return Entry(
         digest=digest,
-        created=_time(created),
-        recorded=_time(recorded),
+        created=zoned(created),
+        recorded=zoned(recorded),
         logs=logs,
-        entered=_time(entered),
+        entered=zoned(entered),
         cell=cell,
         configuration_sha256=configuration,
         method=method,

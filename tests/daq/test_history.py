@@ -12,7 +12,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from daq.cli.app import main
 from daq.cli.history_deeds import deed_words
 from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
-from daq.history.entry import Deed, Entry, Event, logs_of, recorded_at
+from daq.history.entry import Acknowledgement, Deed, Entry, Event, logs_of, recorded_at
 from daq.history.store import HistoryStore
 from daq.history.table import COLUMNS
 from daq.history.watch import Series, dispersions_of, watch
@@ -32,8 +32,10 @@ from daq.history.words import alarm_words, questions
 from daq.recalibration.past import Past
 from daq.recalibration.session import Basis, begin
 from daq.recalibration.session import save as save_session
-from daq.write_back.audit import AuditAction, append, read
+from daq.write_back.audit import AuditAction, AuditEntry, append, read
 from daq.write_back.controller_file import decode as read_controller
+from daq.write_back.drive_proposal import drives_of
+from daq.write_back.gain_gates import GainChange
 from daq.write_back.scalar import respell
 from ident.calibration import Calibration, Gain
 from ident.drift import DISPERSION, dispersions
@@ -303,7 +305,8 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
             file = cell.parent / "own.yaml"
             save(own, file)
             past.keep(own, file)
-        return past.dispersions()
+        changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
+        return dict(past.known(changes).dispersions)
 
 
 def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
@@ -405,11 +408,34 @@ def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
     series = _series(cell)[3]
     assert series.began == 15
     assert not series.alarmed
-    # Of a change that is still to come, nothing has been seen yet.
-    assert main([*explain, "2030-01-01"]) == 0
+    # A baseline that is still to come would silence the axis until then.
+    with HistoryStore(_place(cell).store) as store:
+        store.acknowledge(Acknowledgement("J4", BEGIN.replace(year=2130), BEGIN, "anna", "x", "0" * 64))
     series = _series(cell)[3]
     assert (series.began, series.drift, series.onset, alarm_words(series)) == (20, None, None, None)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
+
+
+def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    explain = ["history", str(cell), "--acknowledge", "J4", "--why", "planned", "--since"]
+    assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "2130-01-02 02:04:05 UTC" in told
+    assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in told
+    assert not _place(cell).audit.exists()
+    assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
+
+
+def test_a_log_of_tomorrow_begins_its_baseline_now(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The clock of whoever recorded it was ahead."""
+    weeks = (datetime.now(UTC) - BEGIN).days // 7 + 2
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, calibration_of(weeks))
+    assert main(["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged"]) == 0
+    assert _series(cell)[3].began == 0
+    assert main(["history", str(cell), "--verify"]) == 0
+    capsys.readouterr()
 
 
 @pytest.mark.parametrize(
@@ -545,6 +571,188 @@ def test_a_broken_history_is_told(cell: Path, capsys: pytest.CaptureFixture[str]
         other.commit()
     assert main(["history", str(cell), "--verify"]) == 4
     assert "without its calibration" in " ".join(capsys.readouterr().err.split())
+
+
+def _write_down(cell: Path, digest: str, *, back: bool = False, at: datetime = BEGIN) -> AuditEntry:
+    """A write to the cell's controller as the audit tells of it; the history is not told. Its end."""
+    controller, audit = load_cell(cell).controller_path, _place(cell).audit
+    begun, ended = AuditAction.APPLY_BEGUN, AuditAction.APPLIED
+    if back:
+        begun, ended = AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK
+    details: dict[str, object] = {"sha256_before": "0" * 64, "sha256_after": "1" * 64 if back else digest[::-1]}
+    if not back:
+        details["calibration"] = {"sha256": digest}
+    first = append(audit, begun, at=at, who="anna", subject=str(controller), details=details)
+    return append(audit, ended, at=at, who="anna", subject=str(controller), details={"begun": first.number})
+
+
+def _enter_write(cell: Path, digest: str, ended: AuditEntry, who: str = "anna") -> None:
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN, who=who, target=ended.subject, audit=ended.sha256, sha256_after=digest[::-1])
+
+
+def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What --verify finds, in one line; empty where all is well."""
+    capsys.readouterr()
+    code = main(["history", str(cell), "--verify"])
+    told = " ".join(capsys.readouterr().err.split())
+    assert code == (4 if told else 0)
+    return told
+
+
+def test_a_write_of_which_the_history_does_not_know_is_told_and_entered_by_hand(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    save(calibration, file)
+    digest = digest_of(calibration)
+    first, back = _write_down(cell, digest), _write_down(cell, digest, back=True)
+    # Of another target the history of this cell need not know.
+    append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="/other.yaml", details={"begun": 1})
+    told = _verified(cell, capsys)
+    for part in (f"entry {first.number} of", "applied by anna", digest[:12], f"entry {back.number} of", "--add"):
+        assert part in told
+    assert main(["history", str(cell), "--verify", "--json"]) == 4
+    found = json.loads(capsys.readouterr().out)["audit"]
+    assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [(2, digest), (4, None)]
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert capsys.readouterr().err.count("Entered too") == 2
+    assert _verified(cell, capsys) == ""
+    with HistoryStore(_place(cell).store) as store:
+        assert [(event.deed, event.at, event.who, event.audit) for event in store.events()] == [
+            (Deed.APPLIED, BEGIN, "anna", first.sha256),
+            (Deed.ROLLED_BACK, BEGIN, "anna", back.sha256),
+        ]
+        assert store.in_force() is None
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+
+
+def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = _filled(cell, 2, lambda _: FLAT)
+    lost, known = _write_down(cell, first), _write_down(cell, second)
+    _enter_write(cell, second, known)
+    told = _verified(cell, capsys)
+    assert f"entry {lost.number} of" in told
+    assert "it knows of a later write" in told
+    file = cell.parent / "calibration.yaml"
+    save(calibration_of(5), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+    assert f"entry {lost.number} of" in _verified(cell, capsys)
+
+
+def test_nothing_is_entered_from_an_audit_that_somebody_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    save(calibration, file)
+    _write_down(cell, digest_of(calibration))
+    audit = _place(cell).audit
+    audit.write_bytes(audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"'))
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+    with HistoryStore(_place(cell).store) as store:
+        assert store.events() == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("event SET who = 'kim'", "event 1: found who 'kim', expected 'anna' as entry 2"),
+        ("event SET target = '/other.yaml'", "event 1: found target /other.yaml, expected"),
+        ("event SET at = '2026-02-02T00:00:00.000000+00:00'", "event 1: found time 2026-02-02T00:00:00"),
+        ("event SET deed = 'rolled back'", "event 1: found rolled back, expected applied"),
+        ("event SET digest = NULL", "event 1: found calibration None, expected"),
+        ("event SET sha256_after = 'ab'", "event 1: found sha256_after ab…, expected"),
+        ("event SET audit = NULL", "no event of entry 2 of the audit, applied by anna"),
+        ("event SET number = 7", "event 1, 2, 3, 4, 5: found no such row, expected all from 1 to 7"),
+        ("acknowledgement SET who = 'kim'", "found who 'kim', expected 'anna (login"),
+        ("acknowledgement SET axis = 'J2'", "found axis 'J2', expected 'J4' as entry 3"),
+        ("acknowledgement SET why = 'x'", "found why 'x', expected 'gearbox changed'"),
+        ("acknowledgement SET since = '2026-01-01T00:00:00.000000+00:00'", "found since '2026-01-01T00:00:00"),
+        ("acknowledgement SET at = '2026-03-01T00:00:00.000000+00:00'", "found time '2026-03-01T00:00:00"),
+        ("acknowledgement SET audit = (SELECT audit FROM event)", "tells of applied, expected acknowledged"),
+        ("gain SET value = value * 1.01 WHERE axis = 'J4'", "gain of J4 in calibration"),
+    ],
+)
+def test_a_row_that_is_not_what_the_audit_tells_is_told(
+    cell: Path, capsys: pytest.CaptureFixture[str], change: str, says: str
+) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    _enter_write(cell, digest, _write_down(cell, digest))
+    assert main(["history", str(cell), "--acknowledge", "J4", "--by", "anna", "--why", "gearbox changed"]) == 0
+    assert _verified(cell, capsys) == ""
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute(f"UPDATE {change}")
+        other.commit()
+    assert says in _verified(cell, capsys)
+
+
+def test_a_row_that_was_taken_away_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    _enter_write(cell, digest, _write_down(cell, digest))
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute("DELETE FROM event")
+        other.commit()
+    told = _verified(cell, capsys)
+    assert "event 1: found no such row" in told
+    assert "no event of entry 2" in told
+
+
+def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whoever wrote was killed before the history knew; the next command says in the audit who it is."""
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    ended = _write_down(cell, digest)
+    begun, later = read(_place(cell).audit)[0], BEGIN + timedelta(hours=1)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=later, who="kim", target=ended.subject, audit=begun.sha256)
+    assert "found who 'kim', expected 'anna'" in _verified(cell, capsys)
+    append(_place(cell).audit, AuditAction.NOTHING_TO_DO, at=later, who="kim", subject=ended.subject, details={})
+    assert _verified(cell, capsys) == ""
+
+
+def test_a_write_that_a_job_entered_stands_within_the_job(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    audit = _place(cell).audit
+
+    def job(action: AuditAction, hours: float) -> None:
+        append(audit, action, at=BEGIN + timedelta(hours=hours), who="job", subject="x", details={})
+
+    job(AuditAction.RECALIBRATION_BEGUN, -1)  # and was killed
+    ended = _write_down(cell, digest)
+    begun = read(audit)[1]
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN + timedelta(hours=1), who="job", target=ended.subject, audit=begun.sha256)
+    assert _verified(cell, capsys) == ""
+    job(AuditAction.RECALIBRATION_BEGUN, 2)
+    job(AuditAction.RECALIBRATION_ENDED, 3)
+    assert _verified(cell, capsys) == ""
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute("UPDATE event SET at = '2026-02-02T00:00:00.000000+00:00'")
+        other.commit()
+    assert "found time 2026-02-02" in _verified(cell, capsys)
+
+
+def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`apply --drives` writes what stands there already once more, to let the drives save it."""
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    subject, evidence = drives_of("demo"), {"calibration": {"sha256": digest}}
+    ends = []
+    for before in ("0" * 64, "1" * 64):
+        begun = append(
+            _place(cell).audit,
+            AuditAction.APPLY_BEGUN,
+            at=BEGIN,
+            who="anna",
+            subject=subject,
+            details={"sha256_before": before, "sha256_after": "1" * 64, **evidence},
+        )
+        told = {"begun": begun.number}
+        ended = append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details=told)
+        ends.append(ended)
+        assert f"entry {ends[0].number} of" in _verified(cell, capsys)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN, who="anna", target=subject, audit=ends[1].sha256, sha256_after="1" * 64)
+    assert _verified(cell, capsys) == ""
 
 
 def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:

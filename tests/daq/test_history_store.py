@@ -350,6 +350,44 @@ def test_a_row_that_somebody_wrote_is_told(tmp_path: Path, change: str) -> None:
         store.entries()
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            "UPDATE gain SET value = 1.5 WHERE axis = 'J4'",
+            "gain of J4 in calibration {digest}…: found value 1.5, ",
+        ),
+        ("UPDATE gain SET std = 0 WHERE axis = 'J4'", "gain of J4 in calibration {digest}…: found std 0.0, expected"),
+        ("UPDATE gain SET unit = 'mNm/A' WHERE axis = 'J4'", "found unit 'mNm/A', expected 'Nm/A'"),
+        ("UPDATE gain SET axis = 'J7' WHERE axis = 'J6'", "found J1, J2, J3, J4, J5, J7, expected J1, J2, J3, J4, J5"),
+        ("DELETE FROM gain", "gains of calibration {digest}…: found none, expected J1"),
+        ("UPDATE calibration SET rows = 1", "row of calibration {digest}…: found rows 1, expected"),
+        ("UPDATE calibration SET recorded = '2025-01-01T00:00:00.000000+00:00'", "found recorded '2025-01-01T00:00:00"),
+        ("UPDATE calibration SET document = 'x'", "calibration {digest}…: its document is"),
+        (
+            "UPDATE calibration SET document = replace(document, 'rows: ', 'rows: 1')",
+            "its document is a change by hand",
+        ),
+        ("UPDATE acknowledgement SET since = '2130-01-01T00:00:00+00:00'", "acknowledgement of J4 at 2026-01-05"),
+        ("DELETE FROM acknowledgement", "acknowledgement 1: found no such row, expected all from 1 to 1"),
+        ("UPDATE event SET number = 9000000000000000000", "event 1, 2, 3, 4, 5: found no such row"),
+    ],
+)
+def test_rows_that_contradict_each_other_are_told(tmp_path: Path, change: str, says: str) -> None:
+    path = tmp_path / "h"
+    with HistoryStore(path) as store:
+        digest = enter(store, calibration_of(0))
+        store.applied(digest, at=BEGIN, who="anna", target="x.yaml")
+        store.acknowledge(Acknowledgement("J4", BEGIN, BEGIN, "anna", "gearbox changed", "0" * 64))
+        assert store.integrity() == ()
+    with closing(sqlite3.connect(path)) as other:
+        other.execute(change)
+        other.commit()
+    with HistoryStore(path) as store:
+        told = store.integrity()
+    assert any(says.format(digest=digest[:12]) in sentence for sentence in told), told
+
+
 @contextmanager
 def _nobody() -> Iterator[None]:
     """Without root's leave to write everywhere."""
