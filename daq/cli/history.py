@@ -30,9 +30,9 @@ from daq.errors import (
 )
 from daq.history.entry import Acknowledgement, utc
 from daq.history.store import HistoryStore
-from daq.history.table import COLUMNS, csv_text
 from daq.history.watch import Series, watch
 from daq.report.history import plot_history
+from daq.report.history_table import COLUMNS, csv_text
 from daq.write_back.audit import AuditAction, append
 
 _PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}

@@ -11,10 +11,10 @@ from rich.table import Table
 
 from daq.cli.verb import printable
 from daq.history.entry import Entry
-from daq.history.table import rows
 from daq.history.watch import Point, Series
 from daq.history.words import alarm_words, pattern_of, questions
 from daq.report.gain_table import with_deviation
+from daq.report.history_table import rows
 from ident.drift_chart import CHART
 
 

@@ -26,12 +26,12 @@ from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
 from daq.history.entry import Acknowledgement, Deed, Entry, Event, logs_of, recorded_at
 from daq.history.store import HistoryStore
-from daq.history.table import COLUMNS
 from daq.history.watch import Series, dispersions_of, watch
 from daq.history.words import alarm_words, questions
 from daq.recalibration.past import Past
 from daq.recalibration.session import Basis, begin
 from daq.recalibration.session import save as save_session
+from daq.report.history_table import COLUMNS
 from daq.write_back.audit import AuditAction, AuditEntry, append, read
 from daq.write_back.controller_file import decode as read_controller
 from daq.write_back.drive_proposal import drives_of

@@ -18,10 +18,10 @@ from daq.fleet.cell_fit import Failure
 from daq.fleet.row import FleetRow
 from daq.fleet.summary import Summary
 from daq.history.store import HistoryStore
-from daq.history.table import csv_text
 from daq.history.watch import Series, watch
 from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.report.history import plot_history
+from daq.report.history_table import csv_text
 from daq.report.proposal import show
 from daq.report.spreadsheet import inert
 from daq.report.terminal_text import terminal_lines, terminal_text
