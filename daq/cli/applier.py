@@ -12,7 +12,7 @@ import typer
 
 from daq.configuration.cell import Cell
 from daq.digest import sha256
-from daq.errors import AuditUnusable, DaqError
+from daq.errors import AuditUnusable, DaqError, UsageError
 from daq.history.judgement import NOTHING, Known, known_of
 from daq.history.store import HistoryStore
 from daq.login import login
@@ -46,8 +46,16 @@ class Applier:
 
 
 def applier(by: str | None) -> Applier:
-    """Whoever runs this, by the name given."""
+    """Whoever runs this, by the name given.
+
+    Raises:
+        UsageError: the name cannot be written down.
+    """
     user = login()
+    if by is not None and not by.isprintable():
+        raise UsageError(
+            f"--by {by!a}", found="characters that cannot be shown", expected="a name", remedy="type it again"
+        )
     return Applier(by or user, user)
 
 
@@ -97,7 +105,8 @@ def ask_history(cell: Cell, target: str, request: Request, changes: Sequence[Gai
     try:
         with HistoryStore(cell.history.store) as store:
             return known_of(store, target, sha256(request.signed), changes)
-    except DaqError:  # `tell_history` says so, once something is written
+    except DaqError as error:
+        _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
         return NOTHING
 
 

@@ -20,9 +20,11 @@ from daq.cli.apply_drives import apply_drives
 from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.configuration.apply_policy import ApplyPolicy
+from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.digest import sha256
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
+from daq.history.audited import catch_up
 from daq.history.store import HistoryStore
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
@@ -103,7 +105,7 @@ def apply_verb(
             print_json({**describe(proposal, None, known), "base": proposal.looked_at})
         raise
     if yes and not proposal.refusals:
-        tell_history(declared, partial(_enter, proposal, written, request, doer, book))
+        tell_history(declared, partial(_enter, declared, proposal, written, request, doer, book))
     if json:
         print_json({**describe(proposal, written, known), "base": proposal.looked_at})
     if proposal.refusals:
@@ -178,6 +180,7 @@ def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier)
 
 
 def _enter(
+    cell: Cell,
     proposal: Proposal,
     written: Written | None,
     request: Request,
@@ -194,6 +197,9 @@ def _enter(
     told = None if written is None else written.audit_sha256
     if written is None and audit is not None:
         told = told_of(audit, target, after)
+    # What others wrote before and could not tell is entered first: nothing is entered behind a later write.
+    if cell.history is not None and any(told in write.digests for write in catch_up(cell, cell.history, store)):
+        return
     store.applied(digest, at=request.now, who=str(doer), target=target, audit=told, sha256_after=after)
 
 

@@ -13,11 +13,11 @@ from rich.console import Console
 from daq.atomic_file import replace_file
 from daq.calibration_file import decode, read
 from daq.cli.applier import applier
-from daq.cli.history_audit import catch_up, verify_history
+from daq.cli.history_audit import verify_history
 from daq.cli.history_deeds import deed_words, in_force
 from daq.cli.history_view import describe, show, show_axis
 from daq.cli.output import say_written
-from daq.cli.verb import JsonOption, Verb, print_json
+from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.configuration.history_place import HistoryPlace
@@ -28,6 +28,7 @@ from daq.errors import (
     OutputFailed,
     UsageError,
 )
+from daq.history.audited import catch_up
 from daq.history.entry import Acknowledgement, utc
 from daq.history.store import HistoryStore
 from daq.history.watch import Series, watch
@@ -135,7 +136,10 @@ def _add(store: HistoryStore, cell: Cell, place: HistoryPlace, file: Path, now: 
     console.print(f"{file.name}: {told}.")
     # Whoever wrote it may have been killed before the history knew.
     for write in catch_up(cell, place, store):
-        console.print(f"Entered too: {write}.")
+        console.print(f"Entered too: {printable(str(write))}.")
+    left = verify_history(cell, place, store)
+    if left.unknown or not left.verdict.holds:
+        console.print("Not all writes that the audit tells of could be entered: see `drivegain history CELL --verify`.")
 
 
 def _acknowledge(

@@ -13,12 +13,17 @@ from daq.cli.verb import printable
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.errors import AuditBroken, HistoryUnreadable
-from daq.history.audited import AuditedWrite, acknowledgement_flaws, at_of, event_flaws, unknown_writes, writes_to
-from daq.history.entry import Deed, iso
+from daq.history.audited import AuditedWrite, acknowledgement_flaws, event_flaws, unknown_writes, writes_to
+from daq.history.entry import iso
 from daq.history.store import HistoryStore
 from daq.recalibration.session import sessions
 from daq.write_back.audit import AuditVerdict, verify
 
+_ADDING = (
+    "`drivegain history CELL --add CALIBRATION` for each calibration that was written, oldest first, which enters what "
+    "the audit tells of them. Where one is no more to be had, keep both files and begin audit and history anew "
+    "(`history.audit`, `history.store`)"
+)
 _SHOWN = 5
 """Sentences of a kind in an error; --json has all."""
 
@@ -107,7 +112,8 @@ class Checked:
                 found=f"{len(self.verdict.flaws)} places that are not what was written{more}\n ",
                 expected="entries that were never changed, moved or taken away",
                 remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is "
-                "known trust the controller's file by its backups only, and begin another audit (`history.audit`)",
+                "known trust the controller's file by its backups only, and begin audit and history anew, both "
+                "(`history.audit`, `history.store`): the old history would look for what is missing for ever",
             )
         unknown = [printable(f"no event of {one}") for one in self.unknown]
         if self.broken:
@@ -123,12 +129,9 @@ class Checked:
                 found=_first(unknown),
                 expected="an event of every write to this cell's controller that the audit tells of",
                 remedy="it knows of a later write: restore the last good one from a backup, or build it anew in "
-                "another file (`history.store`) with `drivegain history CELL --add CALIBRATION` for each calibration "
-                "that was written"
+                f"another file (`history.store`) with {_ADDING}"
                 if self.late
-                else "`drivegain history CELL --add CALIBRATION`, with the calibration that was written (of a rollback "
-                "with any), enters what the audit tells; so does `drivegain apply CALIBRATION --cell CELL --yes`, "
-                "which writes nothing where a controller's file has these gains",
+                else f"{_ADDING}; of a rollback with any one",
             )
 
 
@@ -158,38 +161,6 @@ def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Chec
     )
     unknown, late = unknown_writes(writes_to(cell, entries), store.audited())
     return Checked(place.audit, place.store, verdict, broken, tuple(unknown), late != unknown)
-
-
-def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[AuditedWrite, ...]:
-    """Enter writes of which the audit tells and the history does not know, in their order.
-
-    Only those behind the last one of their target that it knows, and of those with calibrations that it has: an event
-    is never entered behind a later one. Of an audit that is not what was written nothing is entered.
-
-    Returns:
-        what was entered.
-
-    Raises:
-        AuditUnusable, HistoryUnreadable, OutputFailed: see `daq.write_back.audit.verify` and the store.
-    """
-    verdict = _verdict(cell, place, store)
-    if not verdict.holds:
-        return ()
-    _, new = unknown_writes(writes_to(cell, verdict.entries), store.audited())
-    known, stopped, entered = {entry.digest for entry in store.entries()}, set[str](), []
-    for write in new:
-        one, after = write.ended, write.sha256_after
-        at, can = at_of(one), after is not None and (write.deed is Deed.ROLLED_BACK or write.calibration in known)
-        if one.subject in stopped or at is None or after is None or not can:
-            stopped.add(one.subject)
-            continue
-        if write.deed is Deed.ROLLED_BACK:
-            store.rolled_back(at=at, who=one.who, target=one.subject, sha256_after=after, audit=one.sha256)
-        else:
-            digest = write.calibration or ""
-            store.applied(digest, at=at, who=one.who, target=one.subject, audit=one.sha256, sha256_after=after)
-        entered.append(write)
-    return tuple(entered)
 
 
 def _verdict(cell: Cell, place: HistoryPlace, store: HistoryStore) -> AuditVerdict:

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from daq.configuration.cell import Cell
+from daq.configuration.history_place import HistoryPlace
 from daq.history.entry import Acknowledgement, Deed, Event, iso, utc
-from daq.write_back.audit import AuditAction, AuditEntry
+from daq.history.store import HistoryStore
+from daq.write_back.audit import AuditAction, AuditEntry, verify
 from daq.write_back.drive_proposal import drives_of
 
 _ENDS = {AuditAction.APPLIED: Deed.APPLIED, AuditAction.ROLLED_BACK: Deed.ROLLED_BACK}
@@ -40,6 +42,13 @@ class AuditedWrite:
         return None if self.begun is None else _calibration(self.begun)
 
     @property
+    def cell(self) -> str | None:
+        """Name of the cell whose calibration was written, None where the audit does not tell."""
+        told = None if self.begun is None else self.begun.details.get("calibration")
+        found = told.get("cell") if isinstance(told, dict) else None
+        return found if isinstance(found, str) else None
+
+    @property
     def sha256_after(self) -> str | None:
         """Of what the target held afterwards, None where the audit does not tell."""
         return None if self.begun is None else _text(self.begun, "sha256_after")
@@ -61,14 +70,25 @@ class AuditedWrite:
 
 
 def writes_to(cell: Cell, entries: Sequence[AuditEntry]) -> list[AuditedWrite]:
-    """To this cell's controller: another cell may have the same audit."""
+    """To this cell's controller.
+
+    Another cell may have the same audit, and even the same file: what was written with its calibrations, and the way
+    back from there, is told to its own history.
+    """
     file = cell.controller_path
     # Not `followed`: a link that it refuses today was followed on the day of the write.
     targets = {drives_of(cell.name), *(() if file is None else (os.path.realpath(file),))}
     begun = {one.number: one for one in entries if one.action in _BEGINS}
-    return [
-        AuditedWrite(begun.get(_number(one)), one) for one in entries if one.action in _ENDS and one.subject in targets
-    ]
+    found, owners = [], dict[str, str]()
+    for one in entries:
+        if one.action not in _ENDS or one.subject not in targets:
+            continue
+        write = AuditedWrite(begun.get(_number(one)), one)
+        if write.deed is Deed.APPLIED:
+            owners[one.subject] = write.cell or cell.name
+        if owners.get(one.subject, cell.name) == cell.name:
+            found.append(write)
+    return found
 
 
 def unknown_writes(
@@ -93,6 +113,38 @@ def unknown_writes(
         if target not in some_known:
             new.append(write)
     return unknown[::-1], new[::-1]
+
+
+def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[AuditedWrite, ...]:
+    """Enter writes of which the audit tells and the history does not know, in their order.
+
+    Only those behind the last one of their target that it knows, and of those with calibrations that it has: an event
+    is never entered behind a later one. Of an audit that is not what was written nothing is entered.
+
+    Returns:
+        what was entered.
+
+    Raises:
+        AuditUnusable, HistoryUnreadable, OutputFailed: see `daq.write_back.audit.verify` and the store.
+    """
+    verdict = verify(place.audit, store.audited())
+    if not verdict.holds:
+        return ()
+    _, new = unknown_writes(writes_to(cell, verdict.entries), store.audited())
+    known, stopped, entered = {entry.digest for entry in store.entries()}, set[str](), []
+    for write in new:
+        one, after = write.ended, write.sha256_after
+        at, can = at_of(one), after is not None and (write.deed is Deed.ROLLED_BACK or write.calibration in known)
+        if one.subject in stopped or at is None or after is None or not can:
+            stopped.add(one.subject)
+            continue
+        if write.deed is Deed.ROLLED_BACK:
+            store.rolled_back(at=at, who=one.who, target=one.subject, sha256_after=after, audit=one.sha256)
+        else:
+            digest = write.calibration or ""
+            store.applied(digest, at=at, who=one.who, target=one.subject, audit=one.sha256, sha256_after=after)
+        entered.append(write)
+    return tuple(entered)
 
 
 def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:

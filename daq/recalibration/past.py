@@ -11,6 +11,7 @@ from typing import Self
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.digest import sha256_of
+from daq.history.audited import catch_up
 from daq.history.judgement import Known, known_of
 from daq.history.store import HistoryStore
 from daq.history.watch import watch
@@ -40,6 +41,7 @@ class Past:
         self._now = now
         self._who = who
         self._store = HistoryStore(place.store)
+        self._cell, self._place = cell, place
         self._digest = ""
 
     def __enter__(self) -> Self:
@@ -74,6 +76,9 @@ class Past:
         """
         if self._store.in_force(self._target) != self._digest:
             told = told_of(audit, self._target, sha256_after)
+            # What others wrote before and could not tell is entered first: nothing is entered behind a later write.
+            if any(told in write.digests for write in catch_up(self._cell, self._place, self._store)):
+                return
             self._store.applied(
                 self._digest, at=self._now(), who=self._who, target=self._target, audit=told, sha256_after=sha256_after
             )

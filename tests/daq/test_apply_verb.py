@@ -18,6 +18,7 @@ from daq.cli.app import main
 from daq.cli.apply import entered_masses, tightened
 from daq.configuration.apply_policy import ApplyPolicy
 from daq.configuration.cell_file import load_cell
+from daq.digest import sha256
 from daq.errors import ExitCode, UsageError
 from daq.history.judgement import Known
 from daq.history.store import HistoryStore
@@ -251,6 +252,41 @@ def test_an_audit_that_lost_a_rollback_is_noticed(bench: Bench) -> None:
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
 
 
+def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(bench: Bench) -> None:
+    shared = "\nhistory: {audit: shared.jsonl, store: %s.sqlite}\n"
+    other = bench.cell.with_name("other.yaml")
+    text = bench.cell.read_text()
+    bench.cell.write_text(text + shared % "one")
+    other.write_text(text.replace("name: demo", "name: other") + shared % "two")
+    for file, factor in ((bench.cell, 1.0), (other, 1.01)):
+        declared = load_cell(file)
+        made = recorded(demo_calibration(), datetime.now(UTC))
+        gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
+        save(replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains), bench.calibration)
+        base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
+        assert main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base]) == ExitCode.OK
+    for file in (bench.cell, other):
+        assert main(["history", str(file), "--verify"]) == ExitCode.OK
+    assert main(["rollback", "--cell", str(other)]) == ExitCode.OK
+    for file in (bench.cell, other):
+        assert main(["history", str(file), "--verify"]) == ExitCode.OK
+
+
+def test_a_dry_run_says_that_the_history_cannot_be_read(
+    bench: Bench, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
+    assert bench.apply() == ExitCode.OK
+    assert "the history cannot be read" in caplog.text + capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["A\udcff", "A\x1b[31m", "A\u202e"])
+def test_a_name_that_cannot_be_shown_is_no_name(bench: Bench, name: str) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes", "--by", name) == ExitCode.USAGE
+    assert bench.controller.read_bytes() == before
+
+
 def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -268,7 +304,8 @@ def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
         with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
             assert store.in_force(str(bench.controller)) == store.entries()[0].digest
             assert len(store.events()) == 1
-            assert store.audited() == {read(bench.audit)[0].sha256}
+            assert store.audited() == {read(bench.audit)[1].sha256}
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
     with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
