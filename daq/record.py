@@ -20,7 +20,7 @@ from daq.current_check import check_currents
 from daq.digest import sha256
 from daq.disk_space import DiskRoom, FreeBytes, free_bytes, largest_log_bytes
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
-from daq.garbage import settled
+from daq.garbage import short_searches
 from daq.log.metadata import RunInfo, RunStatistics
 from daq.log.readback import readback_of_drives
 from daq.log.writer import LogContent, LogWriter
@@ -148,7 +148,7 @@ def record(
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
     check_entered_mass(cell, payload, entered_kg)
-    with settled(), network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
+    with short_searches(), network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
         network.prepare()
         warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
