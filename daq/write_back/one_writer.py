@@ -50,7 +50,7 @@ def _opened(lock: Path) -> int:
             descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _MODE)
             try:
                 os.fchmod(descriptor, _MODE)  # whatever the umask
-            except BaseException:
+            except BaseException:  # an interrupt too: a lock that others cannot open must not stay behind
                 os.close(descriptor)
                 lock.unlink(missing_ok=True)
                 raise

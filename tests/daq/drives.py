@@ -14,7 +14,7 @@ import can
 from daq.calibration_file import encode
 from daq.cli.applier import Applier
 from daq.cli.apply_drives import apply_drives
-from daq.configuration.cell import Cell
+from daq.configuration.cell import Bus, Cell
 from daq.configuration.cell_bus import drive_axes
 from daq.configuration.cell_file import load_cell
 from daq.configuration.controller_target import Controller, GainObject
@@ -49,6 +49,14 @@ def demo_cell(folder: Path, *objects: GainObject) -> Cell:
         controller=Controller(None, (), objects=objects or (WHOLE,) * len(cell.axes)),
         history=HistoryPlace(folder / "demo.history.sqlite", folder / "demo.audit.jsonl"),
     )
+
+
+def on_its_own_bus(folder: Path, channel: str) -> Cell:
+    """That cell on a virtual bus of a test's own."""
+    bus = Bus("the bus", "virtual", channel, 1_000_000, "127.0.0.1", 29536)
+    declared = demo_cell(folder)
+    axes = tuple(replace(axis, bus=bus.name) for axis in declared.axes)
+    return replace(declared, folder=folder, buses=(bus,), axes=axes)
 
 
 @contextmanager

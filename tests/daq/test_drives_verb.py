@@ -15,7 +15,7 @@ from daq.bus_lock import bus_lock
 from daq.calibration_file import encode
 from daq.cli.drives import saving_of
 from daq.cli.rollback_drives import rollback_drives
-from daq.configuration.cell import Bus, Cell
+from daq.configuration.cell import Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.history.store import HistoryStore
 from daq.write_back.audit import AuditAction, read
@@ -24,16 +24,12 @@ from drivers.parameter_write import Saving
 from drivers.sdo import ObjectAccess
 from drivers.simulated.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import DOER, NOW, apply_in_drives, demo_cell, entered_gain, saved_gain, simulated
+from tests.daq.drives import DOER, NOW, apply_in_drives, entered_gain, on_its_own_bus, saved_gain, simulated
 
 
 @pytest.fixture
 def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
-    declared = demo_cell(tmp_path)
-    bus = Bus("the bus", "virtual", request.node.name, 1_000_000, "127.0.0.1", 29536)
-    return replace(
-        declared, folder=tmp_path, buses=(bus,), axes=tuple(replace(axis, bus="the bus") for axis in declared.axes)
-    )
+    return on_its_own_bus(tmp_path, request.node.name)
 
 
 @pytest.fixture

@@ -109,7 +109,7 @@ def _unit(axis: str, unit: str) -> Callable[[Scene], Scene]:
 
 
 def _changed(gain: Gain, changes: dict[str, float]) -> Gain:
-    return replace(gain, **changes)  # type: ignore[arg-type]
+    return replace(gain, **changes)  # type: ignore[arg-type]  # fields by name
 
 
 def _nameplate(axis: str, nameplate: float) -> Callable[[Scene], Scene]:

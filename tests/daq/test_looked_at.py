@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daq.configuration.cell import Bus, Cell
+from daq.configuration.cell import Cell
 from daq.errors import CalibrationRefused, UsageError
 from daq.write_back.looked_at import LookedAt, change_of, look, other_change
 from drivers.bus import BusAddress
 from drivers.simulated.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import apply_in_drives, demo_cell, entered_gain, simulated
+from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simulated
 
 
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
@@ -45,12 +45,7 @@ def test_what_is_no_digest_is_refused(told: str) -> None:
 
 @pytest.fixture
 def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
-    """The demo cell on a bus of this test's own."""
-    declared = demo_cell(tmp_path)
-    bus = Bus("the bus", "virtual", request.node.name, 1_000_000, "127.0.0.1", 29536)
-    return replace(
-        declared, folder=tmp_path, buses=(bus,), axes=tuple(replace(axis, bus="the bus") for axis in declared.axes)
-    )
+    return on_its_own_bus(tmp_path, request.node.name)
 
 
 @pytest.fixture
