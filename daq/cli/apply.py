@@ -24,7 +24,8 @@ from daq.configuration.cell import Cell
 from daq.configuration.cell_file import load_cell
 from daq.digest import sha256
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
-from daq.history.audited import catch_up
+from daq.history.audited import enter_applied
+from daq.history.entry import Deed, Event
 from daq.history.store import HistoryStore
 from daq.report.proposal import describe, show
 from daq.write_back.apply import Proposal, apply, propose_for, refused
@@ -197,10 +198,7 @@ def _enter(
     told = None if written is None else written.audit_sha256
     if written is None and audit is not None:
         told = told_of(audit, target, after)
-    # What others wrote before and could not tell is entered first: nothing is entered behind a later write.
-    if cell.history is not None and any(told in write.digests for write in catch_up(cell, cell.history, store)):
-        return
-    store.applied(digest, at=request.now, who=str(doer), target=target, audit=told, sha256_after=after)
+    enter_applied(cell, store, Event(digest, Deed.APPLIED, request.now, str(doer), target, told, after))
 
 
 def _say_way_on(proposal: Proposal) -> None:

@@ -15,6 +15,8 @@ from daq.cli.verb import print_json
 from daq.configuration.cell import Cell
 from daq.digest import sha256
 from daq.errors import OutputFailed
+from daq.history.audited import enter_applied
+from daq.history.entry import Deed, Event
 from daq.history.judgement import Known
 from daq.history.store import HistoryStore
 from daq.report.proposal import show_changes
@@ -103,14 +105,8 @@ def _enter(declared: Cell, request: Request, doer: Applier, written: DrivesWritt
 
     def enter(store: HistoryStore) -> None:
         store.add(request.calibration, digest=digest, at=request.now)
-        store.applied(
-            digest,
-            at=request.now,
-            who=str(doer),
-            target=written.target,
-            audit=written.audit_sha256,
-            sha256_after=written.sha256_after,
-        )
+        told, after = written.audit_sha256, written.sha256_after
+        enter_applied(declared, store, Event(digest, Deed.APPLIED, request.now, str(doer), written.target, told, after))
 
     tell_history(declared, enter)
 

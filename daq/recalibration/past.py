@@ -11,7 +11,8 @@ from typing import Self
 from daq.configuration.cell import Cell
 from daq.configuration.history_place import HistoryPlace
 from daq.digest import sha256_of
-from daq.history.audited import catch_up
+from daq.history.audited import enter_applied
+from daq.history.entry import Deed, Event
 from daq.history.judgement import Known, known_of
 from daq.history.store import HistoryStore
 from daq.history.watch import watch
@@ -41,7 +42,7 @@ class Past:
         self._now = now
         self._who = who
         self._store = HistoryStore(place.store)
-        self._cell, self._place = cell, place
+        self._cell = cell
         self._digest = ""
 
     def __enter__(self) -> Self:
@@ -76,12 +77,8 @@ class Past:
         """
         if self._store.in_force(self._target) != self._digest:
             told = told_of(audit, self._target, sha256_after)
-            # What others wrote before and could not tell is entered first: nothing is entered behind a later write.
-            if any(told in write.digests for write in catch_up(self._cell, self._place, self._store)):
-                return
-            self._store.applied(
-                self._digest, at=self._now(), who=self._who, target=self._target, audit=told, sha256_after=sha256_after
-            )
+            event = Event(self._digest, Deed.APPLIED, self._now(), self._who, self._target, told, sha256_after)
+            enter_applied(self._cell, self._store, event)
 
     def watched(self) -> tuple[WatchedGain, ...]:
         """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
