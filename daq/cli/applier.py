@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,7 @@ def own_file(audit: Path, others: Iterable[Path | None]) -> None:
         AuditUnusable: it is.
     """
     for other in others:
-        if other is not None and (audit.resolve() == other.resolve() or _is_same(audit, other)):
+        if other is not None and (os.path.realpath(audit) == os.path.realpath(other) or _is_same(audit, other)):
             raise AuditUnusable(
                 str(audit),
                 found=f"the same file as {other}",

@@ -35,6 +35,7 @@ from daq.history.watch import Series, watch
 from daq.report.history import plot_history
 from daq.report.history_table import COLUMNS, csv_text
 from daq.write_back.audit import AuditAction, append
+from daq.write_back.link import followed
 
 _PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}
 """Suffixes of pictures, and how such a file begins."""
@@ -95,6 +96,9 @@ def history_verb(
         entries = store.entries()
         current = in_force(declared, store)
         deeds = deed_words(entries, store.events(), current)
+        if verify and declared.controller_path is not None:
+            # Where its links lead decides which writes are this cell's: another user's link could hide some.
+            followed(declared.controller_path)
         checked = verify_history(declared, place, store) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:

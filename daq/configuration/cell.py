@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -186,10 +187,16 @@ class Cell:
 
     @property
     def controller_path(self) -> Path | None:
-        """The controller's file, where it is known."""
+        """The controller's file as the cell file names it, where it is known.
+
+        Symbolic links in that name are left alone: `daq.write_back.link` decides which of them may be followed.
+        """
         if self.controller is None or self.controller.file is None or self.folder is None:
             return None
-        return (self.folder / self.controller.file).resolve()
+        place, parts = Path(os.path.realpath(self.folder)), Path(self.controller.file).parts
+        while parts and parts[0] == "..":  # exact, because the folder's own links are resolved
+            place, parts = place.parent, parts[1:]
+        return place.joinpath(*parts)
 
     @property
     def wiring(self) -> tuple[tuple[Bus, tuple[Axis, ...]], ...]:

@@ -13,6 +13,7 @@ from daq.recalibration.journal import Journal, Level
 from daq.recalibration.recording import Cellside, GainTarget
 from daq.recalibration.release import require_release
 from daq.recalibration.session import Session, last_good
+from daq.write_back.link import followed
 from drivers.errors import MotionRefused
 
 CLOCK_SLACK = timedelta(minutes=1)
@@ -24,6 +25,7 @@ def target_of(cell: Cell) -> GainTarget:
 
     Raises:
         ConfigurationInconsistent: the cell names no file of a controller.
+        ControllerUnfit: its name is a symbolic link that a write would not follow (`daq.write_back.link`).
     """
     file = cell.controller_path
     if cell.controller is None or file is None or cell.history is None:
@@ -33,6 +35,7 @@ def target_of(cell: Cell) -> GainTarget:
             expected="a controller's file: a job compares its gains with those in it",
             remedy="name it in the cell file; what is kept in drives alone is recorded and applied by hand",
         )
+    followed(file)  # refused now, not after an hour of recordings
     return GainTarget(cell.controller, file, cell.history)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shlex
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
     """Folders that ProtectHome= and ProtectSystem= would lock; of links, those where the files are."""
     folders = {cell_file.parent, section.folder.parent, section.folder}
     if cell.controller_path is not None:
-        folders.add(cell.controller_path.parent)
+        folders.add(Path(os.path.realpath(cell.controller_path)).parent)
     if cell.history is not None:
         folders |= {cell.history.store.parent, cell.history.audit.parent}
     if section.metrics is not None:

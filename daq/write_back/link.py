@@ -1,4 +1,4 @@
-"""Links to a controller's file: symbolic ones are followed to where they lead, if that place is nobody else's."""
+"""Symbolic and hard links to a controller's file, and which of them a write may follow."""
 
 from __future__ import annotations
 
@@ -12,35 +12,39 @@ from daq.errors import ControllerUnfit
 
 
 def followed(file: Path) -> Path:
-    """The file itself, symbolic links followed; a file that is gone is where its links still lead.
+    """Resolve the symbolic links of a file's name, those of its folders included.
+
+    A file that is gone resolves to where its links still lead.
+
+    Args:
+        file: as it was declared. A name that was resolved before has no links left to judge.
 
     Raises:
-        ControllerUnfit: the links go round in a circle, belong to a stranger, or lead into a folder in which everybody
-            may exchange the file.
+        ControllerUnfit: the links form a circle, one of them belongs to another user, or they lead into a folder in
+            which everybody may exchange the file.
     """
     try:
-        target = file.resolve()
+        target, links = file.resolve(), _links(file)
     except RuntimeError as error:  # of Python before 3.13
         raise _circle(file) from error
-    try:
-        owner = target.lstat().st_uid
-        folder = target.parent.stat()
-    except FileNotFoundError:
-        return target
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise _circle(file) from error
         raise
-    if not file.is_symlink():
-        return target
-    if (made_by := file.lstat().st_uid) not in {0, os.geteuid(), owner}:
-        raise ControllerUnfit(
-            str(file),
-            found=f"a symbolic link that user {made_by} has made, to a file of user {owner}",
-            expected="a link of whoever owns the file, or of you",
-            remedy="name the file itself, or make the link anew",
-        )
-    if folder.st_mode & stat.S_IWOTH:
+    status, folder = _status(target), _status(target.parent)
+    owner = None if status is None else status.st_uid
+    for link in links:
+        made_by = link.lstat().st_uid
+        if made_by not in {0, os.geteuid(), owner}:
+            named = "" if link == file else f" ({link})"
+            whose = f"to {target}, which is not there" if owner is None else f"to a file of user {owner}"
+            raise ControllerUnfit(
+                str(file),
+                found=f"a symbolic link{named} that user {made_by} has made, {whose}",
+                expected="a link of the file's owner, or of you",
+                remedy="name the file itself, or make the link anew",
+            )
+    if links and folder is not None and folder.st_mode & stat.S_IWOTH:
         raise ControllerUnfit(
             str(file),
             found=f"a symbolic link into {target.parent}, a folder that everybody may write",
@@ -48,6 +52,27 @@ def followed(file: Path) -> Path:
             remedy="take that right away (`chmod o-w`), or name the file itself",
         )
     return target
+
+
+def _links(file: Path) -> tuple[Path, ...]:
+    """Symbolic links on the way to a file, the links that they lead to included."""
+    found: dict[Path, None] = {}
+    names = [file.absolute()]
+    while names:
+        name = names.pop()
+        for place in (name, *name.parents):
+            if place not in found and place.is_symlink():
+                found[place] = None
+                names.append(place.parent / place.readlink())
+    return tuple(found)
+
+
+def _status(file: Path) -> os.stat_result | None:
+    """Status of a file, None where it is gone or may not be looked at."""
+    try:
+        return file.lstat()
+    except OSError:
+        return None
 
 
 def require_there(file: Path) -> None:

@@ -474,3 +474,87 @@ def test_whatever_the_history_does_a_write_is_not_called_undone(
     assert bench.apply("--yes") == ExitCode.OK
     assert "the history does not know of this" in caplog.text + capsys.readouterr().err
     assert b"-9.2100" in bench.controller.read_bytes()
+
+
+def _linked(bench: Bench, target: Path) -> None:
+    """Move the controller's file there; the cell file's name of it becomes a symbolic link."""
+    target.parent.mkdir(exist_ok=True)
+    bench.controller.rename(target)
+    bench.controller.symlink_to(target)
+
+
+def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes() if bench.controller.exists() else b""
+    capsys.readouterr()
+    for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
+        assert code == ExitCode.CALIBRATION_REFUSED
+    told = " ".join(capsys.readouterr().err.split())
+    assert told.count(found) == 3
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.CALIBRATION_REFUSED
+    assert found in " ".join(capsys.readouterr().err.split())
+    assert before == (bench.controller.read_bytes() if bench.controller.exists() else b"")
+
+
+def test_a_link_of_the_cell_file_into_a_folder_that_everybody_may_write_is_refused(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _linked(bench, tmp_path / "open" / "gains.yaml")
+    assert bench.apply("--yes") == ExitCode.OK
+    (tmp_path / "open").chmod(0o777)
+    _all_refused(bench, "everybody may write", capsys)
+
+
+def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.controller.parent.rename(tmp_path / "open")
+    bench.controller.parent.symlink_to(tmp_path / "open")
+    assert bench.apply("--yes") == ExitCode.OK
+    (tmp_path / "open").chmod(0o777)
+    _all_refused(bench, "everybody may write", capsys)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+@pytest.mark.parametrize("folder", [False, True], ids=["file", "folder"])
+@pytest.mark.parametrize("behind", [False, True], ids=["named", "behind one's own"])
+def test_a_stranger_s_link_of_the_cell_file_is_refused(
+    bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    link = bench.controller.parent if folder else bench.controller
+    moved, alias = tmp_path / "moved", tmp_path / "alias"
+    link.rename(moved)
+    if behind:
+        alias.symlink_to(moved)
+        link.symlink_to(alias)
+    else:
+        link.symlink_to(moved)
+    assert bench.apply("--yes") == ExitCode.OK
+    os.lchown(alias if behind else link, 4711, 4711)
+    _all_refused(bench, "user 4711 has made", capsys)
+    (moved / "demo.yaml" if folder else moved).unlink()  # a rollback would bring it back, there
+    _all_refused(bench, "user 4711 has made", capsys)
+
+
+def test_links_of_the_cell_file_in_a_circle_are_called_so(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.controller.unlink()
+    bench.controller.symlink_to(bench.controller)
+    _all_refused(bench, "round in a circle", capsys)
+
+
+def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_behind_it(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """So do those of earlier versions, which never saw the link: they go on to match."""
+    target = tmp_path / "elsewhere" / "gains.yaml"
+    _linked(bench, target)
+    before = target.read_bytes()
+    assert bench.apply("--yes") == ExitCode.OK
+    assert bench.rollback() == ExitCode.OK
+    assert bench.controller.is_symlink()
+    assert target.read_bytes() == before
+    assert {entry.subject for entry in read(bench.audit)} == {str(target)}
+    place = load_cell(bench.cell).history
+    assert place is not None
+    with HistoryStore(place.store) as store:
+        assert {event.target for event in store.events()} == {str(target)}
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK

@@ -23,6 +23,7 @@ from daq.errors import (
     BusTaken,
     ClockWentBack,
     ConfigurationInconsistent,
+    ControllerUnfit,
     DiskSpaceShort,
     ExitCode,
     MountFailed,
@@ -489,3 +490,17 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_pat
     # Preflight; then before each recording, and again before its motion.
     assert asked == ["test", "sh", *["test"] * 8, "sh", *["test"] * 2, "sh", *["test"] * 2]
     assert not list(rig.session.folder.glob("warm-up*"))
+
+
+def test_a_link_that_no_write_would_follow_is_refused_before_anything_is_recorded(
+    tmp_path: Path, short_plan: Path
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    behind = tmp_path / "open" / "gains.yaml"
+    behind.parent.mkdir()
+    rig.controller.rename(behind)
+    rig.controller.symlink_to(behind)
+    behind.parent.chmod(0o777)
+    with pytest.raises(ControllerUnfit, match="everybody may write"):
+        rig.job()
+    assert rig.sessions == ()
