@@ -3,6 +3,7 @@
 DriverError
 ├── BusError                  the bus cannot be opened, or has gone
 ├── BusBusy                   another master commands this bus
+├── RecorderIdTaken           the recorder's heartbeat has no node id of its own
 ├── NodeMissing               a configured node does not answer
 ├── NodeMisplaced             a node is heard on another bus than its own
 ├── IdentityMismatch          1018h is not what the cell configuration expects
@@ -62,6 +63,26 @@ class BusBusy(DriverError):
         )
         self.address = address
         self.seen = seen
+
+
+class RecorderIdTaken(DriverError):
+    """The recorder's heartbeat has no node id of its own; a stop that could not be confirmed is noted on the error."""
+
+    def __init__(self, found: str, remedy: str) -> None:
+        super().__init__(
+            f"node id of the recorder's heartbeat: found {found}; expected an id that no device uses, because another "
+            f"device's heartbeat with it keeps the axes running when the recorder is killed; {remedy}"
+        )
+        self.found = found
+        self.remedy = remedy
+
+    @classmethod
+    def by_another(cls, node_id: int) -> RecorderIdTaken:
+        """A device was heard that sends it too."""
+        return cls(
+            f"a heartbeat {0x700 + node_id:03X}h of another device, which has node id {node_id} too",
+            "the axes are stopped; give that device another node id, or record again: the recorder then takes another",
+        )
 
 
 class NodeMissing(DriverError):

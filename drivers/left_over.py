@@ -34,7 +34,7 @@ def _watches_recorder(network: CanopenNetwork, axis: Axis) -> str:
     try:
         for sub in range(1, access.read(CONSUMERS) + 1):
             value = access.read(ObjectEntry(CONSUMERS.index, sub, 32, signed=False))
-            if value >> 16 & 0x7F == network.recorder_id and value & 0xFFFF:
+            if network.was_ours(value):
                 return f"{CONSUMERS.index:04X}h:{sub:02X} = {value:08X}h watches the recorder"
     except ObjectAccessError as error:
         # Only one that it does not have is none: whatever else it refuses may hide what was left.

@@ -22,7 +22,7 @@ from drivers.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bu
 SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 SDO_REQUEST = 0x600
-_EMCY, _SDO_ANSWER, _HEARTBEAT = 0x080, 0x580, 0x700
+_EMCY, _SDO_ANSWER, HEARTBEAT = 0x080, 0x580, 0x700
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
 """What a drive is told (CiA 301, predefined connection set)."""
 PUMP_S = 1.0
@@ -60,13 +60,15 @@ def nmt_name(state: int | None) -> str:
 
 
 def command_name(identifier: int) -> str:
-    """Name of a master's command for a person."""
+    """Name of a frame that only we should send, for a person."""
     if identifier == SYNC_COB_ID:
         return "a SYNC (080h)"
     if identifier == _NMT_COB_ID:
         return "an NMT command (000h)"
     if identifier < SDO_REQUEST:
         return f"a set-point of node {identifier & 0x7F} ({identifier:03X}h)"
+    if identifier >= HEARTBEAT:
+        return f"a heartbeat with the recorder's own node id {identifier - HEARTBEAT} ({identifier:03X}h)"
     return f"an SDO request to node {identifier - SDO_REQUEST} ({identifier:03X}h)"
 
 
@@ -78,8 +80,10 @@ class Link:
         heard_ns: when it did, by the clock.
         answered: nodes that sent any SDO answer.
         silent: nodes that did not answer when they were last asked, and were not heard since.
+        heard: node ids of which any frame came since the bus was opened.
         foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request, set-point of one of
-            `axis_ids`) came that we did not send.
+            `axis_ids`), or of our own heartbeat, came that we did not send.
+        own_id: node id of our heartbeat, None before one was chosen.
         axis_ids: nodes that take set-points from nobody but us.
         sync_producer: who sends SYNC because we told it to (drivers/producer.py); None while only we do.
     """
@@ -99,6 +103,8 @@ class Link:
         self.answered: set[int] = set()
         self.foreign: dict[int, int] = {}
         self.silent: set[int] = set()
+        self.heard: set[int] = set()
+        self.own_id: int | None = None
         self.axis_ids: frozenset[int] = frozenset()
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
@@ -171,7 +177,7 @@ class Link:
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Let the nodes hear us from now on, as a node of this id, whenever somebody reads the bus."""
         self._beat = can.Message(
-            arbitration_id=_HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
+            arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
         )
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
@@ -202,15 +208,16 @@ class Link:
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        set_point = service in _RPDOS and node_id in self.axis_ids
-        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or set_point:
+        ours = (service in _RPDOS and node_id in self.axis_ids) or (service == HEARTBEAT and node_id == self.own_id)
+        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
             return True
         if node_id == 0:
             return False
+        self.heard.add(node_id)
         self.silent.discard(node_id)
-        if service == _HEARTBEAT and message.data:
+        if service == HEARTBEAT and message.data:
             self._note_heartbeat(node_id, message.data[0] & 0x7F)
         elif service == _EMCY and len(message.data) == 8:
             self._note_emcy(node_id, message.data)
@@ -246,7 +253,7 @@ class Link:
             self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {told}"))
 
     def note_foreign(self, identifier: int) -> None:
-        """Take note of a master's command that neither we nor our SYNC producer sent."""
+        """Take note of a frame of a master's, or of our own heartbeat, that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
         if self.foreign[identifier] == 1:  # told once: a master would fill the log
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))

@@ -21,10 +21,11 @@ from drivers.errors import (
     IdentityMismatch,
     MappingRefused,
     NodeMissing,
+    RecorderIdTaken,
     StateRefused,
 )
-from drivers.guard import Guard, arm, disarm, find_guard
-from drivers.link import SYNC_COB_ID, Link, NmtCommand, NmtState, command_name
+from drivers.guard import Guard, arm, disarm, find_guard, is_left_over, producer_of, read_consumers
+from drivers.link import HEARTBEAT, SYNC_COB_ID, Link, NmtCommand, NmtState, command_name
 from drivers.mapping import (
     CONTROLWORD,
     NOT_VALID,
@@ -44,7 +45,7 @@ from drivers.mapping import (
 from drivers.profile import ObjectEntry
 from drivers.sample import Sample
 from drivers.scale import ScaleReading, read_scale
-from drivers.scan import FoundNode, answering, read_identity, require, scan
+from drivers.scan import FoundNode, answering, read_identity, require, scan, unused
 from drivers.sdo import Clock, SdoPolicy
 from drivers.split_bus import CellAddress, open_cell_bus
 from drivers.state import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
@@ -53,6 +54,8 @@ HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
+ASKED_AT_ONCE = 8
+"""Node ids that the recorder may take, and that are asked for a device."""
 HEARTBEAT_MS = 100
 """Of every node, and of the recorder."""
 STANDSTILL_COUNTS = 1024
@@ -70,6 +73,8 @@ class Bounds:
         nmt_s: until a heartbeat confirms an NMT state.
         mode_s: until 6061h shows the mode asked for.
         disable_s: until an axis is without power when the network closes.
+        unused_s: to node ids that the recorder may take. With `listen_s` before it, longer than `guard_ms` of a cell
+            whose SYNC has a usual period: a slower heartbeat could not stand in for the recorder's.
     """
 
     answer_s: float = 1.0
@@ -78,6 +83,7 @@ class Bounds:
     nmt_s: float = 2.0
     mode_s: float = 1.0
     disable_s: float = 2.0
+    unused_s: float = 0.35
 
 
 Undisturbed = Callable[[], AbstractContextManager[None]]
@@ -131,8 +137,8 @@ class CanopenNetwork:
         self.link = Link(address, policy, clock, opener)
         self.node_ids = tuple(axis.node_id for axis in axes)
         self.link.axis_ids = frozenset(self.node_ids)
-        # The highest id is the last that anybody gives to a drive.
-        self.recorder_id = next(n for n in range(127, 0, -1) if n not in self.node_ids)
+        # The highest id is the last that anybody gives to a drive; `prepare` looks whether it is free.
+        self.recorder_id = next((n for n in range(127, 0, -1) if n not in self.node_ids), 0)
         self._originals: dict[int, _Original] = {}
         self._readback: dict[str, object] = {}
         self._scales: dict[str, ScaleReading] = {}
@@ -202,20 +208,24 @@ class CanopenNetwork:
 
         Raises:
             BusBusy: another master commands this bus; nothing was sent.
+            RecorderIdTaken: no node id is free for the recorder's heartbeat.
             NodeMissing, IdentityMismatch, NmtRefused, MappingRefused, ObjectAccessError, StateRefused, BusError: see
                 drivers/errors.py; what was changed until then is restored on leaving the network.
             ScaleImplausible: the ampere of a drive cannot be true (drivers/scale.py).
         """
         self.require_quiet()
         identities = self.check_identities()
-        for axis in self.axes:
+        consumers = [read_consumers(self.link.objects(node_id)) for node_id in self.node_ids]
+        if self.link.own_id is None:
+            self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
+        for axis, entries in zip(self.axes, consumers, strict=True):
             original = self._originals.setdefault(axis.node_id, _Original())
             access = self.link.objects(axis.node_id)
             if original.heartbeat_ms is None:
                 original.heartbeat_ms = access.read(HEARTBEAT_TIME)
             access.write(HEARTBEAT_TIME, self.heartbeat_ms)
             if original.guard is None:
-                original.guard = find_guard(access, self.recorder_id)
+                original.guard = find_guard(access, entries, self.was_ours)
             original.guard = arm(access, original.guard, self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
         for axis, identity in zip(self.axes, identities, strict=True):
@@ -224,6 +234,32 @@ class CanopenNetwork:
             self._set_mode(axis)
             self._readback[axis.name] = self._describe(axis, identity, mapped)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
+
+    def _take_recorder_id(self, watched: Sequence[int]) -> None:
+        """Choose the highest node id that no device uses, and that no amplifier waits for.
+
+        Args:
+            watched: entries of 1016h of all amplifiers.
+
+        Raises:
+            RecorderIdTaken: there is none.
+        """
+        # One that waits for a device which is off now would take our heartbeat for that device's.
+        awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
+        left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]
+        while left := [n for n in left if n not in self.link.heard]:
+            asked, left = left[:ASKED_AT_ONCE], left[ASKED_AT_ONCE:]
+            if free := unused(self.link, asked, self.bounds.unused_s):
+                self.recorder_id = self.link.own_id = free[0]
+                return
+        raise RecorderIdTaken(
+            "none that is free: all of 1 to 127 belong to axes or other devices, or an axis waits for them (1016h)",
+            "nothing has moved; take one of the other devices off the bus while recording",
+        )
+
+    def was_ours(self, value: int) -> bool:
+        """Whether an entry of 1016h still watches a recorder that was killed."""
+        return is_left_over(value, self.recorder_id, self.guard_ms, self.link.heard | self.link.axis_ids)
 
     def require_quiet(self) -> None:
         """Listen for a while before the first frame is sent.
@@ -246,7 +282,13 @@ class CanopenNetwork:
             raise BusBusy(str(self.link.address), seen)
 
     def guard(self) -> None:
-        """Let the amplifiers watch us from now on: they quick stop by themselves when we fall silent."""
+        """Let the amplifiers watch us from now on: they quick stop by themselves when we fall silent.
+
+        Raises:
+            RecorderIdTaken: a device has come that sends the same heartbeat.
+        """
+        if HEARTBEAT + self.recorder_id in self.link.foreign:
+            raise RecorderIdTaken.by_another(self.recorder_id)
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
 
     def unguard(self) -> None:

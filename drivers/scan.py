@@ -88,11 +88,26 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     """
     asked = set(node_ids)
     link.answered.clear()
-    link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])
+    _ask(link, node_ids)
     deadline = link.clock() + round(wait_s * 1e9)
     while not asked <= link.answered and (left_ns := deadline - link.clock()) > 0:
         link.pump(left_ns * 1e-9)
     return tuple(sorted(asked & link.answered))
+
+
+def unused(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Find node ids of which nothing came since the bus was opened, and no answer to an SDO request within a time.
+
+    Raises:
+        BusError: the bus has gone.
+    """
+    _ask(link, node_ids)
+    link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone
+    return tuple(node_id for node_id in node_ids if node_id not in link.heard)
+
+
+def _ask(link: Link, node_ids: Sequence[int]) -> None:
+    link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])
 
 
 def _describe(link: Link, node_id: int, answers: bool) -> FoundNode:

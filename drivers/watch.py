@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import deque
 
-from drivers.errors import BusBusy, DriveFault, DriverError, HeartbeatLost, LimitActive
+from drivers.errors import BusBusy, DriveFault, DriverError, HeartbeatLost, LimitActive, RecorderIdTaken
 from drivers.event import CellEvent, EventKind, EventSink
 from drivers.frozen import ToggleBits
-from drivers.link import SDO_REQUEST, NmtState, command_name, nmt_name
+from drivers.link import HEARTBEAT, SDO_REQUEST, NmtState, command_name, nmt_name
 from drivers.network import CanopenNetwork
 from drivers.state import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
 
@@ -112,6 +112,8 @@ class Watch:
             if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
                 # Whoever only asks a drive something disturbs, and is told; one who commands would move the robot.
                 self.faults.append(BusBusy(str(self._link.address), command_name(event.code)))
+            elif event.kind is EventKind.BUS_BUSY and event.code >= HEARTBEAT:
+                self.faults.append(RecorderIdTaken.by_another(event.code - HEARTBEAT))
             if event.axis is None:
                 continue
             node_id = self._network.node_ids[event.axis]

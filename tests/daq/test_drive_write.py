@@ -377,14 +377,17 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
         assert _gains(simulation) == NEW
 
 
-def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(address: BusAddress, tmp_path: Path) -> None:
+@pytest.mark.parametrize("recorder_id", [127, 126], ids=["usual", "127 was a device's"])
+def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
+    address: BusAddress, tmp_path: Path, recorder_id: int
+) -> None:
     """Killed before the mapping was touched: 1016h would stop the axis for want of a recorder, for ever."""
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
         consumer = ObjectEntry(0x1016, 1, 32, signed=False)
-        network.link.objects(2).write(consumer, network.recorder_id << 16 | 500)
-        with pytest.raises(SaveRefused, match=r"node 2: .*1016h:01 = 007F01F4h watches the recorder"):
+        network.link.objects(2).write(consumer, recorder_id << 16 | 500)
+        with pytest.raises(SaveRefused, match=rf"node 2: .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"):
             apply_to_drives(proposal, network, NOW)
         assert _gains(simulation) == IN_DRIVES
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from itertools import islice
 
+import can
 import pytest
 
 from daq.configuration.cell_bus import drive_axes
@@ -25,11 +26,19 @@ WAY_COUNTS = 2_000_000
 """Longer than the amplifiers wait, shorter than the test looks on."""
 
 
-@pytest.mark.parametrize("guarded", [True, False], ids=["1016h", "without"])
-def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool) -> None:
-    """Without 1016h the same axes go on to their target and keep their power: the guard is what stops them."""
-    address = BusAddress("virtual", f"killed {guarded}")
+@pytest.mark.parametrize(
+    ("guarded", "foreign"), [(True, False), (True, True), (False, False)], ids=["1016h", "foreign 127", "without"]
+)
+def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool, foreign: bool) -> None:
+    """Without 1016h the same axes go on to their target and keep their power: the guard is what stops them.
+
+    A device with the highest node id, and a heartbeat of its own, does not take the recorder's place.
+    """
+    address = BusAddress("virtual", f"killed {guarded} {foreign}")
     bus = open_bus(address)
+    device = open_bus(address)
+    if foreign:
+        device.send_periodic(can.Message(arbitration_id=0x77F, is_extended_id=False, data=b"\x05"), 0.01)
     cell = SimulatedCell(
         load_simulation(CONFIGS / "simulation" / "clean.yaml"),
         bus,
@@ -56,4 +65,5 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
         assert states == {PowerState.SWITCH_ON_DISABLED if guarded else PowerState.OPERATION_ENABLED}
         assert bool((turned > 0.99 * WAY_COUNTS).all()) != guarded
         samples.close()
+    device.shutdown()
     bus.shutdown()
