@@ -7,7 +7,8 @@ result, after it stands.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +18,7 @@ from daq.calibration_file import as_document, save
 from daq.configuration.cell import Cell
 from daq.configuration.cell_bus import bus_address
 from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
+from daq.configuration.simulation import load_simulation, require_simulator
 from daq.errors import OutputExists, UsageError
 from daq.fit import Fit, calibration_of, close_loop, fit
 from daq.plan import Plan, plan
@@ -30,7 +31,7 @@ from daq.write_back.controller_write import Written
 from daq.write_back.request import Request
 from drivers.bus import open_bus
 from drivers.scan import FoundNode
-from drivers.simulated.cell import SimulatedCell
+from drivers.simulated.spec import CellSpec
 from ident.calibration import Calibration
 from ident.identify import Identification
 from ident.loop import Evidence
@@ -116,6 +117,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Tellin
     Raises:
         DaqError, DriverError, IdentificationError: whatever a real cell could raise.
     """
+    require_simulator()
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(cell_file)
     out = settings.out
@@ -206,15 +208,24 @@ def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
         picture.unlink()
 
 
-def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
+@contextmanager
+def _simulated(cell: Cell, spec: CellSpec) -> Iterator[None]:
+    """A simulated cell that answers on the bus of the demonstration."""
+    from drivers.simulated.cell import SimulatedCell  # noqa: PLC0415 - its packages are an optional extra
+
     bus = open_bus(bus_address(cell))
     try:
-        with SimulatedCell(load_simulation(settings.simulation), bus), network_of(cell) as network:
-            nodes = network.scan()
-            network.check_identities()
-            return nodes
+        with SimulatedCell(spec, bus):
+            yield
     finally:
         bus.shutdown()
+
+
+def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
+    with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
+        nodes = network.scan()
+        network.check_identities()
+        return nodes
 
 
 def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
@@ -251,24 +262,20 @@ def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index:
     spec = load_simulation(settings.simulation, payload)
     declared = {candidate.name: candidate for candidate in cell.payloads}
     mounted = None if payload is None else declared[payload]
-    bus = open_bus(bus_address(cell))
-    try:
-        # Another noise in every run, as another day would bring; the plant is the same.
-        with SimulatedCell(replace(spec, seed=spec.seed + 100 * settings.seed + index), bus):
-            return record(
-                cell_file,
-                cell,
-                moves,
-                settings.out / f"{name}.mcap",
-                payload=None if mounted is None else mounted.payload,
-                entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
-                operator="demo",
-                granted_by="the demonstration: a simulated cell",
-                run_id=f"demo-{settings.seed}-{name}",
-                progress=lambda done, total: telling.progress(done, total, "moves"),
-            )
-    finally:
-        bus.shutdown()
+    # Another noise in every run, as another day would bring; the plant is the same.
+    with _simulated(cell, replace(spec, seed=spec.seed + 100 * settings.seed + index)):
+        return record(
+            cell_file,
+            cell,
+            moves,
+            settings.out / f"{name}.mcap",
+            payload=None if mounted is None else mounted.payload,
+            entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
+            operator="demo",
+            granted_by="the demonstration: a simulated cell",
+            run_id=f"demo-{settings.seed}-{name}",
+            progress=lambda done, total: telling.progress(done, total, "moves"),
+        )
 
 
 def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) -> tuple[Proposal, Written | None]:

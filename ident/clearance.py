@@ -4,7 +4,6 @@ Links are capsules. A synchronised point-to-point move is a straight line in joi
 of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k over the whole of it, with k the joints
 between the two and ℓ_k the longest lever from joint k to the capsule. A stretch of half-width h about s is clear when
 the distance at s is at least h times that; else it is halved. So nothing is jumped over, whatever the speed.
-Distances are those of coal (GJK).
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pinocchio import coal
 
+from ident.distance import segment_to_box, segment_to_segment
 from ident.kinematics import Poses, poses
 from ident.robot import JointKind, Robot
 
@@ -101,12 +100,15 @@ class Checker:
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self.robot = robot
         self.scene = scene
-        bodies = [*(_of_capsule(capsule) for capsule in scene.capsules), *(_of_box(box) for box in scene.boxes)]
         moving = [index for index, capsule in enumerate(scene.capsules) if capsule.link != BASE]
-        boxes = range(len(scene.capsules), len(bodies))
-        self._bodies = bodies
+        boxes = range(len(scene.capsules), len(scene.capsules) + len(scene.boxes))
+        # Capsules are numbered as in the scene, boxes behind them.
         self._questions = [*scene.pairs, *((index, box) for index in moving for box in boxes)]
         self._confined = scene.confined if scene.workspace is not None else ()
+        self._first, self._second = np.array(self._questions, dtype=np.int64).reshape(-1, 2).T
+        self._radius = np.array([capsule.radius_m for capsule in scene.capsules] + [0.0] * len(scene.boxes))
+        self._lower = np.array([box.lower_m for box in scene.boxes]).reshape(-1, 3)
+        self._upper = np.array([box.upper_m for box in scene.boxes]).reshape(-1, 3)
 
     def margins(self, position: FloatArray) -> FloatArray:
         """Distance beyond the minimum of the nearest two things; negative where it is not kept [m].
@@ -151,24 +153,29 @@ class Checker:
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Of each question, shape (questions, k); where spheres around both are farther apart than needed, theirs."""
         at = poses(self.robot, position)
-        placed = [_Placed.of(body, at) for body in self._bodies]
-        out = np.empty((len(needed), position.shape[1]))
-        request = coal.DistanceRequest()
-        for row, (first, second) in enumerate(self._questions):
-            a, b = placed[first], placed[second]
-            between = np.linalg.norm(a.middle_m - b.middle_m, axis=1)
-            out[row] = between - a.body.sphere_m - b.body.sphere_m - self.scene.minimum_m
-            for sample in np.flatnonzero(out[row] < needed[row]).tolist():
-                result = coal.DistanceResult()
-                distance = coal.distance(a.body.shape, a.pose(sample), b.body.shape, b.pose(sample), request, result)
-                out[row, sample] = distance - self.scene.minimum_m
+        samples, capsules, boxes = position.shape[1], self.scene.capsules, len(self.scene.boxes)
+        start = np.empty((len(capsules) + boxes, samples, 3))
+        end = np.empty_like(start)
+        for index, capsule in enumerate(capsules):
+            start[index], end[index] = _at(at, capsule.link, capsule.start_m), _at(at, capsule.link, capsule.end_m)
+        start[len(capsules) :], end[len(capsules) :] = self._lower[:, None], self._upper[:, None]
+        middle, sphere = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=2) + self._radius[:, None]
+        out = np.empty((len(needed), samples))
+        asked, first, second = len(self._questions), self._first, self._second
+        out[:asked] = np.linalg.norm(middle[first] - middle[second], axis=2) - sphere[first] - sphere[second]
+        out[:asked] -= self.scene.minimum_m
+        near = out[:asked] < needed[:asked, None]
+        for boxed, distance in ((False, segment_to_segment), (True, segment_to_box)):
+            row, sample = np.nonzero(near & ((second >= len(capsules)) == boxed)[:, None])
+            if row.size:
+                a, b = (first[row], sample), (second[row], sample)
+                radii = self._radius[first[row]] + self._radius[second[row]]
+                out[row, sample] = distance(start[a], end[a], start[b], end[b]) - radii - self.scene.minimum_m
         if self.scene.workspace is not None:
             lower, upper = np.array(self.scene.workspace.lower_m), np.array(self.scene.workspace.upper_m)
-            for row, index in enumerate(self._confined, start=len(self._questions)):
-                capsule = self.scene.capsules[index]
-                ends = [_at(at, capsule.link, np.array(point)) for point in (capsule.start_m, capsule.end_m)]
-                inside = [np.minimum(end - lower, upper - end).min(axis=1) for end in ends]
-                out[row] = np.minimum(*inside) - capsule.radius_m
+            for number, index in enumerate(self._confined, start=asked):
+                inside = [np.minimum(ends[index] - lower, upper - ends[index]).min(axis=1) for ends in (start, end)]
+                out[number] = np.minimum(*inside) - capsules[index].radius_m
         return out
 
     def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
@@ -206,62 +213,12 @@ class Checker:
     def _told(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
         where = tuple(float(value) for value in position)
         if question < len(self._questions):
-            first, second = (self._bodies[index].name for index in self._questions[question])
+            names = [thing.name for things in (self.scene.capsules, self.scene.boxes) for thing in things]
+            first, second = (names[index] for index in self._questions[question])
             return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
         confined = self.scene.capsules[self._confined[question - len(self._questions)]]
         return Obstruction(confined.name, "the end of the workspace", margin_m, where)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Body:
-    """A shape on a link: its pose there, and the radius of a sphere around it."""
-
-    name: str
-    shape: coal.CollisionGeometry
-    link: int
-    rotation: FloatArray
-    middle_m: FloatArray
-    sphere_m: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
-    """A body in the base frame over k samples."""
-
-    body: _Body
-    rotation: FloatArray
-    middle_m: FloatArray
-
-    @classmethod
-    def of(cls, body: _Body, at: Poses) -> _Placed:
-        return cls(body, at.rotation[body.link + 1] @ body.rotation, _at(at, body.link, body.middle_m))
-
-    def pose(self, sample: int) -> coal.Transform3s:
-        return coal.Transform3s(self.rotation[sample], self.middle_m[sample])
-
-
-def _at(at: Poses, link: int, point_m: FloatArray) -> FloatArray:
-    return np.asarray(at.origin_m[link + 1] + at.rotation[link + 1] @ point_m)
-
-
-def _of_capsule(capsule: Capsule) -> _Body:
-    start, end = np.array(capsule.start_m), np.array(capsule.end_m)
-    length = float(np.linalg.norm(end - start))
-    # coal's capsules lie along z; one without length is a sphere.
-    shape = coal.Capsule(capsule.radius_m, length) if length > 0.0 else coal.Sphere(capsule.radius_m)
-    rotation = _z_towards((end - start) / length) if length > 0.0 else np.eye(3)
-    return _Body(capsule.name, shape, capsule.link, rotation, (start + end) / 2, length / 2 + capsule.radius_m)
-
-
-def _of_box(box: Box) -> _Body:
-    lower, upper = np.array(box.lower_m), np.array(box.upper_m)
-    sphere = float(np.linalg.norm(upper - lower)) / 2
-    return _Body(box.name, coal.Box(*(upper - lower)), BASE, np.eye(3), (lower + upper) / 2, sphere)
-
-
-def _z_towards(direction: FloatArray) -> FloatArray:
-    """A rotation that takes z to a unit vector."""
-    least = np.eye(3)[np.argmin(np.abs(direction))]
-    x = np.cross(least, direction)
-    x /= np.linalg.norm(x)
-    return np.column_stack((x, np.cross(direction, x), direction))
+def _at(at: Poses, link: int, point_m: tuple[float, float, float]) -> FloatArray:
+    return np.asarray(at.origin_m[link + 1] + at.rotation[link + 1] @ np.array(point_m))

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from ident.errors import ModelError
 from ident.pseudo_inertia import Body, pseudo_inertia
+from ident.robot import read_urdf
 
 FloatArray = NDArray[np.float64]
 
@@ -41,14 +40,7 @@ def urdf_links(urdf: str) -> FloatArray:
     Raises:
         ModelError: the text is no URDF.
     """
-    try:
-        model = pin.buildModelFromXML(urdf)
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"the URDF cannot be read: {error}") from error
-    bodies = [
-        Body(float(found.mass), np.array(found.lever), np.array(found.inertia)) for found in list(model.inertias)[1:]
-    ]
-    return np.array([body.parameters for body in bodies])
+    return np.array([body.parameters for body in read_urdf(urdf).bodies])
 
 
 def inertia_prior(urdf: str) -> InertiaPrior:

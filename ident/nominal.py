@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from ident.excitation import ExpectedPayload
@@ -11,7 +10,8 @@ from ident.link import LINK_PARAMETERS
 from ident.model import Model
 from ident.motion import Motion
 from ident.payload import Payload
-from ident.robot import Robot
+from ident.pseudo_inertia import Body
+from ident.robot import Robot, read_urdf
 
 FloatArray = NDArray[np.float64]
 
@@ -35,17 +35,16 @@ def nominal_links(robot: Robot, urdf: str) -> tuple[FloatArray, bool]:
         robot: of this URDF.
         urdf: its text; where no link in it has a mass, rods of LINK_MASS_KG are assumed.
     """
-    inertias = [pin.buildModelFromXML(urdf).inertias[index + 1] for index in range(robot.joint_count)]
-    if any(inertia.mass > 0.0 for inertia in inertias):
-        links = [_link(i.mass, np.array(i.lever), np.array(i.inertia)) for i in inertias]
-        return np.array(links), True
+    bodies = read_urdf(urdf).bodies
+    if any(body.mass_kg > 0.0 for body in bodies):
+        return np.array([body.parameters for body in bodies]), True
     links = []
     for index in range(robot.joint_count):
         ways = [joint.translation_m for joint in robot.joints if joint.parent == index]
         way = ways[0] if ways else 0.1 * robot.joints[index].axis
         slender = LINK_MASS_KG / 12.0 * (way @ way * np.eye(3) - np.outer(way, way))
         thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
-        links.append(_link(LINK_MASS_KG, 0.5 * way, slender + thick))
+        links.append(Body(LINK_MASS_KG, 0.5 * way, slender + thick).parameters)
     return np.array(links), False
 
 
@@ -65,7 +64,8 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     across /= np.linalg.norm(across)
     centre = side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
-    guess = dict(zip(LINK_PARAMETERS, _link(mass, centre, mass * side**2 / 6.0 * np.eye(3)), strict=True))
+    cube = Body(mass, centre, mass * side**2 / 6.0 * np.eye(3))
+    guess = dict(zip(LINK_PARAMETERS, cube.parameters, strict=True))
     parameters = np.array([payload.known.get(name, guess[name]) for name in LINK_PARAMETERS])
     return ExpectedPayload(frozenset(payload.known), parameters)
 
@@ -82,7 +82,7 @@ def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, lively: Mo
     columns = model.regressor(lively)
     rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
     largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
-    declared = np.array(pin.buildModelFromXML(urdf).upperEffortLimit)
+    declared = read_urdf(urdf).effort_limit
     usable = (declared > 0.0) & (declared < 1e6)  # some exporters write 0, others 1e9 for "not known"
     return np.where(usable, declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
 
@@ -112,9 +112,3 @@ def nominal_parameters(
         first = 14 * len(links) + 3 * number
         parameters[first : first + 3] = parameters[14 * motor + 10 : 14 * motor + 13]
     return parameters
-
-
-def _link(mass: float, centre: FloatArray, about_centre: FloatArray) -> FloatArray:
-    """In the order of LINK_PARAMETERS, inertia moved to the frame's origin."""
-    inertia = about_centre + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))

@@ -15,12 +15,10 @@ import typer
 from daq.cli.interrupt import interruptible
 from daq.cli.verb import Verb
 from daq.configuration.fault_scenario import load_scenario
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.configuration.simulation import load_simulation, require_simulator, shipped_simulation
 from daq.errors import UsageError
 from drivers.bus import BusAddress, open_answering_bus
 from drivers.hub import Hub
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.mounting import MountingCell
 from drivers.simulated.spec import CellSpec
 from drivers.split_bus import BusPart, SplitAddress, open_split_bus
 
@@ -62,6 +60,10 @@ def simulate(
 
     It prints the bus to write into the cell file of the other verbs, which then run in a second terminal.
     """
+    require_simulator()
+    from drivers.simulated.cell import SimulatedCell  # noqa: PLC0415 - its packages are an optional extra
+    from drivers.simulated.mounting import MountingCell  # noqa: PLC0415 - as above
+
     if payload is not None and payload_from is not None:
         raise UsageError(
             "--payload-from", found="--payload beside it", expected="one of the two", remedy="leave out one of them"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +12,7 @@ from pydantic import Field
 from daq.configuration.fault_scenario import AxisName, FaultModel, absent_axes, axis_index
 from daq.configuration.joint_unit import DEGREE, MILLIMETRE
 from daq.configuration.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
-from daq.errors import ConfigurationInconsistent, UsageError
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from daq.resources import shipped_configurations
 from drivers.simulated.spec import AxisSpec, Body, CellSpec, Dialect, UndeclaredEffect
 
@@ -76,6 +77,22 @@ class SimulationModel(StrictModel):
     payloads: dict[str, BodyModel] = Field(default_factory=dict)
     effects: tuple[EffectModel, ...] = ()
     faults: tuple[FaultModel, ...] = ()
+
+
+def require_simulator() -> None:
+    """Refuse to simulate without the packages that move the simulated cell.
+
+    Raises:
+        ConfigurationMissing: with the extra to install.
+    """
+    missing = [package for package in ("pinocchio", "numba") if find_spec(package) is None]
+    if missing:
+        raise ConfigurationMissing(
+            "the simulated cell",
+            found=f"no package {' and '.join(missing)}",
+            expected="the mechanics and the compiler of the optional extra `simulation`",
+            remedy="pip install 'drivegain[simulation]'",
+        )
 
 
 def load_simulation(path: Path, payload: str | None = None) -> CellSpec:

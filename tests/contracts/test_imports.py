@@ -22,6 +22,8 @@ FOREIGN_TO_IDENT = (
     "typer",
     "rich",
     "matplotlib",
+    "pinocchio",
+    "numba",
     "drivers",
     "daq",
 )
@@ -60,6 +62,7 @@ def test_the_contracts_are_kept() -> None:
     ("file", "line", "says"),
     [
         ("ident/run.py", "import can", "ident is not allowed to import can"),
+        ("ident/run.py", "import pinocchio", "ident is not allowed to import pinocchio"),
         ("ident/run.py", "import drivers.sample", "ident is not allowed to import drivers"),
         ("drivers/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
         ("drivers/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),

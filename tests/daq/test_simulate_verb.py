@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 import yaml
 
+import daq.configuration.simulation
+from daq.cli.app import main
 from daq.cli.simulate import how_to_reach, nodes_on_buses
 from daq.errors import UsageError
 from drivers.bus import BusAddress
@@ -55,3 +61,35 @@ def test_the_part_of_a_cell_file_can_be_pasted() -> None:
         "bus": {"interface": "socketcan", "channel": "can0", "bitrate_bit_s": 1_000_000},
         "sync": {"period_us": 1000, "pacing": "timed"},
     }
+
+
+@pytest.mark.parametrize("verb", [["simulate", "demo"], ["demo", "--out", "made"]])
+@pytest.mark.parametrize("package", ["numba", "pinocchio"])
+def test_without_its_packages_the_extra_is_named(
+    verb: list[str],
+    package: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(daq.configuration.simulation, "find_spec", lambda name: None if name == package else object())
+    assert main(verb) == 6
+    said = capsys.readouterr().err
+    assert f"no package {package}" in said
+    assert "pip install 'drivegain[simulation]'" in said
+    assert not (tmp_path / "made").exists()
+
+
+def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
+    """Their help and what they do to a real cell need no package of the extra."""
+    code = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(('numba', 'pinocchio', 'llvmlite'), None))\n"
+        "import ident.clearance, ident.nominal, ident.physical\n"
+        "from daq.cli.app import VERBS\n"
+        "print(len([listed.load() for listed in VERBS]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 20
