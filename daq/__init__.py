@@ -1,1 +1,1 @@
-"""The service: cell configuration, recording, log, jobs, write-back, report and command line."""
+"""Record cells, fit logs, apply calibrations: the service behind the command `drivegain`."""

@@ -1,1 +1,1 @@
-"""The amplifiers: CANopen/CiA 402 drives, buses, SYNC-grouped streams, and a cell simulated on a bus."""
+"""Drive CiA 402 amplifiers over CANopen: find them, stream their samples, move them, and simulate a cell of them."""

@@ -9,7 +9,7 @@ DriverError
 ├── IdentityMismatch          1018h is not what the cell configuration expects
 ├── NmtRefused                a node did not confirm an NMT state by heartbeat
 ├── ObjectAccessError         an SDO transfer was aborted or timed out
-├── ScaleImplausible          a drive's ampere value cannot be true (drivers/scale.py)
+├── ScaleImplausible          a drive's ampere value cannot be true (drivers/profiles/scale.py)
 ├── MappingRefused            a PDO mapping could not be written, or reads back differently
 ├── StateRefused              a CiA 402 transition did not happen in its bound
 ├── PowerNotOff               a parameter was to be written while the axis has power, or may have

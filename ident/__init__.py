@@ -1,1 +1,1 @@
-"""The science: arrays in, results out. No bus, no log, no clock."""
+"""Identify drive gains and dynamic parameters: arrays in, results out. No bus, no log, no clock."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ident.recording import Recording
-from ident.relative_error import RelativeError
+from ident.data.run import Recording
+from ident.estimators.estimate import RelativeError
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,17 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration
-from ident.dataset import Dataset
-from ident.effects import EFFECTS, UNNAMED
-from ident.effects.effect import Effect
-from ident.effects.placed import PlacedEffect
-from ident.effects.settings import check_settings
-from ident.effects.torque import at_joints
+from ident.data.dataset import Dataset
+from ident.discovery.signals import declared_signals, inertia
+from ident.effects.dictionary import EFFECTS, UNNAMED
+from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.placement import at_joints, check_settings
 from ident.errors import DataUnfit, EffectRefused, ModelError
-from ident.link import LINK_PARAMETERS
-from ident.model import Model
-from ident.payload import Payload
-from ident.signals import declared_signals, inertia
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.model import Model
 
 FloatArray = NDArray[np.float64]
 

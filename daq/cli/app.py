@@ -14,10 +14,9 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
-from daq.cli.verb import Listed, printable
-from daq.cli.verb_group import VerbGroup
+from daq.cli.verb import Listed, VerbGroup, printable
+from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed, exit_code
-from daq.version import software
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
@@ -26,12 +25,12 @@ VERBS = (
     Listed("init", "daq.cli.init:INIT", "Make a folder for a new cell, with templates to fill in."),
     Listed("scan", "daq.cli.scan:SCAN", "List the nodes on the bus beside those that are configured."),
     Listed("monitor", "daq.cli.monitor:MONITOR", "Show what the axes do now; it changes nothing."),
-    Listed("explain-emcy", "daq.cli.explain_emcy:EXPLAIN_EMCY", "Say what an error code of an amplifier means."),
+    Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Say what an error code of an amplifier means."),
     Listed("plan", "daq.cli.plan:PLAN", "Choose moves within the limits that excite every parameter."),
     Listed("record", "daq.cli.record:RECORD", "Make a plan's moves and log them; this moves the robot."),
-    Listed("info", "daq.cli.info:INFO", "Show what is in a log."),
-    Listed("salvage", "daq.cli.salvage:SALVAGE", "Save what a killed recording left behind."),
-    Listed("import", "daq.cli.import_:IMPORT", "Make a log of CSV files of another controller."),
+    Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
+    Listed("salvage", "daq.cli.logs:SALVAGE", "Save what a killed recording left behind."),
+    Listed("import", "daq.cli.logs:IMPORT", "Make a log of CSV files of another controller."),
     Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
     Listed("residual", "daq.cli.residual:RESIDUAL", "As fit; then find what the model lacks, and add it."),
     Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells, one task a cell."),
@@ -42,7 +41,7 @@ VERBS = (
     Listed("rollback", "daq.cli.rollback:ROLLBACK", "Take the last write to a controller's file back."),
     Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell, and any drift."),
     Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "The scheduled job: record, fit, propose or apply."),
-    Listed("install-units", "daq.cli.install_units:INSTALL_UNITS", "Let systemd or cron run the scheduled job."),
+    Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Let systemd or cron run the scheduled job."),
     Listed("simulate", "daq.cli.simulate:SIMULATE", "Run a simulated cell on a bus, for trying the other verbs."),
 )
 """In the order of the help. A verb is imported when it is called: most of them bring a second of mathematics along."""

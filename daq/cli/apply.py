@@ -5,36 +5,154 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from daq.calibration_file import decode, read
-from daq.cli.applier import Applier, ByOption, applier, ask_history, audit_of, tell_history
-from daq.cli.apply_drives import apply_drives
-from daq.cli.drives import DrivesOption, RamOnlyOption, SaveUnknownOption, saving_of
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.apply_policy import ApplyPolicy
-from daq.configuration.cell import Cell
-from daq.configuration.cell_file import load_cell
-from daq.digest import sha256
+from daq.cli.writing import (
+    Applier,
+    ByOption,
+    DrivesOption,
+    RamOnlyOption,
+    SaveUnknownOption,
+    applier,
+    ask_history,
+    audit_of,
+    kept,
+    on_the_bus,
+    outcome,
+    saving_of,
+    tell_history,
+)
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.policy import ApplyPolicy
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
-from daq.history.audited import enter_applied
-from daq.history.entry import Deed, Event
-from daq.history.store import HistoryStore
-from daq.report.proposal import describe, show
-from daq.write_back.apply import Proposal, apply, propose_for, refused
-from daq.write_back.audit import told_of
-from daq.write_back.controller_write import Written
-from daq.write_back.gates import Gate
-from daq.write_back.link import followed
-from daq.write_back.request import Request
+from daq.files import sha256
+from daq.ledger.audit import told_of
+from daq.ledger.entry import Deed, Event
+from daq.ledger.judgement import Known
+from daq.ledger.store import HistoryStore
+from daq.ledger.verify import enter_applied
+from daq.report.proposal import describe, show, show_changes
+from daq.workflow.calibration_file import decode, read
+from daq.writeback.drive_proposal import DriveProposal, drives_of, propose_to_drives
+from daq.writeback.drive_proposal import refused as drives_refused
+from daq.writeback.drive_record import record_folder
+from daq.writeback.drive_target import DrivesWritten, apply_to_drives
+from daq.writeback.file_access import followed
+from daq.writeback.file_proposal import Proposal, apply, propose_for, refused
+from daq.writeback.file_target import Written
+from daq.writeback.gates.table import Gate
+from daq.writeback.request import Request
+from drivers.canopen.parameters import Saving
 from ident.calibration import Calibration
+
+# Gains into the drives themselves: what `drivegain apply --drives` does.
+
+
+def apply_drives(
+    declared: Cell,
+    cell_file: Path,
+    request: Request,
+    *,
+    doer: Applier,
+    saving: Saving,
+    audit: Path | None,
+    yes: bool,
+    json: bool,
+) -> None:
+    """Show what a calibration changes in the drives of a cell, and write it with `yes`; nothing moves.
+
+    Args:
+        declared, cell_file: the cell, and where it is.
+        request: what is to be written.
+        doer: who writes it.
+        saving: whether the drives keep it.
+        audit: where it is written down, None for nowhere.
+        yes: write.
+        json: tell it to a program.
+    """
+    written: DrivesWritten | None = None
+    with on_the_bus(declared) as network:
+        proposal = propose_to_drives(declared, request, network)
+        if not json:
+            _show(proposal, ask_history(declared, drives_of(declared.name), request, proposal.changes), Console())
+        if yes and proposal.refusals and json:
+            print_json(_described(proposal, None))
+        if yes:
+            try:
+                written = apply_to_drives(proposal, network, request.now, saving=saving, audit=audit, who=str(doer))
+            except OSError as error:
+                raise OutputFailed.of(record_folder(declared), error) from error
+    if written is not None:
+        _enter_drives(declared, request, doer, written)
+    if json:
+        print_json(_described(proposal, written))
+    if proposal.refusals:
+        raise drives_refused(proposal)
+    if not json:
+        _say_drives_outcome(proposal, written, saving, cell_file)
+
+
+def _show(proposal: DriveProposal, known: Known, console: Console) -> None:
+    show_changes(proposal.changes, console, known, "in the drive")
+    for change, value in zip(proposal.changes, proposal.base, strict=True):
+        console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}", markup=False, highlight=False)
+
+
+def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[str, Any]:
+    return {
+        "cell": proposal.cell,
+        "base_sha256": proposal.base_sha256,
+        "base": proposal.looked_at,
+        "applied": written is not None,
+        **({} if written is None else outcome(written)),
+        "changes": [
+            {
+                "axis": change.axis,
+                "object": change.key,
+                "old": change.old,
+                "new": change.new,
+                "std": change.std,
+                "nameplate": change.nameplate,
+                "unit": change.unit,
+            }
+            for change in proposal.changes
+        ],
+        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals],
+    }
+
+
+def _enter_drives(declared: Cell, request: Request, doer: Applier, written: DrivesWritten) -> None:
+    digest = sha256(request.signed)
+
+    def enter(store: HistoryStore) -> None:
+        store.add(request.calibration, digest=digest, at=request.now)
+        told, after = written.audit_sha256, written.sha256_after
+        enter_applied(declared, store, Event(digest, Deed.APPLIED, request.now, str(doer), written.target, told, after))
+
+    tell_history(declared, enter)
+
+
+def _say_drives_outcome(
+    proposal: DriveProposal, written: DrivesWritten | None, saving: Saving, cell_file: Path
+) -> None:
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    if written is not None:
+        console.print(f"Written to the drives and read back; {written.record} says what stood there. {kept(saving)}")
+        console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell_file))} --drives")
+        return
+    if proposal.unchanged:
+        console.print("The drives have these gains already; --yes would only let them save.")
+    console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
+    console.print(f"  --yes --base {proposal.looked_at}")
 
 
 def apply_verb(

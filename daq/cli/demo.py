@@ -10,16 +10,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daq.atomic_file import replace_file
-from daq.cli.progress import Stepper
 from daq.cli.residual import before_after_table, ranking_table
 from daq.cli.scan import scan_rows, scan_table
+from daq.cli.terminal import Stepper
 from daq.cli.verb import JsonOption, Verb, json_text, print_json
-from daq.configuration.simulation import shipped_simulation
-from daq.demo import Outcome, Settings, Telling, demonstrate, summary
 from daq.errors import OutputFailed
-from daq.report.gain_table import gain_table
+from daq.files import replace_file
+from daq.report.gains import gain_table
 from daq.report.proposal import show as show_proposal
+from daq.simulation.demo import Outcome, Settings, Telling, demonstrate, summary
+from daq.simulation.simulation_file import shipped_simulation
 
 
 def demo(

@@ -12,29 +12,81 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from daq.atomic_file import replace_file
-from daq.calibration_file import load
-from daq.cli.export_log import EXPORT_LOG
-from daq.cli.output import check_output, say_written
-from daq.cli.progress import status
-from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.cli.verb_group import VerbGroup
-from daq.configuration.cell_file import URDF, bundle, load_cell
-from daq.configuration.cell_model import model_of
-from daq.configuration.yaml_file import read_bytes
+from daq.cli.terminal import check_output, say_written, status
+from daq.cli.verb import JsonOption, Verb, VerbGroup, print_json, printable
+from daq.config.cell import model_of
+from daq.config.cell_file import URDF, bundle, load_cell
+from daq.config.yaml_file import read_bytes
+from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputExists, OutputFailed, UsageError
-from daq.fit import DOUBTFUL_PERCENT
-from daq.physical_robot import PhysicalRobot, cell_limits, physical_robot, require_solver
-from daq.urdf_file import FORMAT, JointUpdate, Updated, update_urdf
-from daq.urdf_markup import parse_markup
-from daq.version import software
+from daq.files import replace_file
+from daq.log.export import TableFormat, export_log
+from daq.workflow.calibration_file import load
+from daq.workflow.fit import DOUBTFUL_PERCENT
+from daq.workflow.urdf_export import (
+    FORMAT,
+    JointUpdate,
+    PhysicalRobot,
+    Updated,
+    cell_limits,
+    parse_markup,
+    physical_robot,
+    require_solver,
+    update_urdf,
+)
 from ident.calibration import Calibration
-from ident.drive_train import DriveTrain
-from ident.inertia_prior import urdf_links
-from ident.model import Model
-from ident.physical_programme import MARGIN
-from ident.pseudo_inertia import body_of
-from ident.robot import robot_from_urdf
+from ident.model.bodies import body_of
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import robot_from_urdf
+from ident.physical.inertia_prior import urdf_links
+from ident.physical.programme import MARGIN
+
+# `drivegain export log`: a log as a table for other programs.
+
+
+def export_log_verb(
+    log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
+    out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.")],
+    csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Apache Parquet; needs pip install 'drivegain[parquet]'.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Write the samples of a log into a table: a row a SYNC, joint positions and currents in SI beside raw numbers.
+
+    The log itself opens in Foxglove and PlotJuggler as it is (configs/viewers).
+    """
+    kind = _format(csv, parquet)
+    with status(f"writing {kind.value}"):
+        done = export_log(log, out, kind)
+    if done.partial:
+        typer.echo(f"{log} is PARTIAL: saved from a recording that was never finished", err=True)
+    if not done.valid:
+        typer.echo(f"{log} is INVALID: {done.reason or 'no reason given'}; a fit refuses it", err=True)
+    if json:
+        print_json({"log": str(log), "table": str(out), "format": kind.value, "rows": done.rows,
+                    "columns": list(done.columns), "partial": done.partial, "valid": done.valid})  # fmt: skip
+    else:
+        console = Console(soft_wrap=True, highlight=False)
+        console.print(f"{done.rows} rows of {len(done.columns)} columns", markup=False)
+        say_written(console, out)
+
+
+def _format(csv: bool, parquet: bool) -> TableFormat:
+    wanted = [kind for kind, asked in ((TableFormat.CSV, csv), (TableFormat.PARQUET, parquet)) if asked]
+    if len(wanted) != 1:
+        raise UsageError(
+            "--csv, --parquet",
+            found="both" if wanted else "neither",
+            expected="one of them",
+            remedy="say which kind of table to write",
+        )
+    return wanted[0]
+
+
+EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
+
 
 FloatArray = NDArray[np.float64]
 

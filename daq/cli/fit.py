@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from enum import Enum
@@ -13,26 +14,126 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from daq.calibration_file import as_document, save
-from daq.cases import CaseFit, Known, calibration_of_case, essential_fit, fit_case, reduce_logs
-from daq.cli.fit_cases import fit_cases, removed
-from daq.cli.output import check_output, say_written
-from daq.cli.progress import status
-from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell_file import load_cell
+from daq.cli.terminal import check_output, say_written, status
+from daq.cli.verb import JsonOption, Verb, print_json, printable
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
 from daq.errors import OutputFailed, UsageError
-from daq.fit import Fit, check_explained, compare_estimators, fit
-from daq.gain_verdicts import needed_verdicts
-from daq.log.losses import LossyLogs
-from daq.report.comparison import comparison_document, comparison_tables
-from daq.report.current_signal import actual_current_note
-from daq.report.excitation import advice, cannot_tell, verdict_document
-from daq.report.fit import draw
-from daq.report.gain_table import gain_table, partial_note
-from daq.report.residual_summary import spelt
+from daq.files import replace_file
+from daq.log.reader import LossyLogs
+from daq.report.fit import (
+    actual_current_note,
+    advice,
+    cannot_tell,
+    comparison_document,
+    comparison_tables,
+    draw,
+    verdict_document,
+)
+from daq.report.gains import gain_table, partial_note
+from daq.report.paper_tables import PaperTable, page, parameter_table
+from daq.report.paper_tables import gain_table as paper_gain_table
+from daq.report.residual_document import spelt
+from daq.workflow.calibration_file import as_document, save
+from daq.workflow.cases import CASES, Case, CaseFit, Known, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, check_explained, compare_estimators, fit, needed_verdicts
 from ident.calibration import Calibration
-from ident.comparison import Comparison
-from ident.estimate import Method
+from ident.estimators.comparison import Comparison
+from ident.estimators.estimate import Method
+
+# `drivegain fit --cases`: the paper's cases and ours from the same logs, a calibration file each.
+
+
+TABLES = "drivegain-fit-tables"
+"""What a page of tables says it is."""
+
+
+def fit_cases(
+    logs: Sequence[Path],
+    holdout: Sequence[Path],
+    cell: Cell | None,
+    ratio: float | None,
+    folder: Path,
+    format_: str,
+    created: datetime,
+    *,
+    json: bool,
+) -> None:
+    """Fit every case, write its calibration, and tabulate them as Tables 1 to 4.
+
+    Args:
+        logs, holdout, cell, ratio: as of daq.cases.
+        folder: for the calibrations, and tables.md.
+        format_: what a calibration file says it is.
+        created: when.
+        json: print one JSON object.
+
+    Raises:
+        OutputExists, OutputFailed: a file of another kind is in the way, or the file system refuses.
+        DaqError, IdentificationError: a case cannot be fitted.
+    """
+    files = {case.name: folder / f"{case.name}.yaml" for case in CASES}
+    page_file = folder / "tables.md"
+    check_output(page_file, (*logs, *holdout), TABLES)
+    for file in files.values():
+        check_output(file, (*logs, *holdout), format_)
+    with status("identifying") as telling:
+        reduced = reduce_logs(logs, holdout, cell)
+        fits: dict[str, CaseFit] = {}
+        for case in CASES:
+            telling(case.title)
+            fits[case.name] = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=ratio)
+        calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
+    tables = case_tables(calibrations)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, file in files.items():
+            save(calibrations[name], file)
+        title = f"Identification of {reduced.cell.name}"
+        replace_file(page_file, page(title, tables, marker=TABLES).encode())
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+    if json:
+        print_json({"cases": {case.name: _document(case, fits, calibrations) for case in CASES}})
+        return
+    console = Console(soft_wrap=True, highlight=False)
+    for name, found in fits.items():
+        left = found.fitted.identification.training_error.total
+        if left > DOUBTFUL_PERCENT:
+            console.print(f"{name} did not succeed: its relative error is {left:.3g} %.", style="bold", markup=False)
+    for table in tables:
+        console.print(table.on_screen())
+        for note in table.notes:
+            console.print(printable(note), markup=False)
+        console.print()
+    say_written(console, *files.values(), page_file)
+
+
+def case_tables(calibrations: dict[str, Calibration]) -> tuple[PaperTable, ...]:
+    """Tables 1 to 4."""
+    wls, tls = ((calibrations[f"case-{drawn}"], calibrations[f"case-{mass}"]) for drawn, mass in ((1, 2), (3, 4)))
+    return (
+        parameter_table(1, *wls, "IDIM-WLS"),
+        paper_gain_table(2, *wls, "IDIM-WLS"),
+        parameter_table(3, *tls, "IDIM-TLS"),
+        paper_gain_table(4, *tls, "IDIM-TLS"),
+    )
+
+
+def _document(case: Case, fits: dict[str, CaseFit], calibrations: dict[str, Calibration]) -> dict[str, Any]:
+    return {
+        "title": case.title,
+        "known": case.known.value,
+        **as_document(calibrations[case.name]),
+        "removed": removed(fits[case.name]),
+    }
+
+
+def removed(found: CaseFit) -> list[dict[str, Any]]:
+    """Base parameters that were taken out, in the order in which they went, for --json."""
+    steps = () if found.essential is None else found.essential.removed
+    return [{"name": step.name, "std_percent": step.std_percent} for step in steps]
+
 
 CALIBRATION = "drivegain-calibration"
 """What a calibration file says it is."""

@@ -13,20 +13,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.atomic_file import replace_file
-from daq.cli.output import say_written
-from daq.cli.progress import progress_bar
+from daq.cli.terminal import progress_bar, say_written
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.errors import ExitCode, OutputExists, OutputFailed
-from daq.fleet.cell_fit import Failure, Loop
-from daq.fleet.crew import crew_of
-from daq.fleet.fleet import fit_fleet
-from daq.fleet.log_store import list_logs
-from daq.fleet.row import FleetRow
-from daq.fleet.shelf import open_shelf
-from daq.fleet.summary import Summary
+from daq.files import replace_file
+from daq.jobs.cell_fit import Failure, Loop, open_shelf
+from daq.jobs.fleet import FleetRow, fit_fleet
+from daq.jobs.fleet_survey import Summary, list_logs
+from daq.jobs.workers import crew_of
 from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
-from daq.report.gain_table import with_deviation
+from daq.report.gains import with_deviation
 
 
 def fleet_verb(

@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from daq.cli.verb import Verb
+from daq.environment import shipped_configurations
 from daq.errors import OutputExists, OutputFailed, UsageError
-from daq.resources import shipped_configurations
 
 TEMPLATES = (
     ("cells/demo.yaml", "cells/{name}.yaml"),

@@ -16,21 +16,20 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from daq.cli.interrupt import interruptible
 from daq.cli.scan import ENABLED
+from daq.cli.terminal import interruptible
 from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.configuration.bus_load import frame_bits
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import cell_address, drive_axes
-from daq.configuration.cell_file import load_cell
+from daq.config.bus import cell_address, drive_axes, frame_bits
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from drivers.canopen.link import nmt_name
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import DriverError, NodeMissing
-from drivers.event import EventKind
-from drivers.link import nmt_name
-from drivers.monitor import QUIET_S, CellMonitor, CellReading, Source
-from drivers.network import CanopenNetwork
-from drivers.scale import read_scale
-from drivers.sdo import SdoPolicy
-from drivers.state import decode
+from drivers.profiles.cia402 import decode
+from drivers.profiles.scale import read_scale
+from drivers.stream.monitor import QUIET_S, CellMonitor, CellReading, Source
+from drivers.stream.sample import EventKind
 
 POLICY = SdoPolicy(timeout_s=0.3, attempts=2)
 SHOWN_EVENTS = 5

@@ -8,18 +8,15 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.output import check_output
-from daq.cli.progress import progress_bar
+from daq.cli.terminal import check_output, progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell import Cell
-from daq.configuration.cell_file import load_cell
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
 from daq.errors import OutputFailed
-from daq.experiment import RUNS, Experiment, experiment_of
-from daq.extra_moves import extra_moves
-from daq.plan import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT, Plan, plan
-from daq.plan_file import save_plan
-from daq.planned_move import paths_of
-from ident.verdict import GainVerdict, verdicts
+from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
+from daq.workflow.plan import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT, Plan, extra_moves, plan
+from daq.workflow.plan_file import save_plan
+from ident.planning.verdict import GainVerdict, verdicts
 
 
 def plan_verb(

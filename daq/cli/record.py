@@ -9,21 +9,19 @@ from typing import Annotated
 
 import typer
 
-from daq.bus_lock import bus_lock
-from daq.cli.interrupt import interruptible
-from daq.cli.progress import progress_bar
+from daq.cli.terminal import interruptible, progress_bar
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell import Cell, MotionPolicy, Pacing
-from daq.configuration.cell_bus import bus_loads
-from daq.configuration.cell_file import load_cell
+from daq.config.bus import bus_loads
+from daq.config.cell import Cell, MotionPolicy, Pacing
+from daq.config.cell_file import load_cell
+from daq.environment import login
 from daq.errors import DiskSpaceShort, ExitCode, OutputExists, OutputFailed, UsageError
-from daq.login import login
-from daq.payload_mass import check_entered_mass
-from daq.plan import slowed
-from daq.plan_file import load_plan
-from daq.record import record
+from daq.workflow.plan import slowed
+from daq.workflow.plan_file import load_plan
+from daq.workflow.record import record
+from daq.workflow.safeguards import bus_lock, check_entered_mass
 from drivers.errors import CellSilent, DriverError, SampleLost
-from ident.payload import Payload
+from ident.model.bodies import Payload
 
 
 def record_verb(

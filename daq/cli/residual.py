@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated
 
 import typer
@@ -24,23 +25,87 @@ from daq.cli.fit import (
     save_calibration,
     save_pictures,
 )
-from daq.cli.output import check_output, say_written
-from daq.cli.progress import status
-from daq.cli.residual_report import check_report, save_report
-from daq.cli.verb import JsonOption, Verb, print_json
-from daq.configuration.cell_file import load_cell
-from daq.effect_words import placed_name
-from daq.fit import Fit, calibration_of, close_loop, fit
-from daq.log.losses import LossyLogs
+from daq.cli.terminal import check_output, say_written, status
+from daq.cli.verb import JsonOption, Verb, json_text, print_json
+from daq.config.cell_file import load_cell
+from daq.errors import OutputExists, OutputFailed
+from daq.files import replace_file
+from daq.log.reader import LossyLogs
+from daq.report.effect_names import placed_name
 from daq.report.fit import start_of
-from daq.report.gain_table import gain_table, partial_note, with_deviation
-from daq.report.residual_document import residual_document
-from daq.report.residual_summary import error_rows, spelt, summary
-from ident.before_after import Account, account
+from daq.report.gains import gain_table, partial_note, with_deviation
+from daq.report.residual_document import FORMAT, VERSION, error_rows, residual_document, spelt, summary
+from daq.report.residual_page import GENERATOR, residual_page
+from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from ident.calibration import Calibration
-from ident.effects.placed import PlacedEffect
-from ident.estimate import Method
-from ident.search import Finding
+from ident.discovery.before_after import Account, account
+from ident.discovery.search import Finding
+from ident.effects.effect import PlacedEffect
+from ident.estimators.estimate import Method
+
+# The folder that `drivegain residual --report` fills.
+
+
+PAGE, DOCUMENT = "report.html", "residual.json"
+_LOOK_BYTES = 4096
+_OURS = ((PAGE, f'<meta name="generator" content="{GENERATOR}">'), (DOCUMENT, f'"format": "{FORMAT}"'))
+"""What the beginning of either file says, so that an earlier report may be replaced and nothing else."""
+
+
+def check_report(folder: Path | None) -> None:
+    """Make the folder, before any long work, and refuse one in which something would be destroyed.
+
+    Args:
+        folder: None where no report is wanted.
+
+    Raises:
+        OutputExists: it holds a file of one of these names that is no earlier report.
+        OutputFailed: it cannot be made, or nothing can be written into it.
+    """
+    if folder is None:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+    for name, mark in _OURS:
+        path = folder / name
+        if path.exists() and not (path.is_file() and mark.encode() in _head(path)):
+            raise OutputExists(
+                str(path),
+                found="something that is no report of `drivegain residual`",
+                expected="no such file, or that of an earlier report",
+                remedy="choose another folder, or move it away",
+            )
+
+
+def save_report(fitted: Fit, account: Account, calibration: Calibration, folder: Path) -> None:
+    """Both files, each whole or not at all.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+        calibration: with the accepted effects.
+        folder: checked.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    body = residual_document(fitted, account, calibration)
+    document = json_text({"format": FORMAT, "version": VERSION, **body})
+    try:
+        replace_file(folder / PAGE, residual_page(fitted, account, calibration).encode())
+        replace_file(folder / DOCUMENT, document.encode())
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(_LOOK_BYTES)
+
 
 SHOWN = 6
 """Findings listed for each turn; the JSON has them all."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,15 +15,17 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_parts, cell_address, drive_axes
-from daq.configuration.cell_file import load_cell
-from daq.report.current_signal import actual_current_note, signals
+from daq.config.bus import bus_parts, cell_address, drive_axes
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.errors import UsageError
+from daq.report.fit import actual_current_note, current_signals
+from drivers.canopen.emcy import CODES, describe
+from drivers.canopen.link import nmt_name
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.scan import FoundNode
 from drivers.errors import NodeMissing
-from drivers.link import nmt_name
-from drivers.network import CanopenNetwork
-from drivers.scan import FoundNode
-from drivers.state import State
+from drivers.profiles.cia402 import State
 
 ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
 """States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
@@ -68,7 +71,7 @@ def scan_verb(
     rows = [row for name, nodes in found.items() for row in scan_rows(declared, nodes, name)]
     if json:
         address = str(cell_address(declared))
-        print_json({"bus": address, "nodes": rows, "reset": reset, "current": signals(declared)})
+        print_json({"bus": address, "nodes": rows, "reset": reset, "current": current_signals(declared)})
     else:
         console = Console(soft_wrap=True)
         console.print(scan_table(rows, console.width, several=len(found) > 1))
@@ -171,3 +174,46 @@ def scan_table(rows: list[dict[str, Any]], width: int = 80, several: bool = Fals
 
 
 SCAN = Verb("scan", scan_verb, "drivegain scan cells/demo.yaml")
+
+
+# `drivegain explain-emcy`: what an error code of an amplifier means.
+
+
+_HEX = re.compile(r"(?:0[xX])?([0-9a-fA-F]{1,4})[hH]?")
+
+
+def explain_emcy_verb(
+    code: Annotated[str, typer.Argument(help="As manuals write it, in hexadecimal: 8611, 8611h or 0x8611.")],
+    json: JsonOption = False,
+) -> None:
+    """Say what an emergency error code (EMCY, object 603Fh) means by CiA 301 and CiA 402.
+
+    Codes that these leave to the manufacturer are told by their class; the drive's manual knows more.
+    """
+    number = read_code(code)
+    standard = number in CODES
+    text = describe(number)
+    if json:
+        print_json({"code": number, "hex": f"{number:04X}h", "text": text, "standard": standard})
+        return
+    typer.echo(f"{number:04X}h: {text}")
+
+
+def read_code(text: str) -> int:
+    """The number in a code as people write it.
+
+    Raises:
+        UsageError: it is no hexadecimal number of at most four digits.
+    """
+    found = _HEX.fullmatch(text.strip())
+    if found is None:
+        raise UsageError(
+            f"code {text!r}",
+            found="no error code",
+            expected="a hexadecimal number of at most four digits, as 8611, 8611h or 0x8611",
+            remedy="take it from the event's text (`drivegain info LOG`) or from object 603Fh",
+        )
+    return int(found.group(1), 16)
+
+
+EXPLAIN_EMCY = Verb("explain-emcy", explain_emcy_verb, "drivegain explain-emcy 8611h")

@@ -10,14 +10,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from daq.calibration_file import load
-from daq.cli.output import say_written
-from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.cli.verb_group import VerbGroup
-from daq.configuration.cell_file import load_cell
+from daq.cli.terminal import say_written
+from daq.cli.verb import JsonOption, Verb, VerbGroup, print_json, printable
+from daq.config.cell_file import load_cell
 from daq.errors import UsageError
-from daq.report.gain_table import gain_table
-from daq.signature import generate, needs_password, sign, signers_of
+from daq.report.gains import gain_table
+from daq.workflow.calibration_file import load
+from daq.writeback.signature import generate, needs_password, sign, signers_of
 
 
 def sign_verb() -> None:

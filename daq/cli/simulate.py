@@ -12,15 +12,14 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.interrupt import interruptible
+from daq.cli.terminal import interruptible
 from daq.cli.verb import Verb
-from daq.configuration.fault_scenario import load_scenario
-from daq.configuration.simulation import load_simulation, require_simulator, shipped_simulation
 from daq.errors import UsageError
-from drivers.bus import BusAddress, open_answering_bus
-from drivers.hub import Hub
-from drivers.simulated.spec import CellSpec
-from drivers.split_bus import BusPart, SplitAddress, open_split_bus
+from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
+from drivers.canopen.bus import BusAddress, open_answering_bus
+from drivers.canopen.hub import Hub
+from drivers.simulation.spec import CellSpec
+from drivers.stream.split_bus import BusPart, SplitAddress, open_split_bus
 
 SHIPPED = ("demo", "clean", "seven-axis", "gantry")
 SHIPPED_FAULTS = "faults-example"
@@ -61,8 +60,7 @@ def simulate(
     It prints the bus to write into the cell file of the other verbs, which then run in a second terminal.
     """
     require_simulator()
-    from drivers.simulated.cell import SimulatedCell  # noqa: PLC0415 - its packages are an optional extra
-    from drivers.simulated.mounting import MountingCell  # noqa: PLC0415 - as above
+    from drivers.simulation.cell import MountingCell, SimulatedCell  # noqa: PLC0415 - needs an optional extra
 
     if payload is not None and payload_from is not None:
         raise UsageError(

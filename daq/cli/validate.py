@@ -13,22 +13,21 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from daq.atomic_file import replace_file
-from daq.calibration_file import load
 from daq.cli.fit import CellOption
-from daq.cli.output import check_output, say_written
-from daq.cli.progress import status
+from daq.cli.terminal import check_output, say_written, status
 from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.configuration.cell_file import load_cell
-from daq.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun, cross_validate
+from daq.config.cell_file import load_cell
 from daq.errors import CalibrationMissing, OutputFailed
-from daq.fit import DOUBTFUL_PERCENT
+from daq.files import replace_file
+from daq.report.fit import plot_torques
 from daq.report.paper_tables import PaperTable, condition_table, mass_tables, page
 from daq.report.paper_tables import error_table as paper_error_table
-from daq.report.torque import plot_torques
-from daq.validate import Acquaintance, Validation, conditioning_of, together
+from daq.workflow.calibration_file import load
+from daq.workflow.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun, cross_validate
+from daq.workflow.fit import DOUBTFUL_PERCENT
+from daq.workflow.validate import Acquaintance, Validation, conditioning_of, together
 from ident.calibration import Calibration
-from ident.relative_error import RelativeError
+from ident.estimators.estimate import RelativeError
 
 TABLES = "drivegain-validation-tables"
 """What a page of tables says it is."""

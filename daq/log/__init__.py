@@ -1,0 +1,1 @@
+"""MCAP logs: written without loss, read fast, salvaged, imported and exported."""

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from ident.link import LINK_PARAMETERS
-from ident.payload import Payload
+from ident.model.bodies import LINK_PARAMETERS, Payload
 
 RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
 LARGEST_COUNT = 2**64

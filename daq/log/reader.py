@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,9 @@ from mcap.records import Attachment, Chunk, Header, McapRecord, Metadata
 from numpy.typing import NDArray
 
 from daq.errors import LogIncomplete, LogMissing, LogUnreadable
-from daq.log.chunk import ChunkContents
-from daq.log.framing import UNFINISHED, RecordFile
-from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC
+from daq.log.container import UNFINISHED, ChunkContents, RecordFile
+from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC, Readback, readback_from_bytes
+from daq.log.message import NAME as READBACK
 from daq.log.metadata import (
     RUN,
     SEAL,
@@ -24,9 +26,7 @@ from daq.log.metadata import (
     statistics_from_record,
     unsealed,
 )
-from daq.log.readback import NAME as READBACK
-from daq.log.readback import Readback, readback_from_bytes
-from drivers.event import CellEvent
+from drivers.stream.sample import CellEvent
 
 BLOCK_SAMPLES = 4096
 """That a block has before it is handed out; so many and one chunk are in memory at most."""
@@ -290,3 +290,34 @@ def _joined(blocks: list[SampleBlock]) -> SampleBlock:
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
     blocks.clear()
     return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+
+
+# Losses that a log tells of, and whether somebody wants to use it all the same.
+
+
+MASKED = (
+    "missing answers",
+    "late answers",
+    "answers of wrong length",
+    "frames dropped by the kernel",
+    "frames dropped by the interface",
+    "frames dropped by the capture process",
+)
+"""What the recorder counts and every reader masks: the samples that it concerns carry the axis in `missing`."""
+
+
+class LossyLogs(Enum):
+    """What happens with a log that its recorder marked invalid because of MASKED losses."""
+
+    REFUSED = "refused"
+    ACCEPTED = "accepted"
+
+
+def tells_losses_alone(reason: str) -> bool:
+    """Whether the reason of an invalid run speaks of MASKED losses and of nothing else.
+
+    Doubles, frames that nobody asked for and periods without SYNC are not among them: they say that the recorder did
+    not understand what it saw.
+    """
+    kinds = "|".join(map(re.escape, MASKED))
+    return all(re.fullmatch(rf"\d+ (?:{kinds})", part) for part in reason.split(", "))

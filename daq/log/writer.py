@@ -15,7 +15,7 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from daq.errors import OutputExists, OutputFailed
-from daq.log.framing import UNFINISHED
+from daq.log.container import UNFINISHED
 from daq.log.message import (
     DEFINITIONS,
     EVENTS_SCHEMA,
@@ -24,17 +24,17 @@ from daq.log.message import (
     JOINTS_TOPIC,
     SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
+    Readback,
     event_bytes,
     joint_state_bytes,
     joint_state_prefix,
+    readback_bytes,
     sample_bytes,
     sample_struct,
 )
+from daq.log.message import NAME as READBACK
 from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_record, sealed, statistics_record
-from daq.log.readback import NAME as READBACK
-from daq.log.readback import Readback, readback_bytes
-from drivers.event import CellEvent
-from drivers.sample import Sample
+from drivers.stream.sample import CellEvent, Sample
 
 FLUSH_NS = 150_000_000
 """Of recorded or of wall time, whichever comes first. What a kill may cost is 200 ms: the rest is for the cycle on the

@@ -1,1 +1,1 @@
-"""Pictures and tables of a calibration: arrays and labels in, a PNG or a table out."""
+"""Tables, JSON documents, pictures and pages."""

@@ -7,10 +7,10 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from daq.fleet.cell_fit import Failure
-from daq.fleet.row import FleetRow
-from daq.fleet.summary import Summary
-from daq.report.spreadsheet import inert, inert_row
+from daq.jobs.cell_fit import Failure
+from daq.jobs.fleet import FleetRow
+from daq.jobs.fleet_survey import Summary
+from daq.report.text import inert, inert_row
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")

@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from daq.cross_validation import CrossValidation, Failure
+from daq.workflow.cross_validation import CrossValidation, Failure
 from ident.calibration import Calibration, Parameter
 
 NONE = "—"

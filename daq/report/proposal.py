@@ -11,13 +11,13 @@ from rich.console import Console
 from rich.syntax import Syntax
 from rich.table import Table
 
-from daq.history.judgement import NOTHING, Known, judge
-from daq.report.gain_table import with_deviation
-from daq.report.terminal_text import terminal_lines, terminal_text
-from daq.write_back.apply import Proposal
-from daq.write_back.controller_write import Written
-from daq.write_back.gain_gates import GainChange
-from ident.drift import FALSE_ALARM
+from daq.ledger.judgement import NOTHING, Known, judge
+from daq.report.gains import with_deviation
+from daq.report.text import terminal_lines, terminal_text
+from daq.writeback.file_proposal import Proposal
+from daq.writeback.file_target import Written
+from daq.writeback.gates.target import GainChange
+from ident.drift.change import FALSE_ALARM
 
 
 def show(proposal: Proposal, console: Console, known: Known = NOTHING) -> None:

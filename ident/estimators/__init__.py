@@ -1,1 +1,1 @@
-"""The estimators, each on the same System."""
+"""Estimators of gains and parameters, and their error bars."""

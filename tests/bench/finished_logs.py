@@ -11,15 +11,15 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation, shipped_simulation
-from daq.plan import plan
-from daq.plan_file import load_plan, save_plan
-from daq.record import record
-from daq.resources import shipped_configurations
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
+from daq.config.bus import bus_address
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.plan import plan
+from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.record import record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
 
 DURATION_S = 60.0
 SEED = 20

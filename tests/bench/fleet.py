@@ -21,8 +21,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.calibration_file import as_document, load
-from daq.fit import calibration_of, fit
+from daq.workflow.calibration_file import as_document, load
+from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import CELLS, FleetCell, make_fleet, tell
 
 LOGS = Path("out/bench/fleet")

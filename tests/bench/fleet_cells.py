@@ -16,17 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.configuration.cell import Cell
-from daq.configuration.cell_file import bundle, cell_from_bundle, load_cell
-from daq.conversion import scaling
+from daq.config.cell import Cell
+from daq.config.cell_file import bundle, cell_from_bundle, load_cell
+from daq.log.conversion import scaling
+from daq.log.message import AxisReadback, Readback
 from daq.log.metadata import RunInfo
-from daq.log.readback import AxisReadback, Readback
 from daq.log.writer import LogContent, LogWriter
-from daq.plan import Plan, plan
-from drivers.event import CellEvent, EventKind
-from drivers.sample import Sample
-from drivers.simulated.spec import Body
-from ident.payload import Payload
+from daq.workflow.plan import Plan, plan
+from drivers.simulation.spec import Body
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from ident.model.bodies import Payload
 from tests.studies.coverage_runs import CELL
 from tests.studies.direct_cell import RawRun, simulate_run
 from tests.studies.side_by_side import side_by_side

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.axis import Axis
-from drivers.bus import BusAddress
-from drivers.network import CanopenNetwork
-from drivers.pacing import FollowedSync
-from drivers.socketcan import SocketcanBus, open_socketcan
-from drivers.stream import SyncStream
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.network import CanopenNetwork
+from drivers.profiles.profile import Axis
+from drivers.stream.socketcan import SocketcanBus, open_socketcan
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import FollowedSync
 from tests.bench.stream_sender import FRAMES_A_CYCLE, LAST, NODES
 from tests.drivers.scripted import PROFILE
 from tests.vcan.run import INTERFACE, OUT

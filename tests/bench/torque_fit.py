@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from ident.base_parameters import BaseParameters, base_parameters
-from ident.link import LINK_PARAMETERS
-from ident.motion import Motion
-from ident.regressor import fill_rigid, moved_links
-from ident.robot import Robot
-from ident.tsqr import qr_merge, qr_update
+from ident.equations.triangles import qr_merge, qr_update
+from ident.model.base import BaseParameters, base_parameters
+from ident.model.bodies import LINK_PARAMETERS
+from ident.model.kinematics import Motion
+from ident.model.regressor import fill_rigid, moved_links
+from ident.model.robot import Robot
 
 FloatArray = NDArray[np.float64]
 

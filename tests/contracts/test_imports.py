@@ -61,17 +61,17 @@ def test_the_contracts_are_kept() -> None:
 @pytest.mark.parametrize(
     ("file", "line", "says"),
     [
-        ("ident/run.py", "import can", "ident is not allowed to import can"),
-        ("ident/run.py", "import pinocchio", "ident is not allowed to import pinocchio"),
-        ("ident/run.py", "import drivers.sample", "ident is not allowed to import drivers"),
-        ("drivers/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
-        ("drivers/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
-        ("drivers/profile.py", "import pinocchio", "drivers.profile is not allowed to import pinocchio"),
+        ("ident/data/run.py", "import can", "ident is not allowed to import can"),
+        ("ident/data/run.py", "import pinocchio", "ident is not allowed to import pinocchio"),
+        ("ident/data/run.py", "import drivers.stream.sample", "ident is not allowed to import drivers"),
+        ("drivers/stream/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
+        ("drivers/stream/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
+        ("drivers/profiles/profile.py", "import pinocchio", "drivers.profiles is not allowed to import pinocchio"),
         ("daq/errors.py", "import canopen", "daq is not allowed to import canopen"),
-        ("daq/fit.py", "import daq.configuration.simulation", "daq.fit is not allowed to import daq.configuration.sim"),
-        ("daq/log/reader.py", "import drivers.simulated.spec", "daq.log is not allowed to import drivers.simulated"),
+        ("daq/workflow/fit.py", "import daq.simulation.simulation_file", "daq.workflow is not allowed to import daq"),
+        ("daq/log/reader.py", "import drivers.simulation.spec", "daq.log is not allowed to import drivers.simulation"),
         # Also by way of a module that nobody has named.
-        ("daq/atomic_file.py", "import drivers.simulated.spec", "daq.write_back is not allowed to import drivers.sim"),
+        ("drivers/errors.py", "import drivers.simulation.spec", "daq.writeback is not allowed to import drivers.sim"),
     ],
 )
 def test_a_contract_broken_on_purpose_is_reported(copied: Path, file: str, line: str, says: str) -> None:

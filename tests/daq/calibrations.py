@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 from hypothesis import strategies as st
 
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
-from ident.recording import Recording
-from ident.relative_error import RelativeError
+from ident.data.run import Recording
+from ident.estimators.estimate import RelativeError
 
 NAMEPLATE = (32.96, 32.96, 25.65, -11.52, 18.48, 7.68)
 IDENTIFIED = (33.9, 32.4, 24.2, -9.21, 16.3, 6.79)

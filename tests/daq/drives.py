@@ -11,26 +11,24 @@ from pathlib import Path
 
 import can
 
-from daq.calibration_file import encode
-from daq.cli.applier import Applier
-from daq.cli.apply_drives import apply_drives
-from daq.configuration.cell import Bus, Cell
-from daq.configuration.cell_bus import drive_axes
-from daq.configuration.cell_file import load_cell
-from daq.configuration.controller_target import Controller, GainObject
-from daq.configuration.history_place import HistoryPlace
-from daq.configuration.simulation import load_simulation
-from daq.write_back.request import Request
-from drivers.axis import Axis
-from drivers.bus import BusAddress, open_bus
-from drivers.network import Bounds, CanopenNetwork
-from drivers.parameter import Parameter, ParameterKind
-from drivers.parameter_write import Saving
-from drivers.profile import Mapping
-from drivers.sdo import SdoPolicy
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.fault import FaultSpec
-from drivers.simulated.node import Node
+from daq.cli.apply import apply_drives
+from daq.cli.writing import Applier
+from daq.config.bus import drive_axes
+from daq.config.cell import Bus, Cell
+from daq.config.cell_file import load_cell
+from daq.config.controller import Controller, GainObject
+from daq.config.policy import HistoryPlace
+from daq.simulation.simulation_file import load_simulation
+from daq.workflow.calibration_file import encode
+from daq.writeback.request import Request
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.network import Bounds, CanopenNetwork
+from drivers.canopen.parameters import Saving
+from drivers.canopen.sdo import SdoPolicy
+from drivers.profiles.profile import Axis, Mapping, Parameter, ParameterKind
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.faults import FaultSpec
+from drivers.simulation.node import Node
 from ident.calibration import Calibration
 from tests.daq.calibrations import NAMEPLATE, demo_calibration
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from daq.configuration.cell_file import bundle
+from daq.config.cell_file import bundle
+from daq.log.message import AxisReadback, Readback
 from daq.log.metadata import RunInfo
-from daq.log.readback import AxisReadback, Readback
 from daq.log.writer import LogContent, LogWriter
-from drivers.event import CellEvent
-from drivers.sample import Sample
-from ident.payload import Payload
+from drivers.stream.sample import CellEvent, Sample
+from ident.model.bodies import Payload
 
 START_NS = 1_700_000_000_123_456_789
 DISC = Payload("disc", "flange-a", {"m": 4.59})

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.atomic_file import replace_file
+from daq.files import replace_file
 
 ACCESS, DEFAULT = "system.posix_acl_access", "system.posix_acl_default"
 READ, WRITE = 4, 2

@@ -11,7 +11,7 @@ import drivers
 import ident
 from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
 from drivers.errors import DriverError, IdentityMismatch
-from drivers.simulated.errors import SdoAbort
+from drivers.simulation.spec import SdoAbort
 from ident.errors import IdentificationError, RankDeficient
 
 

@@ -7,8 +7,8 @@ import pwd
 
 import pytest
 
-from daq.cli.applier import applier
-from daq.login import login
+from daq.cli.writing import applier
+from daq.environment import login
 
 
 @pytest.mark.parametrize("variable", ["LOGNAME", "USER", "LNAME", "USERNAME"])

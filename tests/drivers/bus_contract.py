@@ -6,7 +6,7 @@ import can
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.bus import send_burst
+from drivers.canopen.bus import send_burst
 
 WAIT_S = 5.0
 Ends = tuple[can.BusABC, can.BusABC, can.BusABC]

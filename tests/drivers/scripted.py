@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterable
 
 import can
 
-from drivers.axis import Axis, Identity
-from drivers.bus import BusAddress
-from drivers.move import AxisLimits, MotionPermission
-from drivers.network import Bounds, CanopenNetwork
-from drivers.profile import Amplitude, CurrentScale, DriveProfile, ObjectEntry, TapPoint
-from drivers.sdo import SdoPolicy
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.network import Bounds, CanopenNetwork
+from drivers.canopen.sdo import SdoPolicy
+from drivers.motion.move import AxisLimits, MotionPermission
+from drivers.profiles.profile import Amplitude, Axis, CurrentScale, DriveProfile, Identity, ObjectEntry, TapPoint
 
 PERIOD_NS = 1_000_000
 ADDRESS = BusAddress("virtual", "scripted")

@@ -9,23 +9,23 @@ from pathlib import Path
 
 import can
 
-from daq.configuration.cell_bus import drive_axes
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
-from drivers.bus import BusAddress, open_bus
+from daq.config.bus import drive_axes
+from daq.config.cell_file import load_cell
+from daq.simulation.simulation_file import load_simulation
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.network import Bounds, CanopenNetwork
+from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import DriverError
-from drivers.event import CellEvent, EventKind
-from drivers.motion import execute
-from drivers.move import AxisLimits, MotionPermission, synchronised_move
-from drivers.network import Bounds, CanopenNetwork
-from drivers.pacing import LockstepSync
-from drivers.sdo import SdoPolicy
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.errors import SdoAbort
-from drivers.simulated.fault import FaultSpec
-from drivers.simulated.node import Node
-from drivers.simulated.power_state import PowerState
-from drivers.stream import StreamStatistics, SyncStream
+from drivers.motion.execute import execute
+from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultSpec
+from drivers.simulation.node import Node
+from drivers.simulation.spec import SdoAbort
+from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.stream import StreamStatistics, SyncStream
+from drivers.stream.sync import LockstepSync
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERIOD_NS = 1_000_000

@@ -13,9 +13,9 @@ from drivers.errors import (
     NmtRefused,
     NodeMissing,
 )
-from drivers.event import EventKind
-from drivers.simulated.fault import FaultKind, FaultSpec
-from drivers.simulated.power_state import PowerState
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.stream.sample import EventKind
 from tests.faults.cells import run
 
 REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import can
 import pytest
 
+from drivers.canopen.link import NmtCommand
 from drivers.errors import NmtRefused
-from drivers.link import NmtCommand
 from tests.drivers.scripted import ScriptedBus, cell
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
-from daq.conversion import load_run
+from daq.config.bus import bus_address
+from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
+from daq.log.conversion import load_run
 from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import read_log
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
+from daq.simulation.simulation_file import load_simulation
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
 from tests.daq.logs import content
 from tests.faults.cells import CONFIGS
 from tests.faults.test_scenario import PLAN

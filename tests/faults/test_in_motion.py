@@ -19,9 +19,9 @@ from drivers.errors import (
     PdoLengthWrong,
     SampleLost,
 )
-from drivers.event import EventKind
-from drivers.simulated.fault import FaultKind, FaultSpec
-from drivers.simulated.power_state import PowerState
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.stream.sample import EventKind
 from tests.faults.cells import STRIKE, Outcome, run
 
 AXIS = 2

@@ -8,17 +8,17 @@ from itertools import islice
 import can
 import pytest
 
-from daq.configuration.cell_bus import drive_axes
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
-from drivers.bus import BusAddress, open_bus
-from drivers.motion import execute
-from drivers.move import MotionPermission, synchronised_move
-from drivers.network import CanopenNetwork
-from drivers.pacing import LockstepSync
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.power_state import PowerState
-from drivers.stream import SyncStream
+from daq.config.bus import drive_axes
+from daq.config.cell_file import load_cell
+from daq.simulation.simulation_file import load_simulation
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.network import CanopenNetwork
+from drivers.motion.execute import execute
+from drivers.motion.move import MotionPermission, synchronised_move
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import PowerState
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
 from tests.faults.cells import CONFIGS, PERIOD_NS, ROOM, let_pass
 
 GUARD_MS = 2000

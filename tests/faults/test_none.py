@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.event import EventKind
+from drivers.stream.sample import EventKind
 from tests.faults.cells import STRIKE, run
 
 INCIDENTS = {

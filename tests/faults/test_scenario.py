@@ -11,20 +11,18 @@ import pytest
 
 from daq.cli.app import main
 from daq.cli.record import granted
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.configuration.fault_scenario import load_scenario
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.config.bus import bus_address
+from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, ExitCode, SchemaMismatch
 from daq.log.reader import read_log
-from drivers.bus import open_bus
-from drivers.event import EventKind
-from drivers.hub import Hub
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.errors import SpecInvalid
-from drivers.simulated.fault import FaultKind, FaultSpec
-from drivers.simulated.power_state import PowerState
-from drivers.simulated.spec import CellSpec
+from daq.simulation.simulation_file import load_scenario, load_simulation, shipped_simulation
+from drivers.canopen.bus import open_bus
+from drivers.canopen.hub import Hub
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.spec import CellSpec, SpecInvalid
+from drivers.stream.sample import EventKind
 from tests.faults.cells import CONFIGS
 
 PLAN = """format: drivegain-plan

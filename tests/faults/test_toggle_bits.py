@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.configuration.drive import drive_from_text
+from daq.config.drive import drive_from_text
 from daq.errors import SchemaMismatch
-from drivers.axis import Axis
-from drivers.frozen import ToggleBits
+from drivers.motion.watch import ToggleBits
+from drivers.profiles.profile import Axis
 from tests.drivers.scripted import PROFILE
 from tests.faults.cells import CONFIGS
 

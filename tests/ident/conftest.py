@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident.loop import Evidence
-from ident.run import Run
+from ident.data.run import Run
+from ident.discovery.loop import Evidence
 from tests.ident.recordings import MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
 
 

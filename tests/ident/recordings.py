@@ -9,19 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from ident.conditioning import Conditioning
-from ident.dataset import Dataset, differentiate
-from ident.drive_train import DriveTrain
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset, differentiate
+from ident.data.run import Run
+from ident.discovery.candidates import ColumnCache, Inquiry, inquire
+from ident.discovery.loop import Evidence, gather
+from ident.equations.rows import decimate_rows
+from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
-from ident.identify import identify
-from ident.inquiry import ColumnCache, Inquiry, inquire
-from ident.link import LINK_PARAMETERS
-from ident.loop import Evidence, gather
-from ident.model import Model
-from ident.payload import Payload
-from ident.robot import robot_from_urdf
-from ident.rows import decimate_rows
-from ident.run import Run
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import robot_from_urdf
 from tests.ident.arms import THREE_AXES, TX40
 
 FloatArray = NDArray[np.float64]

@@ -12,26 +12,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
-from ident.dataset import Dataset, differentiate, planned
-from ident.effects import EFFECTS, UNNAMED
-from ident.effects.abscissa import Abscissa
-from ident.effects.cogging import Cogging
-from ident.effects.load_friction import LoadFriction
-from ident.effects.placed import PlacedEffect
-from ident.effects.settings import check_settings
-from ident.effects.spring import Spring
-from ident.effects.stribeck import Stribeck
-from ident.effects.warm_up import WarmUp
+from ident.data.dataset import Dataset, differentiate, planned
+from ident.data.run import Run
+from ident.discovery.loop import Evidence, gather, with_effects
+from ident.discovery.signals import session_began_s
+from ident.effects.dictionary import EFFECTS, UNNAMED
+from ident.effects.effect import Abscissa, PlacedEffect
+from ident.effects.electrical import Cogging
+from ident.effects.friction import LoadFriction, Stribeck, WarmUp
+from ident.effects.placement import check_settings
+from ident.effects.position import Spring
+from ident.equations.rows import decimate_rows, row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
-from ident.estimate import Method
-from ident.identify import identify
-from ident.loop import Evidence, gather, with_effects
-from ident.payload import Payload
+from ident.estimators.estimate import Method, RelativeError
+from ident.estimators.identify import identify
+from ident.model.bodies import Payload
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
-from ident.relative_error import RelativeError
-from ident.rows import decimate_rows, row_masks
-from ident.run import Run
-from ident.signals import session_began_s
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth
 
 FloatArray = NDArray[np.float64]

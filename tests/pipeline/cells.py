@@ -11,14 +11,14 @@ from typing import Any
 import yaml
 
 from daq.cli.app import main
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
 from daq.errors import ExitCode
-from daq.resources import shipped_configurations
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
 
 
 @dataclass(frozen=True)

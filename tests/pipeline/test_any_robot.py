@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.conversion import load_run
 from daq.errors import ExitCode
+from daq.log.conversion import load_run
 from tests.pipeline.cells import Job, run_job
 
 ROBOTS = ("seven-axis", "gantry")

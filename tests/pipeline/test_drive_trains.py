@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from drivers.simulated.drive_train import motor_rows, reduction
-from ident.drive_train import DriveTrain
+from drivers.simulation.plant import motor_rows, reduction
+from ident.model.model import DriveTrain
 
 ENTRY = st.sampled_from((0.0, 0.0, 0.0, 1.0, -1.0, 32.0, 45.0, -48.0, 101.5))
 

@@ -11,11 +11,11 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.configuration.cell_model import model_of
-from daq.conversion import load_run
+from daq.config.cell import model_of
 from daq.errors import ExitCode, RolesExchanged
-from daq.fit import check_signs
-from ident.identify import identify
+from daq.log.conversion import load_run
+from daq.workflow.fit import check_signs
+from ident.estimators.identify import identify
 
 
 @pytest.fixture(scope="module")

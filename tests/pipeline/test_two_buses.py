@@ -13,21 +13,21 @@ import can
 import pytest
 
 from daq.cli.app import main
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_parts, cell_address, drive_axes
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.config.bus import bus_parts, cell_address, drive_axes
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
-from daq.record import network_of
-from drivers.bus import open_bus
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from daq.workflow.record import network_of
+from drivers.canopen.bus import open_bus
+from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.errors import BusError
-from drivers.motion import execute
-from drivers.move import AxisLimits, MotionPermission, synchronised_move
-from drivers.network import Bounds, CanopenNetwork
-from drivers.pacing import LockstepSync
-from drivers.simulated.cell import SimulatedCell
-from drivers.split_bus import CellAddress, SplitAddress, SplitBus, open_cell_bus
-from drivers.stream import SyncStream
+from drivers.motion.execute import execute
+from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.simulation.cell import SimulatedCell
+from drivers.stream.split_bus import CellAddress, SplitAddress, SplitBus, open_cell_bus
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
 from tests.conftest import CHECKOUT
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 
@@ -105,7 +105,7 @@ def test_an_amplifier_on_the_wrong_bus_is_found_there(wiring: Wiring, capsys: py
 def test_the_monitor_shows_both_buses(
     wiring: Wiring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("drivers.monitor", "daq.cli.monitor"):
+    for module in ("drivers.stream.monitor", "daq.cli.monitor"):
         monkeypatch.setattr(f"{module}.QUIET_S", 0.1)
     assert main(["monitor", str(wiring.path), "--json", "--interval", "0.5"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.configuration.simulation import shipped_simulation
-from daq.demo import Settings, Telling, demonstrate, summary
+from daq.simulation.demo import Settings, Telling, demonstrate, summary
+from daq.simulation.simulation_file import shipped_simulation
 
 OUT = Path("out/gain-study")
 SEEDS = (1, 2, 3, 4)

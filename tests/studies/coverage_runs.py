@@ -20,17 +20,17 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.conversion import load_run
-from daq.plan import Plan, plan
-from daq.record import record
-from daq.resources import shipped_configurations
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.spec import CellSpec
-from ident.run import Run
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.log.conversion import load_run
+from daq.workflow.plan import Plan, plan
+from daq.workflow.record import record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.spec import CellSpec
+from ident.data.run import Run
 from tests.studies.direct_cell import RawRun, run_of, simulate_run
 from tests.studies.raw_runs import read_runs, write_runs
 from tests.studies.side_by_side import side_by_side

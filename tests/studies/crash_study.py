@@ -29,13 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.cli.app import main as drivegain
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.environment import shipped_configurations
 from daq.errors import ExitCode, LogUnreadable
 from daq.log.reader import Log, LogReader, SampleBlock, read_log
-from daq.resources import shipped_configurations
-from drivers.bus import BusAddress, open_bus
-from drivers.hub import Hub
-from drivers.simulated.cell import SYNC_ID, SimulatedCell
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.hub import Hub
+from drivers.simulation.cell import SYNC_ID, SimulatedCell
 
 OUT = Path("out/crash-study.json")
 PROMISED_MS = 200.0
@@ -71,7 +71,7 @@ class Tap:
 
 
 ASKED = 1
-"""SYNCs before the log begins: a recorder first asks where the axes stand (daq/record.py)."""
+"""SYNCs before the log begins: a recorder first asks where the axes stand (daq/workflow/record.py)."""
 
 
 @dataclass(frozen=True)

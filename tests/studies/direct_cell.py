@@ -1,7 +1,8 @@
 """Runs of a simulated cell without a bus: the same plant, loops, nodes and moves, and no frames back and forth.
 
 The coverage study needs hundreds of runs, and most of a recorded run's time is frames and threads. What moves the
-cell is unchanged: `drivers.motion.execute` walks the moves of `daq.record.motor_moves` through the nodes' own CiA 402
+cell is unchanged: `drivers.motion.execute.execute` walks the moves of `daq.workflow.record.motor_moves` through the
+nodes' own CiA 402
 state machines, and the amplifiers round and add noise as they do on the bus. `tests.studies.coverage_runs --check`
 compares it with a recording over the bus, count by count.
 """
@@ -19,32 +20,29 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import drive_axes
-from daq.conversion import Scaling, moves, scaling
-from daq.log.readback import AxisReadback, Readback
-from daq.plan import Plan
-from daq.record import motor_limits, motor_moves
-from drivers.event import CellEvent
-from drivers.mapping import SETPOINT_PDOS, Direction, records, write_record
-from drivers.motion import execute
-from drivers.move import MotionPermission
-from drivers.network import MODE_OF_OPERATION, PROFILE_POSITION_MODE, CanopenNetwork
-from drivers.pacing import LockstepSync
-from drivers.profile import ObjectEntry
-from drivers.sample import Sample
-from drivers.sdo import ObjectAccess
-from drivers.simulated.amplifier import AmplifierSet
-from drivers.simulated.effects import build_effect
-from drivers.simulated.effects.lag import Lag
-from drivers.simulated.node import NmtCommand, Node
-from drivers.simulated.plant import Plant
-from drivers.simulated.readings import Readings, take
-from drivers.simulated.spec import CellSpec
-from drivers.simulated.tuning import tuned
-from drivers.stream import SyncStream
-from ident.payload import Payload
-from ident.run import Run
+from daq.config.bus import drive_axes
+from daq.config.cell import Cell
+from daq.log.conversion import Scaling, moves, scaling
+from daq.log.message import AxisReadback, Readback
+from daq.workflow.plan import Plan
+from daq.workflow.record import motor_limits, motor_moves
+from drivers.canopen.network import MODE_OF_OPERATION, PROFILE_POSITION_MODE, CanopenNetwork
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, write_record
+from drivers.canopen.sdo import ObjectAccess
+from drivers.motion.execute import execute
+from drivers.motion.move import MotionPermission
+from drivers.profiles.profile import ObjectEntry
+from drivers.simulation.amplifier import AmplifierSet, tuned
+from drivers.simulation.drive import Readings, take
+from drivers.simulation.effects import Lag, build_effect
+from drivers.simulation.node import NmtCommand, Node
+from drivers.simulation.plant import Plant
+from drivers.simulation.spec import CellSpec
+from drivers.stream.sample import CellEvent, Sample
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+from ident.data.run import Run
+from ident.model.bodies import Payload
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +116,7 @@ def simulate_run(
 
 
 def run_of(raw: RawRun, cell: Cell) -> Run:
-    """A raw run in SI units, as `daq.conversion` makes it of a log."""
+    """A raw run in SI units, as `daq.log.conversion` makes it of a log."""
     if cell.sync is None:
         raise ValueError(f"cell {cell.name}: no sync period")
     scale = _scaling(cell, raw.ampere_per_unit)
@@ -142,7 +140,7 @@ def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> Scaling:
 class DirectStream:
     """A stream of samples of a simulated cell that is called instead of being sent frames.
 
-    It has what `drivers.motion.execute` uses of a `SyncStream` and of its network.
+    It has what `drivers.motion.execute.execute` uses of a `SyncStream` and of its network.
 
     Attributes:
         network: what the walk asks of a network: its nodes and the names of its axes.

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ident.drift import DISPERSION, dispersions
-from ident.drift_chart import CHART, Chart, path
-from ident.drift_trend import trend
+from ident.drift.change import DISPERSION, dispersions
+from ident.drift.chart import CHART, Chart, path, trend
 
 FloatArray = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """The cells of the effects study: which plant does what beyond the declared model.
 
-An effect is made by the plant's own physics (drivers/simulated/effects/), by parameters that a mechanic would know;
+An effect is made by the plant's own physics (drivers/simulation/effects.py), by parameters that a mechanic would know;
 nothing here comes from the formulas that the search tries.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import chain
 
-from drivers.simulated.spec import CellSpec, UndeclaredEffect
+from drivers.simulation.spec import CellSpec, UndeclaredEffect
 from tests.studies.study_cells import spec_of, study_cell
 
 NOISE_FACTOR = 1.59

@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from daq.configuration.cell_file import load_cell
-from daq.plan import plan
-from daq.plan_file import load_plan, save_plan
-from ident.run import Run
+from daq.config.cell_file import load_cell
+from daq.workflow.plan import plan
+from daq.workflow.plan_file import load_plan, save_plan
+from ident.data.run import Run
 from tests.studies.coverage_runs import CELL
 from tests.studies.direct_cell import run_of, simulate_run
 from tests.studies.effect_cells import ALL, EffectCase
@@ -103,7 +103,7 @@ def _plan_path(out: Path, number: int) -> Path:
 def _plan(task: _PlanTask) -> str:
     cell = load_cell(CELL)
     path = _plan_path(task.out, task.number)
-    fingerprint = digest(digest_of_source("daq.plan"), cell.digest, task.number, DURATION_S)
+    fingerprint = digest(digest_of_source("daq.workflow.plan"), cell.digest, task.number, DURATION_S)
     if is_finished(path, fingerprint):
         return f"plan {task.number}: kept"
     save_plan(plan(cell, seed=3001 + task.number, duration_s=DURATION_S), path)

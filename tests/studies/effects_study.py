@@ -19,14 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.configuration.cell_file import load_cell
-from daq.configuration.cell_model import model_of
-from drivers.simulated.spec import UndeclaredEffect
-from ident.effects import EFFECTS
-from ident.effects.effect import Side
-from ident.effects.placed import PlacedEffect
-from ident.identify import identify
-from ident.loop import Evidence, close_the_loop, gather
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from drivers.simulation.spec import UndeclaredEffect
+from ident.discovery.loop import Evidence, close_the_loop, gather
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import PlacedEffect, Side
+from ident.estimators.identify import identify
 from tests.studies.coverage_runs import CELL
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
 from tests.studies.effect_runs import OUT, load_runs, make_runs

@@ -6,7 +6,7 @@ import ast
 import hashlib
 from pathlib import Path
 
-from daq.atomic_file import replace_file
+from daq.files import replace_file
 
 ROOMS = ("daq", "drivers", "ident")
 CHECKOUT = Path(__file__).parents[2]

@@ -15,15 +15,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from daq.configuration.cell import Cell
-from daq.configuration.cell_file import load_cell
-from daq.configuration.cell_model import model_of
-from daq.fit import Fit, calibration_of
-from daq.resources import shipped_configurations
-from ident.estimate import Method
-from ident.identify import estimate_with, identify
-from ident.loop import close_the_loop, gather
-from ident.run import Run
+from daq.config.cell import Cell, model_of
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.workflow.fit import Fit, calibration_of
+from ident.data.run import Run
+from ident.discovery.loop import close_the_loop, gather
+from ident.estimators.estimate import Method
+from ident.estimators.identify import estimate_with, identify
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
 FIT = ("bare-1", "loaded-1", "bare-2", "loaded-2")

@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.configuration.cell_file import load_cell
-from daq.configuration.cell_model import model_of
-from daq.conversion import load_run
-from ident.comparison import ESTIMATORS
-from ident.conditioning import Conditioning
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from daq.log.conversion import load_run
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.equations.reduction import reduce_runs
+from ident.equations.system import System
+from ident.estimators.comparison import ESTIMATORS
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
-from ident.model import Model
-from ident.reduction import reduce_runs
-from ident.run import Run
-from ident.system import System
+from ident.model.model import Model
 from tests.studies.coverage_runs import CELLS, load_coverage, make_coverage
 from tests.studies.coverage_runs import OUT as COVERAGE
 from tests.studies.record_study import CELL, FLOORS, SEEDS, StudyLogs, record_study, study_logs

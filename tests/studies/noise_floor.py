@@ -8,12 +8,12 @@ from __future__ import annotations
 import argparse
 import sys
 
-from daq.configuration.cell_file import load_cell
-from daq.configuration.cell_model import model_of
-from daq.plan import plan
-from daq.resources import shipped_configurations
-from ident.estimate import Method
-from ident.identify import identify
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.workflow.plan import plan
+from ident.estimators.estimate import Method
+from ident.estimators.identify import identify
 from tests.studies.direct_cell import run_of, simulate_run
 from tests.studies.study_cells import declared_payload, spec_of, study_cell
 

@@ -21,14 +21,14 @@ import numpy as np
 import yaml
 
 from daq.cli import main as drivegain
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.plan_file import load_plan
-from daq.record import record
+from daq.config.bus import bus_address
+from daq.config.cell_file import load_cell
 from daq.report.paper_tables import PaperTable, percent
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.spec import Body
+from daq.workflow.plan_file import load_plan
+from daq.workflow.record import record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.spec import Body
 from tests.studies.fingerprint import digest, finish, is_finished
 from tests.studies.paper_figures import paper_table
 from tests.studies.record_study import CELL, FLOORS, OUT, PROCESSES, StudyLogs, record_study

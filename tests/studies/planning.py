@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.configuration.cell_file import load_cell
-from daq.experiment import RUNS, Experiment, experiment_of
-from daq.plan import EXCHANGES, Plan, plan
-from daq.planned_move import paths_of
-from ident.excitation import Design, ExpectedPayload
-from ident.link import LINK_PARAMETERS
+from daq.config.cell_file import load_cell
+from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
+from daq.workflow.plan import EXCHANGES, Plan, plan
+from ident.model.bodies import LINK_PARAMETERS
+from ident.planning.excitation import Design, ExpectedPayload
 from tests.ident.recordings import GAINS, PAYLOAD_TRUTH, tx40_truth
 
 CELLS = Path(__file__).parents[2] / "configs" / "cells"

@@ -26,21 +26,21 @@ from pathlib import Path
 import numpy as np
 
 from daq.cli.simulate import MountedFile
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation, shipped_simulation
+from daq.config.bus import bus_address
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
 from daq.errors import DaqError
-from daq.resources import shipped_configurations
-from drivers.bus import open_bus
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.canopen.bus import open_bus
 from drivers.errors import DriverError
-from drivers.simulated.fault import FaultKind, FaultSpec
-from drivers.simulated.mounting import MountingCell
-from drivers.simulated.spec import CellSpec
-from ident.drift import DISPERSION, decide
+from drivers.simulation.cell import MountingCell
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.spec import CellSpec
+from ident.drift.change import DISPERSION, decide
 from ident.errors import IdentificationError
-from tests.daq.recalibration.made import made_rig, whole_job
-from tests.daq.recalibration.rig import RUNS, Rig, make_plan, make_rig
-from tests.daq.recalibration.test_killed import Kill, finished_by_the_next
+from tests.daq.jobs.made import made_rig, whole_job
+from tests.daq.jobs.rig import RUNS, Rig, make_plan, make_rig
+from tests.daq.jobs.test_killed import Kill, finished_by_the_next
 
 AXIS, LOSS = 3, 0.94
 FAULT = FaultSpec(FaultKind.EMERGENCY, 2, 2000, None, 0x7305)

@@ -21,19 +21,18 @@ from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from pathlib import Path
 
-from daq.atomic_file import replace_file
-from daq.configuration.cell import Cell
-from daq.configuration.cell_bus import bus_address
-from daq.configuration.cell_file import load_cell
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations, software
+from daq.files import replace_file
 from daq.log.metadata import VERSION
-from daq.plan import Plan, plan
-from daq.plan_file import load_plan, save_plan
-from daq.record import record
-from daq.resources import shipped_configurations
-from daq.version import software
-from drivers.bus import open_bus
-from drivers.simulated.cell import SimulatedCell
-from drivers.simulated.spec import CellSpec
+from daq.workflow.plan import Plan, plan
+from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.record import record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.spec import CellSpec
 from tests.studies.direct_cell import simulate_run
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished
 from tests.studies.side_by_side import side_by_side
@@ -195,7 +194,7 @@ def _plan(task: _PlanTask) -> str:
     cell = load_cell(CELL)
     path = task.out / "plans" / f"{task.seed}-{task.plan}.yaml"
     number = 10 * task.seed + ord(task.plan) - ord("a")
-    fingerprint = digest(digest_of_source("daq.plan"), cell.digest, number, task.duration_s)
+    fingerprint = digest(digest_of_source("daq.workflow.plan"), cell.digest, number, task.duration_s)
     if is_finished(path, fingerprint):
         return f"plan {path.stem}: kept"
     begun_s = time.perf_counter()

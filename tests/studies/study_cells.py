@@ -12,10 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
-from daq.configuration.simulation import load_simulation, shipped_simulation
-from drivers.simulated.spec import AxisSpec, Body, CellSpec
-from ident.link import LINK_PARAMETERS
-from ident.payload import Payload
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.spec import AxisSpec, Body, CellSpec
+from ident.model.bodies import LINK_PARAMETERS, Payload
 
 PAYLOADS = ("disc", "plate")
 GAIN_SPREAD = 0.10

@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.cli.app import main as drivegain
-from daq.configuration.cell_model import model_of
-from daq.conversion import load_run
-from daq.resources import shipped_configurations
-from ident.estimate import Estimate, Method
-from ident.identify import identify
-from ident.loop import close_the_loop, gather
-from ident.observation import Observation
-from ident.relative_error import RelativeError, of_squares
+from daq.config.cell import model_of
+from daq.environment import shipped_configurations
+from daq.log.conversion import load_run
+from ident.discovery.loop import close_the_loop, gather
+from ident.equations.observation import Observation
+from ident.estimators.estimate import Estimate, Method, RelativeError, of_squares
+from ident.estimators.identify import identify
 
 FloatArray = NDArray[np.float64]
 

@@ -23,10 +23,9 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
-from daq.log.losses import tells_losses_alone
-from daq.log.reader import Log, read_log
-from drivers.event import EventKind
-from drivers.state import State, decode
+from daq.log.reader import Log, read_log, tells_losses_alone
+from drivers.profiles.cia402 import State, decode
+from drivers.stream.sample import EventKind
 from tests.faults.test_scenario import PLAN
 from tests.vcan.cells import simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE

@@ -16,13 +16,13 @@ import can
 import numpy as np
 import pytest
 
-from daq.conversion import load_run
+from daq.log.conversion import load_run
 from daq.log.reader import read_log
-from drivers.bus import BusAddress, open_bus
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.link import Link
+from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError
-from drivers.link import Link
-from drivers.sdo import SdoPolicy
-from drivers.socketcan import CapturedMessage, SocketcanBus, open_socketcan
+from drivers.stream.socketcan import CapturedMessage, SocketcanBus, open_socketcan
 from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE
 

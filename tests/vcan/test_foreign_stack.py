@@ -17,14 +17,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.axis import Axis, Identity
-from drivers.bus import BusAddress
-from drivers.mapping import STATUSWORD, feedback_entries, read_record
-from drivers.mapping import Direction as PdoDirection
-from drivers.network import HEARTBEAT_TIME, MODE_OF_OPERATION, CanopenNetwork
-from drivers.pacing import LockstepSync
-from drivers.state import State, decode
-from drivers.stream import SyncStream
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.network import HEARTBEAT_TIME, MODE_OF_OPERATION, CanopenNetwork
+from drivers.canopen.pdo import STATUSWORD, feedback_entries, read_record
+from drivers.canopen.pdo import Direction as PdoDirection
+from drivers.profiles.cia402 import State, decode
+from drivers.profiles.profile import Axis, Identity
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
 from tests.drivers.scripted import PROFILE
 from tests.vcan.run import INTERFACE
 

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import yaml
 
-from daq.configuration.cell_file import load_cell
-from daq.configuration.simulation import load_simulation
-from daq.conversion import load_run
+from daq.config.cell_file import load_cell
 from daq.errors import ClockImplausible
+from daq.log.conversion import load_run
+from daq.simulation.simulation_file import load_simulation
 from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
 
 PERIOD_US = 20_000

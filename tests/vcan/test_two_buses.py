@@ -11,8 +11,8 @@ from typing import Self
 
 import pytest
 
-from daq.configuration.cell_file import load_cell
-from daq.record import network_of
+from daq.config.cell_file import load_cell
+from daq.workflow.record import network_of
 from drivers.errors import BusError
 from tests.two_buses import LEFT, RIGHT, on_two_buses
 from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation

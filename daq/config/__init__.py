@@ -1,0 +1,1 @@
+"""Files that people write: cells, drives, imports, simulations."""

@@ -1,0 +1,232 @@
+"""A cell as drivers takes it: the address of its bus, or of its buses, and its amplifiers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil
+
+from daq.config.cell import Bus, Cell, Pacing
+from daq.errors import ConfigurationInconsistent
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.network import HEARTBEAT_MS
+from drivers.canopen.pdo import SETPOINT_PDOS, STATUSWORD, pack
+from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
+from drivers.stream.split_bus import BusPart, CellAddress, SplitAddress
+
+# How much of a CAN bus a recording takes: on average, at worst, and in the cycle in which all axes start.
+
+
+LARGEST_MEAN = 0.80
+"""Of a bus that a recording may take on average. What is left is for repeated frames, SDO, EMCY and other nodes; above
+it frames wait for each other so often that answers come after the next SYNC."""
+LARGEST_WORST = 1.0
+"""Of a period that SYNC and its answers may take when every frame is as long as stuffing can make it: an answer that
+comes after the next SYNC is late, and makes a run invalid."""
+STUFFING = 13
+"""Of so many bits that are stuffed, one is doubled on average: positions and currents have runs of equal bits that
+random data have not (which double one in 30). tests/daq/config/test_bus_load.py compares it with real frames."""
+MOVES_PER_S = 1.0
+SETPOINTS = 4
+"""Controlwords of an axis in a move: new set-point until acknowledged, taken back until seen; each twice as a rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusLoad:
+    """What a recording takes of one bus, as shares of it.
+
+    Attributes:
+        mean: SYNC, the answers, heartbeats, and the set-points of a move a second, with usual stuffing.
+        worst: SYNC and the answers alone, of a period, with all the stuffing that can be.
+        start: of a period, of the cycle in which all axes are told to start, with usual stuffing. Above 1 that cycle
+            lasts longer than a period, and answers may be late.
+    """
+
+    mean: float
+    worst: float
+    start: float
+
+    @property
+    def allowed(self) -> bool:
+        """Whether a recording may take that."""
+        return self.mean <= LARGEST_MEAN and self.worst <= LARGEST_WORST
+
+    def __str__(self) -> str:
+        return f"{100 * self.mean:.0f} % on average, {100 * self.worst:.0f} % at worst"
+
+
+def frame_bits(data_bytes: int) -> int:
+    """Longest data frame of an 11-bit identifier with so much data, stuff bits and the space after it counted.
+
+    Source: ISO 11898-1; of 34 + 8·d bits that are stuffed, one in four (the first alone needs five) can be doubled.
+    """
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + 13 + (stuffed - 1) // 4
+
+
+def usual_bits(data_bytes: int) -> float:
+    """The same frame with as many stuff bits as a recording's frames have on average."""
+    stuffed = 34 + 8 * data_bytes
+    return stuffed + 13 + stuffed / STUFFING
+
+
+def answer_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> float:
+    """How long SYNC and one answer of each axis occupy the bus at worst [µs].
+
+    Args:
+        profiles: of the axes, one each.
+        bitrate_bit_s: of the bus.
+    """
+    return 1e6 * (frame_bits(0) + sum(map(frame_bits, _answers(profiles)))) / bitrate_bit_s
+
+
+def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: int) -> BusLoad:
+    """What a recording takes of a bus.
+
+    Args:
+        profiles: of the axes on it, one each.
+        bitrate_bit_s: of the bus.
+        period_us: of SYNC.
+    """
+    period_bits = bitrate_bit_s * period_us * 1e-6
+    cycle = _cycle_bits(profiles)
+    setpoints = len(profiles) * usual_bits(_SETPOINT_BYTES[0])
+    return BusLoad(
+        mean=cycle / period_bits + _steady_bits_s(profiles) / bitrate_bit_s,
+        worst=answer_us(profiles, bitrate_bit_s) / period_us,
+        start=(cycle + setpoints) / period_bits,
+    )
+
+
+def shortest_period_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> int | None:
+    """The shortest period at which a bus may carry a recording; None where heartbeats and moves alone are too much."""
+    left_bits_s = LARGEST_MEAN * bitrate_bit_s - _steady_bits_s(profiles)
+    if left_bits_s <= 0:
+        return None
+    mean_us = 1e6 * _cycle_bits(profiles) / left_bits_s
+    # A period that is exact up to rounding must not be refused by it.
+    return ceil(max(mean_us, answer_us(profiles, bitrate_bit_s) / LARGEST_WORST) - 1e-6)
+
+
+def split_answers(profile: DriveProfile) -> bool:
+    """Whether one PDO cannot hold an axis's answer, which then takes two frames."""
+    return len(pack(_feedback(profile))) > 1
+
+
+def _feedback(profile: DriveProfile) -> tuple[ObjectEntry, ...]:
+    return (profile.position, profile.current, STATUSWORD)
+
+
+def _bytes(pdo: Sequence[ObjectEntry]) -> int:
+    return sum(entry.bits for entry in pdo) // 8
+
+
+_SETPOINT_BYTES = tuple(map(_bytes, SETPOINT_PDOS))
+
+
+def _answers(profiles: Sequence[DriveProfile]) -> tuple[int, ...]:
+    """Bytes of every frame that answers one SYNC."""
+    return tuple(_bytes(pdo) for profile in profiles for pdo in pack(_feedback(profile)))
+
+
+def _cycle_bits(profiles: Sequence[DriveProfile]) -> float:
+    return usual_bits(0) + sum(map(usual_bits, _answers(profiles)))
+
+
+def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
+    """Of heartbeats, the recorder's among them, and of set-points, whatever the period is [bit/s]."""
+    heartbeats = (len(profiles) + 1) * usual_bits(1) * 1000.0 / HEARTBEAT_MS
+    first, *others = map(usual_bits, _SETPOINT_BYTES)
+    return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))
+
+
+def cell_address(cell: Cell) -> CellAddress:
+    """Where the bus, or the buses, of a cell are.
+
+    Raises:
+        ConfigurationInconsistent: the cell has no bus, it only imports recordings.
+    """
+    parts = bus_parts(cell)
+    return parts[0].address if len(parts) == 1 else SplitAddress(parts)
+
+
+def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
+    """Each bus of a cell with the nodes that should be on it.
+
+    Raises:
+        ConfigurationInconsistent: as `cell_address`.
+    """
+    if not cell.buses:
+        raise _no_bus(cell, "no bus")
+    return tuple(
+        BusPart(bus.name, _address(bus), frozenset(axis.node_id for axis in axes if axis.node_id is not None))
+        for bus, axes in cell.wiring
+    )
+
+
+def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:
+    """What a recording takes of each bus; in lockstep, what it would take of a real one."""
+    if cell.sync is None:
+        return ()
+    profiles = [[axis.profile for axis in axes if axis.profile is not None] for _, axes in cell.wiring]
+    return tuple(
+        (bus, bus_load(used, bus.bitrate_bit_s, cell.sync.period_us))
+        for bus, used in zip(cell.buses, profiles, strict=True)
+    )
+
+
+def load_warnings(cell: Cell) -> tuple[str, ...]:
+    """Buses on which the start of a move does not fit between two SYNCs."""
+    if cell.sync is None or cell.sync.pacing is Pacing.LOCKSTEP:
+        return ()
+    return tuple(
+        f"{bus.name}: when all its axes are told to start, set-points and answers take {100 * load.start:.0f} % of a "
+        "period, and a late answer makes the run invalid; a longer sync.period_us or a second bus has room for them"
+        for bus, load in bus_loads(cell)
+        if load.start > 1.0
+    )
+
+
+def bus_address(cell: Cell) -> BusAddress:
+    """Where the bus of a cell that has one is.
+
+    Raises:
+        ConfigurationInconsistent: the cell has none, or several.
+    """
+    if not cell.buses:
+        raise _no_bus(cell, "no bus")
+    if len(cell.buses) > 1:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}",
+            found=f"{len(cell.buses)} buses",
+            expected="one",
+            remedy="use a cell file with a single bus here",
+        )
+    return _address(cell.buses[0])
+
+
+def drive_axes(cell: Cell) -> tuple[Axis, ...]:
+    """The amplifiers of a cell.
+
+    Raises:
+        ConfigurationInconsistent: an axis has no node, the cell only imports recordings.
+    """
+    axes = []
+    for axis in cell.axes:
+        if axis.node_id is None or axis.profile is None:
+            raise _no_bus(cell, f"axis {axis.name} without node_id or drive")
+        axes.append(Axis(axis.name, axis.node_id, axis.profile, axis.identity))
+    return tuple(axes)
+
+
+def _address(bus: Bus) -> BusAddress:
+    return BusAddress(bus.interface, bus.channel, bus.bitrate_bit_s, bus.host, bus.port)
+
+
+def _no_bus(cell: Cell, found: str) -> ConfigurationInconsistent:
+    return ConfigurationInconsistent(
+        f"cell {cell.name!r}",
+        found=found,
+        expected="a cell with bus, sync, and node_id and drive of each axis",
+        remedy="this cell only imports recordings; add what is missing, as in configs/cells/demo.yaml",
+    )

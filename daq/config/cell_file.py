@@ -1,0 +1,232 @@
+"""From a cell file, or from the copy of it that a log carries, to a `Cell`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import MILLIMETRE, Axis, Bus, Cell, Limits, Sync, WeighedPayload
+from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, PayloadModel, ratio_of
+from daq.config.checks import check
+from daq.config.clearance import clearance_of
+from daq.config.drive import drive_from_text
+from daq.config.policy import history_place, max_change_faults
+from daq.config.yaml_file import describe, parse_yaml, read_bytes, read_model
+from daq.environment import shipped_configurations
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing
+from drivers.profiles.profile import DriveProfile, Identity, TapPoint
+from ident.data.conditioning import Conditioning
+from ident.model.bodies import LINK_PARAMETERS
+
+CELL = "cell.yaml"
+URDF = "robot.urdf"
+DRIVES = "drives/"
+
+
+def load_cell(path: Path) -> Cell:
+    """Read a cell file and all it refers to.
+
+    Raises:
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+    """
+    sources = _sources(path)
+    names = {name: str(source) for name, source in sources.items()}
+    return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path, names)
+
+
+def bundle(path: Path) -> dict[str, bytes]:
+    """The texts of a cell file and of all files that it refers to, by fixed names; what a log carries.
+
+    Raises:
+        ConfigurationError: a file is missing, or the cell file is not what its schema says.
+    """
+    return {name: read_bytes(source) for name, source in _sources(path).items()}
+
+
+def cell_from_bundle(
+    files: Mapping[str, bytes], file: Path | None = None, names: Mapping[str, str] | None = None
+) -> Cell:
+    """The cell that a bundle describes.
+
+    Args:
+        files: as `bundle` made them; other entries (a log has more attachments) are passed over.
+        file: the cell file, where there is one.
+        names: what to call the files in messages.
+
+    Raises:
+        ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
+    """
+    names = names or {}
+    document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
+    model = read_model(document, CellModel)
+    urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
+    profiles = {
+        drive: drive_from_text(_member(files, member, names), names.get(member, member))
+        for drive in model.drives
+        for member in (f"{DRIVES}{drive}.yaml",)
+    }
+    check(document, model, urdf, profiles)
+    if faults := list(max_change_faults(model.policy.apply, [axis.name for axis in model.axes])):
+        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
+    used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
+    return Cell(
+        name=model.name,
+        urdf=urdf,
+        gravity_m_s2=model.robot.gravity_m_s2,
+        ratio=ratio_of(model),
+        buses=tuple(Bus(**bus.model_dump()) for bus in model.buses),
+        sync=None if model.sync is None else Sync(**model.sync.model_dump()),
+        axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
+        payloads=tuple(_payload(payload) for payload in model.payloads),
+        conditioning=_conditioning(model.conditioning),
+        controller=None if model.controller is None else model.controller.controller,
+        clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
+        folder=None if file is None else file.parent,
+        digest=digest({name: files[name] for name in used}),
+        recording_digest=_recording_digest({name: files[name] for name in used}),
+        motion=model.policy.motion,
+        apply=model.policy.apply.policy,
+        history=None if file is None else history_place(model.history, file),
+        recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
+    )
+
+
+def digest(files: Mapping[str, bytes]) -> str:
+    """sha256 over names and contents, in the order of the names, hex."""
+    total = hashlib.sha256()
+    for name in sorted(files):
+        total.update(f"{name}\0{len(files[name])}\0".encode())
+        total.update(files[name])
+    return total.hexdigest()
+
+
+_AFTERWARDS = ("policy", "history", "recalibration")
+"""Keys of a cell file that say what becomes of a calibration; no recording and no fit asks for them."""
+
+
+def _recording_digest(files: Mapping[str, bytes]) -> str:
+    """`digest` of what the files say, not of how: comments, line breaks and the order of keys do not count."""
+    return digest({name: _canonical(name, content) for name, content in files.items()})
+
+
+def _canonical(name: str, content: bytes) -> bytes:
+    if name == URDF:
+        return content
+    tree = parse_yaml(content, name).tree
+    if name == CELL:
+        tree = {key: value for key, value in tree.items() if key not in _AFTERWARDS}
+    return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _sources(path: Path) -> dict[str, Path]:
+    """Where the members of a cell's bundle are on disk."""
+    model = read_model(parse_yaml(read_bytes(path), str(path)), CellModel)
+    sources = {CELL: path, URDF: path.parent / model.robot.urdf}
+    for drive in model.drives:
+        profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
+        sources |= {f"{DRIVES}{drive}.eds": profile.parent / eds for eds in _eds_of(profile)}
+    return sources
+
+
+def _eds_of(profile: Path) -> tuple[str, ...]:
+    """The electronic data sheet that a profile names beside itself, if it does; the schema is checked elsewhere."""
+    tree = parse_yaml(read_bytes(profile), str(profile)).tree
+    named = tree.get("eds") if isinstance(tree, dict) else None
+    return (named,) if isinstance(named, str) and named else ()
+
+
+def _drive_path(folder: Path, drive: str) -> Path:
+    """A profile beside the cell (drives/ or ../drives/), else the shipped one."""
+    file = f"{drive}.yaml"
+    candidates = (folder / "drives" / file, folder.parent / "drives" / file, shipped_configurations() / "drives" / file)
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    shipped = ", ".join(sorted(entry.stem for entry in candidates[-1].parent.glob("*.yaml")))
+    raise ConfigurationMissing(
+        f"drive profile {drive!r}",
+        found="no file " + ", ".join(map(str, candidates)),
+        expected=f"a profile beside the cell, or a shipped one ({shipped})",
+        remedy="correct the axis's `drive`, or write the profile",
+    )
+
+
+def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -> bytes:
+    if member in files:
+        return files[member]
+    raise ConfigurationMissing(
+        names.get(member, member),
+        found="only " + (", ".join(sorted(files)) or "nothing"),
+        expected=f"{member} among the files of the cell",
+        remedy="the log or bundle is incomplete; record or import it again",
+    )
+
+
+def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> Axis:
+    limits, unit = model.limits, model.limits.unit
+    # The schema lets exactly one of the three be given, the checks only those of the joint's kind.
+    gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
+    per_newton = model.nameplate_gain_n_per_a is not None
+    profile = None if model.drive is None else profiles[model.drive]
+    # A gain by the actual current is another quantity: whoever shows it or its calibration file shows the unit.
+    ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
+    return Axis(
+        name=model.name,
+        node_id=model.node_id,
+        drive=model.drive,
+        profile=profile,
+        identity=None if model.identity is None else Identity(**model.identity.model_dump()),
+        bus=bus,
+        counts_per_revolution=model.counts_per_revolution,
+        unit=unit,
+        zero_offset_rad=unit.si * (model.zero_offset_deg or model.zero_offset_mm or 0.0),
+        nameplate_gain=next(gain for gain in gains if gain is not None),
+        gain_unit=model.gain_unit or f"{'N' if per_newton else 'Nm'}/{ampere}",
+        limits=Limits(
+            position=(unit.si * limits.position[0], unit.si * limits.position[1]),
+            velocity=unit.si * limits.velocity,
+            acceleration=unit.si * limits.acceleration,
+        ),
+    )
+
+
+def _conditioning(model: ConditioningModel) -> Conditioning:
+    """Each joint's standstill speed stands in the list of its kind, as the checks have made sure."""
+    millimetres = model.standstill_mm_s or (None,) * len(model.standstill_rad_s)
+    radians = model.standstill_rad_s or (None,) * len(millimetres)
+    rest = model.model_dump(exclude={"standstill_rad_s", "standstill_mm_s"})
+    speeds = (
+        MILLIMETRE.si * (along or 0.0) if about is None else about
+        for about, along in zip(radians, millimetres, strict=True)
+    )
+    return Conditioning(**rest, standstill_rad_s=tuple(speeds))
+
+
+def _payload(model: PayloadModel) -> WeighedPayload:
+    known = {} if model.known is None else model.known.model_dump(exclude_none=True)
+    if model.centre_m is not None:
+        known = drawn_parameters(model.mass_kg, model.centre_m, model.inertia_kg_m2)
+    return WeighedPayload(model.name, model.mounting, model.mass_kg, model.mass_tolerance_kg, known)
+
+
+def drawn_parameters(
+    mass_kg: float, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
+) -> dict[str, float]:
+    """First moments and, where it is given, the inertia moved to the frame's origin (Steiner), by LINK_PARAMETERS.
+
+    Args:
+        mass_kg: of the body.
+        centre_m: of mass, shape (3,).
+        about_centre_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass, in the directions of the frame.
+    """
+    centre = np.array(centre_m)
+    known = dict(zip(("mx", "my", "mz"), (mass_kg * centre).tolist(), strict=True))
+    if about_centre_kg_m2 is not None:
+        steiner = mass_kg * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+        inertia = np.array(about_centre_kg_m2) + steiner[np.triu_indices(3)]
+        known |= dict(zip(LINK_PARAMETERS[:6], inertia.tolist(), strict=True))
+    return known

@@ -1,0 +1,278 @@
+"""What may stand in a cell file, key by key (configs/cells/demo.yaml shows all of it)."""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from daq.config.cell import DEGREE, MILLIMETRE, RECORDER, JointUnit, MotionPolicy, Pacing
+from daq.config.clearance import ClearanceModel, WorkspaceModel
+from daq.config.controller import ControllerModel
+from daq.config.policy import ApplyPolicyModel, HistoryModel
+from daq.config.recalibration import RecalibrationModel
+from daq.config.yaml_file import StrictModel, not_in_file
+
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
+FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
+Positive = Annotated[float, Field(gt=0)]
+ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
+U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class RobotModel(StrictModel):
+    """The arm."""
+
+    urdf: FileName
+    gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
+
+
+class DriveTrainModel(StrictModel):
+    """R, a row a motor."""
+
+    ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1, max_length=32)]
+
+
+class BusModel(StrictModel):
+    """A python-can bus."""
+
+    interface: Name
+    channel: FileName
+    bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 29536
+
+
+class NamedBusModel(BusModel):
+    """One of several buses; the only one of a cell has the name of its channel."""
+
+    name: FileName
+
+
+def _how_many(value: object) -> str:
+    return SEVERAL_BUSES if isinstance(value, list | tuple) else ONE_BUS
+
+
+Buses = Annotated[
+    Annotated[BusModel, Tag(ONE_BUS)]
+    | Annotated[tuple[NamedBusModel, ...], Tag(SEVERAL_BUSES), Field(min_length=1, max_length=8)],
+    Discriminator(_how_many),
+]
+"""One bus, or a list of named ones."""
+
+
+class SyncModel(StrictModel):
+    """The sampling."""
+
+    period_us: Annotated[int, Field(ge=250, le=1_000_000)]
+    pacing: Pacing = Pacing.TIMED
+    producer: Name = RECORDER
+
+
+class IdentityModel(StrictModel):
+    """Object 1018h."""
+
+    vendor_id: U32
+    product_code: U32
+    serial: U32 | None = None
+
+
+class LimitsModel(StrictModel):
+    """Of a joint as people read them: in degrees, or in mm where it is prismatic."""
+
+    position_deg: tuple[float, float] | None = None
+    velocity_deg_s: Positive | None = None
+    acceleration_deg_s2: Positive | None = None
+    position_mm: tuple[float, float] | None = None
+    velocity_mm_s: Positive | None = None
+    acceleration_mm_s2: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> LimitsModel:
+        degrees = (self.position_deg, self.velocity_deg_s, self.acceleration_deg_s2)
+        millimetres = (self.position_mm, self.velocity_mm_s, self.acceleration_mm_s2)
+        if sorted(part.count(None) for part in (degrees, millimetres)) != [0, 3]:
+            raise ValueError(
+                "position_deg, velocity_deg_s and acceleration_deg_s2, or for a prismatic joint position_mm, "
+                "velocity_mm_s and acceleration_mm_s2"
+            )
+        return self
+
+    @property
+    def unit(self) -> JointUnit:
+        """Of the numbers."""
+        return DEGREE if self.position_mm is None else MILLIMETRE
+
+    @property
+    def position(self) -> tuple[float, float]:
+        """Lower and upper end, in the unit."""
+        # The validator has seen to it that one of the two is there.
+        return self.position_mm or self.position_deg or (0.0, 0.0)
+
+    @property
+    def velocity(self) -> float:
+        """Largest speed, in the unit a second."""
+        return self.velocity_mm_s or self.velocity_deg_s or 0.0
+
+    @property
+    def acceleration(self) -> float:
+        """Largest acceleration, in the unit a second squared."""
+        return self.acceleration_mm_s2 or self.acceleration_deg_s2 or 0.0
+
+
+class AxisModel(StrictModel):
+    """One motor and its joint."""
+
+    name: Name
+    node_id: int | None = None
+    bus: Name | None = None
+    drive: Name | None = None
+    identity: IdentityModel | None = None
+    counts_per_revolution: Annotated[int, Field(gt=0, le=2**31)] | None = None
+    zero_offset_deg: float | None = None
+    zero_offset_mm: float | None = None
+    lead_mm: float | None = None
+    nameplate_gain_nm_per_a: float | None = None
+    nameplate_gain_n_per_a: float | None = None
+    nameplate_gain: float | None = None
+    gain_unit: Annotated[str, Field(min_length=1, max_length=60)] | None = None
+    limits: LimitsModel
+
+    @model_validator(mode="after")
+    def _moving(self) -> AxisModel:
+        if self.lead_mm == 0.0:
+            raise ValueError("a lead_mm that is not zero: the way for a turn, negative for a left-handed screw")
+        return self
+
+    @model_validator(mode="after")
+    def _one_gain(self) -> AxisModel:
+        gains = (self.nameplate_gain_nm_per_a, self.nameplate_gain_n_per_a, self.nameplate_gain)
+        if gains.count(None) != 2 or (self.nameplate_gain is None) != (self.gain_unit is None):
+            raise ValueError(
+                "nameplate_gain_nm_per_a, nameplate_gain_n_per_a (prismatic), or nameplate_gain together with gain_unit"
+            )
+        return self
+
+
+class KnownModel(StrictModel):
+    """Single inertial parameters of a payload beside its mass, about the last joint's frame (paper eq. 5)."""
+
+    Ixx: float | None = None
+    Ixy: float | None = None
+    Ixz: float | None = None
+    Iyy: float | None = None
+    Iyz: float | None = None
+    Izz: float | None = None
+    mx: float | None = None
+    my: float | None = None
+    mz: float | None = None
+
+
+class PayloadModel(StrictModel):
+    """A weighed body, and what its drawing says of it.
+
+    The centre of mass is in the last joint's frame; the inertia xx, xy, xz, yy, yz, zz is about the centre of mass, in
+    the directions of that frame, as a URDF has it (xy = −∫xy dm).
+    """
+
+    name: Name
+    mounting: Name
+    mass_kg: float
+    mass_tolerance_kg: Annotated[float, Field(ge=0)] = 0.0
+    centre_m: tuple[float, float, float] | None = None
+    inertia_kg_m2: tuple[float, float, float, float, float, float] | None = None
+    known: KnownModel | None = None
+
+    @model_validator(mode="after")
+    def _one_spelling(self) -> PayloadModel:
+        if self.inertia_kg_m2 is not None and self.centre_m is None:
+            raise ValueError("centre_m beside inertia_kg_m2: the inertia is about the centre of mass")
+        if self.centre_m is not None and self.known is not None:
+            raise ValueError("centre_m and inertia_kg_m2, or single parameters under `known`, not both")
+        return self
+
+
+class ConditioningModel(StrictModel):
+    """The filters."""
+
+    position_cutoff_hz: Positive = 40.0
+    position_order: Annotated[int, Field(ge=1, le=10)] = 4
+    decimation_cutoff_hz: Positive = 20.0
+    standstill_rad_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
+    standstill_mm_s: tuple[Annotated[float, Field(ge=0)] | None, ...] = ()
+    standstill_share: Annotated[float, Field(gt=0, le=1)] = 0.1
+
+
+class PolicyModel(StrictModel):
+    """What may be done in this cell without asking."""
+
+    motion: MotionPolicy = MotionPolicy.ASK
+    apply: ApplyPolicyModel = ApplyPolicyModel()
+
+
+class CellModel(StrictModel):
+    """A whole cell file."""
+
+    name: Name
+    robot: RobotModel
+    drive_train: DriveTrainModel
+    bus: Buses | None = None
+    sync: SyncModel | None = None
+    axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
+    payloads: tuple[PayloadModel, ...] = ()
+    conditioning: ConditioningModel
+    controller: ControllerModel | None = None
+    workspace: WorkspaceModel | None = None
+    clearance: ClearanceModel | None = None
+    policy: PolicyModel = PolicyModel()
+    history: HistoryModel = HistoryModel()
+    recalibration: RecalibrationModel | None = None
+
+    @property
+    def buses(self) -> tuple[NamedBusModel, ...]:
+        """All of them, by their names; none in a cell that only imports recordings."""
+        if self.bus is None or isinstance(self.bus, tuple):
+            return self.bus or ()
+        return (NamedBusModel(name=self.bus.channel, **self.bus.model_dump()),)
+
+    def bus_of(self, axis: AxisModel) -> str | None:
+        """Name of the bus of an axis; the only one needs not be named."""
+        return axis.bus or (self.buses[0].name if len(self.buses) == 1 else None)
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Names of the drive profiles that the axes use, each once."""
+        return tuple(dict.fromkeys(axis.drive for axis in self.axes if axis.drive))
+
+
+# The drive train as a cell file writes it, and which joint the gain of each motor speaks of.
+
+
+FloatArray = NDArray[np.float64]
+
+
+def ratio_of(model: CellModel) -> FloatArray:
+    """R of q_motor = R q_joint (paper eq. 24), rad a rad, or rad a metre of a prismatic joint, shape (n, n).
+
+    Where a prismatic axis has a `lead_mm`, its column is written in turns: one turn of screw or pinion moves the joint
+    by the lead, so R = ratio · 2π / lead.
+
+    Raises:
+        ValueError: the rows are not n of n numbers.
+    """
+    lead_mm = [axis.lead_mm for axis in model.axes]
+    per_turn = np.array([1.0 if lead is None else 2.0 * pi / (1e-3 * lead) for lead in lead_mm])
+    return np.asarray(np.array(model.drive_train.ratio, dtype=np.float64) * per_turn, dtype=np.float64)
+
+
+def gain_joints(ratio: FloatArray) -> tuple[int, ...]:
+    """Index of the joint whose torque or force the gain of each motor speaks of: that of its reduction N.
+
+    Args:
+        ratio: R, shape (n, n).
+    """
+    # The rule of ident.drive_train.DriveTrain.reduction.
+    return tuple(motor if row[motor] != 0.0 else int(np.argmax(np.abs(row))) for motor, row in enumerate(ratio))

@@ -1,0 +1,234 @@
+"""A drive profile file: which objects of an amplifier carry position and current, in which unit, and who says so."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_model
+from daq.errors import ConfigurationInconsistent
+from drivers.profiles.profile import (
+    Amplitude,
+    Basis,
+    CurrentScale,
+    DriveProfile,
+    Fact,
+    Mapping,
+    ObjectEntry,
+    RatedMotor,
+    Save,
+    ScaleForm,
+    TapPoint,
+)
+
+Index = Annotated[int, Field(ge=0x1000, le=0xFFFF)]
+Subindex = Annotated[int, Field(ge=0, le=0xFF)]
+Positive = Annotated[float, Field(gt=0)]
+Text = Annotated[str, Field(min_length=1, max_length=400)]
+
+
+class EntryModel(StrictModel):
+    """One object dictionary entry."""
+
+    index: Index
+    subindex: Subindex = 0
+    type: Literal["i8", "i16", "i32", "i64", "u8", "u16", "u32", "u64"]
+
+    def entry(self) -> ObjectEntry:
+        """As drivers takes it."""
+        return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
+
+
+class SignalModel(StrictModel):
+    """A signal that is mapped into the TPDO: at most 32 bits, because logs hold int32."""
+
+    index: Index
+    subindex: Subindex = 0
+    type: Literal["i8", "i16", "i32", "u8", "u16"]
+
+    def entry(self) -> ObjectEntry:
+        """As drivers takes it."""
+        return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
+
+
+SCALE_KEYS: dict[ScaleForm, frozenset[str]] = {
+    ScaleForm.PRODUCT: frozenset({"factor", "objects"}),
+    ScaleForm.PER_MILLE: frozenset({"rated_current"}),
+    ScaleForm.FIXED_STEP: frozenset({"ampere_per_unit"}),
+    ScaleForm.DIGITS_OF_PEAK: frozenset({"digits", "peak_current_a"}),
+    ScaleForm.DIGITS_OF_TOLD_PEAK: frozenset({"digits", "peak_current"}),
+    ScaleForm.SWITCHED_PER_MILLE: frozenset({"rated_current", "switch"}),
+}
+"""What each form is told by; nothing else, and nothing less."""
+
+
+class ScaleModel(StrictModel):
+    """Ampere per raw unit, in one of the known forms (drivers.profile.ScaleForm).
+
+    A file without `form` is a product: logs of the first version carry such profiles.
+    """
+
+    form: ScaleForm = ScaleForm.PRODUCT
+    factor: Positive | None = None
+    objects: tuple[EntryModel, ...] = ()
+    rated_current: EntryModel | None = None
+    ampere_per_unit: Positive | None = None
+    digits: Annotated[int, Field(gt=0)] | None = None
+    peak_current_a: Positive | None = None
+    peak_current: EntryModel | None = None
+    switch: EntryModel | None = None
+
+    @model_validator(mode="after")
+    def _form_and_keys(self) -> ScaleModel:
+        told, wanted = self.model_fields_set - {"form"}, SCALE_KEYS[self.form]
+        empty = {key for key in told if getattr(self, key) is None and key != "peak_current_a"}
+        if empty or told - wanted or wanted - told - {"objects"}:
+            raise ValueError(f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing else")
+        return self
+
+    def scale(self) -> CurrentScale | None:
+        """As drivers takes it; None while nobody has entered the peak current."""
+        factor, objects = self.factor, self.objects
+        if self.rated_current is not None:
+            factor, objects = 1e-6, (self.rated_current,)  # a thousandth of so many mA
+        elif self.digits is not None and self.peak_current is not None:
+            factor, objects = 1e-3 / self.digits, (self.peak_current,)  # [mA]
+        elif self.digits is not None and self.peak_current_a is not None:
+            factor = self.peak_current_a / self.digits
+        elif self.ampere_per_unit is not None:
+            factor = self.ampere_per_unit
+        if factor is None:
+            return None
+        entries = tuple(entry.entry() for entry in objects)
+        if self.switch is None:
+            return CurrentScale(factor, entries, self.form)
+        return CurrentScale(factor, entries, self.form, self.switch.entry(), (math.sqrt(0.5), 1.0))
+
+
+class RatedModel(StrictModel):
+    """The motor's name plate in the drive."""
+
+    current: EntryModel
+    ampere_per_unit: Positive = 1e-3
+    torque: EntryModel | None = None
+    newton_metre_per_unit: Positive = 1e-3
+
+    def rated(self) -> RatedMotor:
+        """As drivers takes it."""
+        torque = None if self.torque is None else self.torque.entry()
+        return RatedMotor(self.current.entry(), self.ampere_per_unit, torque, self.newton_metre_per_unit)
+
+
+class SaveModel(StrictModel):
+    """How the drive is told to keep its parameters."""
+
+    index: Index = 0x1010
+    subindex: Subindex
+    signature: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+    mapping: Mapping
+
+    def save(self) -> Save:
+        """As drivers takes it."""
+        return Save(ObjectEntry(self.index, self.subindex, 32, signed=False), self.signature, self.mapping)
+
+
+class FactModel(StrictModel):
+    """What a fact rests on."""
+
+    basis: Basis
+    where: Text
+
+
+class FactsModel(StrictModel):
+    """One for each line of a profile that somebody could doubt."""
+
+    position: FactModel
+    current: FactModel
+    current_scale: FactModel
+    amplitude: FactModel
+    tap: FactModel
+    saturation_bit: FactModel
+    update_period_us: FactModel
+    rated: FactModel
+    save: FactModel
+    toggle_bit: FactModel | None = None
+
+    def facts(self) -> tuple[Fact, ...]:
+        """As drivers takes them."""
+        told: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
+        return tuple(Fact(name, fact.basis, fact.where) for name, fact in told.items() if fact is not None)
+
+
+class DriveModel(StrictModel):
+    """A whole drive profile file."""
+
+    name: Annotated[str, Field(min_length=1)]
+    position: SignalModel
+    current: SignalModel
+    current_scale: ScaleModel
+    amplitude: Amplitude
+    tap: TapPoint
+    saturation_bit: Annotated[int, Field(ge=0, le=15)] | None = None
+    toggle_bit: Literal[8, 14, 15] | None = None
+    """Those that CiA 402 leaves to the maker; the others mean something in profile position mode."""
+    update_period_us: Annotated[int, Field(gt=0)]
+    rated: RatedModel | None = None
+    save: SaveModel | None = None
+    save_semantics: str
+    source: Annotated[str, Field(min_length=1)]
+    eds: Annotated[str, Field(pattern=r"^[^/\\\x00]+$", max_length=200)] | None = None
+    """File beside the profile, the maker's data sheet; a log carries it."""
+    facts: FactsModel | None = None
+
+    @model_validator(mode="after")
+    def _toggle_bit_and_source(self) -> DriveModel:
+        if self.facts is not None and (self.toggle_bit is None) != (self.facts.toggle_bit is None):
+            raise ValueError("toggle_bit and facts.toggle_bit, both or neither")
+        return self
+
+
+def drive_from_text(text: bytes, name: str) -> DriveProfile:
+    """The profile in the text of a drive file.
+
+    Args:
+        text: of the file.
+        name: what to call it in messages.
+
+    Raises:
+        ConfigurationError: the text is not a drive profile, or the peak current of the drive is not entered yet.
+    """
+    document = parse_yaml(text, name)
+    model = read_model(document, DriveModel)
+    scale = model.current_scale.scale()
+    if scale is None:
+        raise _peak_missing(document)
+    return DriveProfile(
+        name=model.name,
+        position=model.position.entry(),
+        current=model.current.entry(),
+        current_scale=scale,
+        amplitude=model.amplitude,
+        tap=model.tap,
+        saturation_bit=model.saturation_bit,
+        update_period_us=model.update_period_us,
+        save_semantics=model.save_semantics,
+        source=model.source,
+        facts=() if model.facts is None else model.facts.facts(),
+        rated=None if model.rated is None else model.rated.rated(),
+        save=None if model.save is None else model.save.save(),
+        toggle_bit=model.toggle_bit,
+    )
+
+
+def _peak_missing(document: Document) -> ConfigurationInconsistent:
+    fault = Fault(
+        ("current_scale", "peak_current_a"),
+        "nothing",
+        "the peak current of this size of drive [A]; the drive has no object that tells it",
+    )
+    return ConfigurationInconsistent(
+        **describe(document, [fault]),
+        remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
+    )

@@ -1,0 +1,1 @@
+"""Scheduled recalibration, and fits of many cells at once."""

@@ -1,0 +1,298 @@
+"""The task of a fleet: the logs of one cell become a calibration, or the reason why not."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+
+from daq.config.yaml_file import MAX_BYTES
+from daq.environment import software
+from daq.errors import (
+    CalibrationUnreadable,
+    DaqError,
+    ExitCode,
+    LogsDiffer,
+    LogUnreadable,
+    OutputExists,
+    OutputFailed,
+    exit_code,
+)
+from daq.files import read_regular, replace_file
+from daq.jobs.fleet_survey import (
+    CellLogs,
+    StoredLog,
+    Summary,
+    at_hand,
+    fingerprint,
+    summary_document,
+    summary_from,
+    summary_of,
+)
+from daq.workflow.calibration_file import as_document, decode, encode
+from daq.workflow.fit import calibration_of, close_loop, fit
+from drivers.errors import DriverError
+from ident.calibration import Calibration
+from ident.errors import IdentificationError
+
+SEED = 0
+"""Of the significance test of the loop: that of `drivegain residual`."""
+
+
+class Loop(Enum):
+    """Whether effects that the model lacks are looked for."""
+
+    OPEN = "open"
+    CLOSED = "closed"
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why a cell has no calibration.
+
+    Attributes:
+        kind: name of the error's class.
+        text: found, expected and to do, as a single fit would say it.
+        exit_code: that a single fit would have ended with.
+    """
+
+    kind: str
+    text: str
+    exit_code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """What a worker sends back: small, whatever the logs weigh.
+
+    Attributes:
+        summary: of the calibration.
+        content: of its file, found to say the same.
+        seconds: that it took, reading included.
+    """
+
+    summary: Summary
+    content: bytes
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unfitted:
+    """What a worker sends back of a cell that cannot be fitted.
+
+    Attributes:
+        failure: why not.
+        seconds: that it took to find out.
+    """
+
+    failure: Failure
+    seconds: float
+
+
+def fit_cell(
+    cell: CellLogs, loop: Loop, created: datetime, clock: Callable[[], float] = time.perf_counter
+) -> Fitted | Unfitted:
+    """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs.
+
+    Args:
+        cell: with its logs, which this process can read.
+        loop: whether to look for effects.
+        created: when, for the calibration.
+        clock: for the seconds.
+    """
+    begun_s = clock()
+    paths: dict[Path, StoredLog] = {}
+    with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
+        try:
+            for seen in (*cell.fit, *cell.holdout):
+                _check_name(seen.log)
+                paths[at_hand(seen.log, Path(folder))] = seen.log
+            logs = list(paths)
+            fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :])
+            if loop is Loop.CLOSED:
+                fitted = close_loop(fitted, SEED)
+            _check_unchanged(cell)
+            calibration = calibration_of(fitted, created)
+            content = _content(calibration, cell.cell)
+        except (DaqError, DriverError, IdentificationError) as error:
+            return Unfitted(failure_of(error, paths), clock() - begun_s)
+    return Fitted(summary_of(calibration), content, clock() - begun_s)
+
+
+def _check_name(log: StoredLog) -> None:
+    """A calibration names its logs: a name that is no text has no place in it."""
+    try:
+        log.name.encode()
+    except UnicodeEncodeError as error:
+        raise LogUnreadable(
+            log.address,
+            found="bytes in its name that are no UTF-8",
+            expected="a name that a calibration can tell",
+            remedy="rename it",
+        ) from error
+
+
+def _check_unchanged(cell: CellLogs) -> None:
+    """A log that somebody copies anew meanwhile: what was read of it is not what the calibration would stand for."""
+    for seen in (*cell.fit, *cell.holdout):
+        if fingerprint(seen.log) != seen.fingerprint:
+            raise LogsDiffer(
+                seen.log.address,
+                found="another content than when the logs were looked through",
+                expected="logs that nobody writes while they are fitted",
+                remedy="start it again",
+            )
+
+
+def _content(calibration: Calibration, name: str) -> bytes:
+    """Of the file, spelt and read back here: it takes a tenth of the time of a fit, and who collects them is alone."""
+    content = encode(calibration)
+    if as_document(decode(content, name)) != as_document(calibration):
+        raise CalibrationUnreadable(
+            name, found="another content on reading back", expected="what was fitted", remedy="report it: it is a fault"
+        )
+    return content
+
+
+def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = None) -> Failure:
+    """An error as the table tells it.
+
+    Args:
+        error: of ours, or one that nobody expected.
+        paths: of copies, which nobody has seen: they are called by what they are copies of.
+    """
+    text = str(error) or type(error).__name__
+    for path, log in (paths or {}).items():
+        text = text.replace(str(path), log.address)
+    return Failure(type(error).__name__, text, int(exit_code(type(error)) or ExitCode.UNEXPECTED))
+
+
+# The folder of a fleet's calibrations: what stands there and is of the same logs needs no second fit.
+
+
+STATE_VERSION = 1
+FORMAT = "drivegain-fleet-state"
+
+
+@dataclass(frozen=True, slots=True)
+class Shelf:
+    """A calibration file a cell, and beside each a small JSON file that says what it was made of.
+
+    Attributes:
+        folder: made already.
+        loop: what is wanted of every cell.
+    """
+
+    folder: Path
+    loop: Loop
+
+    def file(self, cell: CellLogs) -> Path:
+        """Of a cell's calibration: its name, as far as a file may have it, and the beginning of the digest."""
+        name = re.sub(r"[^\w.-]", "_", cell.cell)[:40]
+        return self.folder / f"{name}-{cell.configuration_sha256[:12]}.yaml"
+
+    def standing(self, cell: CellLogs) -> tuple[Summary, float] | None:
+        """What is told of the calibration of these logs, and the seconds that it took; None where it is not there.
+
+        The file itself is not parsed: it is the one that was written, by its digest.
+
+        Raises:
+            OutputExists: there is something that no calibration, or no note beside it, can replace.
+        """
+        file = self.file(cell)
+        for path in (file, _state(file)):
+            _check_replaceable(path)
+        try:
+            # No pipe is waited for, and no file of somebody else fills the memory: neither is ours.
+            state = json.loads(read_regular(_state(file), MAX_BYTES))
+            found = hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest()
+            if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != (
+                FORMAT,
+                self._inputs(cell),
+                found,
+            ):
+                return None
+            return summary_from(state["summary"]), float(state["seconds"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return None  # whatever it is, it is made anew
+
+    def keep(self, cell: CellLogs, fitted: Fitted) -> Path:
+        """Put a calibration there; a kill at any point leaves what stands whole, or what is made anew.
+
+        Raises:
+            OutputFailed: the file system refuses.
+        """
+        file = self.file(cell)
+        state = {
+            "format": FORMAT,
+            "inputs_sha256": self._inputs(cell),
+            "calibration_sha256": hashlib.sha256(fitted.content).hexdigest(),
+            "seconds": fitted.seconds,
+            "summary": summary_document(fitted.summary),
+        }
+        for path, content in ((file, fitted.content), (_state(file), json.dumps(state, indent=1).encode())):
+            try:
+                replace_file(path, content)
+            except OSError as error:
+                raise OutputFailed.of(path, error) from error
+        return file
+
+    def _inputs(self, cell: CellLogs) -> str:
+        """Digest of all that decides a calibration: software, options, configuration, logs and their roles."""
+        logs = [
+            (role, Path(seen.log.name).name, seen.fingerprint, seen.mounting)
+            for role, several in (("fit", cell.fit), ("holdout", cell.holdout))
+            for seen in several
+        ]
+        decisive = (STATE_VERSION, software(), self.loop.value, cell.cell, cell.configuration_sha256, logs)
+        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
+
+
+def open_shelf(folder: Path, loop: Loop) -> Shelf:
+    """Make the folder, and see that files can be put there.
+
+    Raises:
+        OutputExists: it is no folder.
+        OutputFailed: the file system refuses.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputExists(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+    return Shelf(folder, loop)
+
+
+def _check_replaceable(path: Path) -> None:
+    """Refuse a folder, and a link to a device or a pipe: a link is followed, and what it leads to would be replaced."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return  # there is nothing, or who writes it will be told
+    if stat.S_ISDIR(mode):
+        found = "a folder"
+    elif path.is_symlink() and not stat.S_ISREG(mode):
+        found = "a link to something that is no regular file"
+    else:
+        return
+    raise OutputExists(
+        str(path),
+        found=found,
+        expected="a file that an earlier fleet has left, or none",
+        remedy="move it away, or choose another folder",
+    )
+
+
+def _state(file: Path) -> Path:
+    return file.with_suffix(".json")

@@ -1,0 +1,201 @@
+"""From a place full of logs to a row a cell, with at most as many cells in work as there are workers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import islice
+from pathlib import Path
+from typing import TypeVar
+
+from daq.errors import UsageError
+from daq.jobs.cell_fit import Failure, Fitted, Loop, Shelf, Unfitted, failure_of, fit_cell
+from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, Summary, UnknownLog, by_cell, survey
+from daq.jobs.workers import Crew
+
+# One line of a fleet's table: a cell with what came of it, or with what stood in the way.
+
+
+@dataclass(frozen=True, slots=True)
+class FleetRow:
+    """What is told of one cell.
+
+    Attributes:
+        cell: its name; that of the log where the log does not tell whose it is.
+        configuration_sha256: of its configuration; empty where nobody knows it.
+        fit, holdout: names of the logs.
+        result: what came of it, or why nothing did.
+        seconds: that it took.
+        configurations: in how many different ones the cell's logs were made; each has a row.
+        file: of the calibration, where it is kept.
+        kept: it stood already, and its logs are the same.
+    """
+
+    cell: str
+    configuration_sha256: str
+    fit: tuple[str, ...]
+    holdout: tuple[str, ...]
+    result: Summary | Failure
+    seconds: float
+    configurations: int = 1
+    file: Path | None = None
+    kept: bool = False
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is a calibration."""
+        return isinstance(self.result, Summary)
+
+
+SURVEYED = 16
+"""Logs whose heads one task reads: a cell's logs lie together, and share a configuration that is read once."""
+
+LOOK_S = 30.0
+"""After so long without a result somebody looks whether the workers are still there; a cell may well take longer."""
+
+Told = Callable[[int, int, str], None]
+"""Done, total, and a remark."""
+Work = TypeVar("Work")
+Made = TypeVar("Made")
+
+
+def fit_fleet(
+    logs: tuple[StoredLog, ...],
+    crew: Crew,
+    loop: Loop,
+    shelf: Shelf | None,
+    now: Callable[[], datetime],
+    told: Told = lambda _done, _total, _remark: None,
+) -> tuple[FleetRow, ...]:
+    """Fit every cell of which there are logs; what is wrong with one is told in its row.
+
+    Args:
+        logs: of all cells.
+        crew: who does it.
+        loop: whether to look for effects.
+        shelf: where calibrations are kept, None for nowhere.
+        now: time of day, for the calibrations.
+        told: of progress, by cells; while heads are read, by logs.
+
+    Returns:
+        the rows, by cell and configuration; logs that do not tell whose they are come last.
+
+    Raises:
+        UsageError: the workers have gone; what was fitted stays on the shelf.
+        OutputExists: something on the shelf is in the way of a calibration; no cell was fitted.
+        OutputFailed: a calibration could not be kept.
+    """
+    cells, unknown = _surveyed(logs, crew, told)
+    configurations = Counter(cell.cell for cell in cells)
+    rows: list[FleetRow] = []
+    missing = []
+    for cell in cells:
+        standing = None if shelf is None else shelf.standing(cell)
+        if shelf is None or standing is None:
+            missing.append(cell)
+        else:
+            row = _row_of(cell, *standing, configurations[cell.cell])
+            rows.append(replace(row, file=shelf.file(cell), kept=True))
+    told(len(rows), len(cells), "")
+
+    def submit(cell: CellLogs) -> Future[Fitted | Unfitted]:
+        return crew.executor.submit(fit_cell, cell, loop, now())
+
+    for cell, found in each(submit, missing, crew):
+        rows.append(_row(cell, found, configurations[cell.cell], shelf))
+        told(len(rows), len(cells), cell.cell)
+    rows.sort(key=lambda row: (row.cell, row.configuration_sha256))
+    return (*rows, *(FleetRow(log.log.name, "", (log.log.name,), (), failure_of(log.error), 0.0) for log in unknown))
+
+
+def each(
+    submit: Callable[[Work], Future[Made]], work: Iterable[Work], crew: Crew
+) -> Iterator[tuple[Work, Made | BaseException]]:
+    """Have some work done, in the order in which it is finished.
+
+    No more is handed over than there are workers, so that neither tasks nor results pile up anywhere.
+
+    Args:
+        submit: hands a piece over to the crew.
+        work: in pieces.
+        crew: who does it.
+
+    Yields:
+        each piece with what came of it, or with what it raised.
+
+    Raises:
+        UsageError: the workers have gone.
+    """
+    waiting = iter(work)
+    running = {submit(piece): piece for piece in islice(waiting, crew.workers)}
+    absent = 0
+    while running:
+        done, _ = wait(running, LOOK_S, return_when=FIRST_COMPLETED)
+        # A worker that died may be on its way back: only who is missed twice has gone.
+        absent = absent + 1 if not done and not crew.present() else 0
+        if absent > 1:
+            raise _gone("no workers any more")
+        for future in done:
+            piece = running.pop(future)
+            outcome = _outcome(future)
+            running |= {submit(following): following for following in islice(waiting, 1)}
+            yield piece, outcome
+
+
+def _outcome(future: Future[Made]) -> Made | BaseException:
+    try:
+        error = future.exception()
+        if error is None:
+            return future.result()
+    except CancelledError as lost:
+        raise _gone("the connection to the scheduler lost") from lost
+    return error
+
+
+def _gone(found: str) -> UsageError:
+    return UsageError(
+        "--scheduler",
+        found=found,
+        expected="a scheduler and workers that last until the end",
+        remedy="look at their own logs; started again with the same --out, it goes on where it was",
+    )
+
+
+def _surveyed(logs: tuple[StoredLog, ...], crew: Crew, told: Told) -> tuple[tuple[CellLogs, ...], list[UnknownLog]]:
+    portions = [logs[first : first + SURVEYED] for first in range(0, len(logs), SURVEYED)]
+    seen: list[SeenLog] = []
+    unknown: list[UnknownLog] = []
+    looked_at = 0
+
+    def submit(portion: tuple[StoredLog, ...]) -> Future[tuple[SeenLog | UnknownLog, ...]]:
+        return crew.executor.submit(survey, portion)
+
+    for portion, found in each(submit, portions, crew):
+        if isinstance(found, BaseException):  # a worker that was killed, or an error of ours
+            unknown += [UnknownLog(log, found) for log in portion]
+        else:
+            seen += [log for log in found if isinstance(log, SeenLog)]
+            unknown += [log for log in found if isinstance(log, UnknownLog)]
+        looked_at += len(portion)
+        told(looked_at, len(logs), "heads of logs")
+    return by_cell(seen), sorted(unknown, key=lambda log: log.log.name)
+
+
+def _row(
+    cell: CellLogs, found: Fitted | Unfitted | BaseException, configurations: int, shelf: Shelf | None
+) -> FleetRow:
+    if isinstance(found, BaseException):
+        # A worker that was killed, or an error of ours: the other cells have nothing to do with it.
+        return _row_of(cell, failure_of(found), 0.0, configurations)
+    if isinstance(found, Unfitted):
+        return _row_of(cell, found.failure, found.seconds, configurations)
+    row = _row_of(cell, found.summary, found.seconds, configurations)
+    return row if shelf is None else replace(row, file=shelf.keep(cell, found))
+
+
+def _row_of(cell: CellLogs, result: Summary | Failure, seconds: float, configurations: int) -> FleetRow:
+    fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
+    return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations)

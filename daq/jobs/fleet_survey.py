@@ -1,0 +1,377 @@
+"""Which cell each log is of, by its head alone, and what a fit makes of the logs of one cell."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from daq.config.cell_file import cell_from_bundle
+from daq.errors import ConfigurationMissing, DaqError, LogMissing, LogUnreadable
+from daq.files import open_regular
+from daq.log.message import NAME as READBACK
+from daq.log.reader import LogHead, LogReader
+from ident.calibration import Calibration, Gain
+
+# Where the logs of a fleet lie: a folder, or an object store by its address (s3://…, through fsspec).
+
+
+ENDING = ".mcap"
+PIECE_BYTES = 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class StoredLog:
+    """One log of a fleet, by name; any process that sees the same store can open it.
+
+    Attributes:
+        address: path, or address in an object store.
+        name: below the folder that was given, for people.
+    """
+
+    address: str
+    name: str
+
+    @property
+    def remote(self) -> bool:
+        """It is no file of this machine's folders."""
+        return is_address(self.address)
+
+
+def is_address(place: str) -> bool:
+    """Whether a place is an address for fsspec, and not a path."""
+    return "://" in place
+
+
+def list_logs(place: str) -> tuple[StoredLog, ...]:
+    """Whatever has the name of a finished log at a place and in the folders below it, by name.
+
+    A folder, a pipe or a link that leads nowhere may have such a name: `fingerprint` tells of it.
+
+    Raises:
+        LogMissing: there is no such folder, or no log in it.
+        ConfigurationMissing: the address needs a package that is not installed.
+    """
+    logs = _listed_remote(place) if is_address(place) else _listed_local(Path(place))
+    if not logs:
+        raise LogMissing(
+            place, found=f"no file *{ENDING}", expected="a folder with the logs of cells", remedy="check the place"
+        )
+    return tuple(sorted(logs, key=lambda log: log.name))
+
+
+def at_hand(log: StoredLog, folder: Path) -> Path:
+    """A log as a file: itself, or a copy of the same name in a folder of its own below `folder`.
+
+    Raises:
+        LogMissing: it cannot be read, or is no regular file.
+    """
+    if not log.remote:
+        with _told(log.address):
+            return _regular(Path(log.address))
+    copy = _copy(log, folder)
+    with _told(log.address):
+        store, path = _store(log.address)
+        with store.open(path, "rb") as source, copy.open("wb") as target:
+            shutil.copyfileobj(source, target, PIECE_BYTES)
+    return copy
+
+
+def beginning(log: StoredLog, size: int, folder: Path) -> Path:
+    """The first bytes of a log in an object store, as a file below `folder`.
+
+    Raises:
+        LogMissing: it cannot be read.
+    """
+    copy = _copy(log, folder)
+    with _told(log.address):
+        store, path = _store(log.address)
+        copy.write_bytes(store.cat_file(path, start=0, end=size))
+    return copy
+
+
+def fingerprint(log: StoredLog) -> str:
+    """What changes when the log does: the digest of a file, what the store tells of an object.
+
+    Raises:
+        LogMissing: it cannot be read, or is no regular file.
+    """
+    with _told(log.address):
+        if log.remote:
+            store, path = _store(log.address)
+            return str(store.ukey(path))
+        with open_regular(_regular(Path(log.address))) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _listed_local(folder: Path) -> list[StoredLog]:
+    if not folder.is_dir():
+        raise LogMissing(
+            str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
+        )
+    # Absolute: a worker may stand elsewhere. What is no file is not left out: it may stand for a log of a cell.
+    return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
+
+
+def _listed_remote(place: str) -> list[StoredLog]:
+    with _told(place):
+        store, root = _store(place)
+        if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
+            return _listed_local(Path(root))  # file://: with links, pipes and devices, of which fsspec does not tell
+        found = [path for path in store.find(root) if path.endswith(ENDING)]
+    below = root.rstrip("/") + "/"
+    return [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in found]
+
+
+def _regular(path: Path) -> Path:
+    """A log in a folder, looked at before anybody opens it: a pipe or a device would never end."""
+    if path.is_symlink() and not path.exists():
+        found = f"a link to {path.readlink()}, which leads nowhere"
+        raise _no_log(path, found, "mount or copy what it leads to, or move the link away")
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode):
+        found = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
+        raise _no_log(path, found, f"put the log there, or give this a name without {ENDING}")
+    return path
+
+
+def _no_log(path: Path, found: str, remedy: str) -> LogMissing:
+    return LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
+
+
+def _copy(log: StoredLog, folder: Path) -> Path:
+    # A fit calls a run by the name of its file, and two of a cell's logs may share it.
+    return Path(tempfile.mkdtemp(dir=folder)) / PurePosixPath(log.name).name
+
+
+def _store(address: str) -> tuple[Any, str]:
+    """The file system of an address, and the path in it."""
+    try:
+        # Untyped, and in no installation that nobody asked it into.
+        store, path = import_module("fsspec.core").url_to_fs(address)
+    except (ImportError, ValueError) as error:
+        bare = find_spec("fsspec") is None
+        raise ConfigurationMissing(
+            address,
+            found=str(error),
+            expected="an address that fsspec can read with what is installed",
+            remedy="pip install 'drivegain[fleet]'" if bare else "install what it names (for s3://: pip install s3fs)",
+        ) from error
+    return store, path
+
+
+@contextmanager
+def _told(address: str) -> Iterator[None]:
+    try:
+        yield
+    except DaqError:
+        raise
+    except Exception as error:  # every store has errors of its own, and few of them are an OSError
+        raise LogMissing(
+            address,
+            found=(getattr(error, "strerror", None) or str(error) or type(error).__name__).lower(),
+            expected="a log that can be read",
+            remedy="check the place, and the rights to read there",
+        ) from error
+
+
+HEAD_BYTES = 4 * 2**20
+"""Of a log in an object store, to begin with: its configuration files and first samples are within, as a rule."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenLog:
+    """A log and whose it is.
+
+    Attributes:
+        log: by name.
+        fingerprint: changes when the log does.
+        cell: name in the configuration that the log carries.
+        configuration_sha256: digest of that configuration.
+        mounting: of the payload; None without load.
+        started_ns: Unix time of its start [ns].
+    """
+
+    log: StoredLog
+    fingerprint: str
+    cell: str
+    configuration_sha256: str
+    mounting: str | None
+    started_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownLog:
+    """A log that does not tell whose it is.
+
+    Attributes:
+        log: by name.
+        error: why not.
+    """
+
+    log: StoredLog
+    error: BaseException
+
+
+@dataclass(frozen=True, slots=True)
+class CellLogs:
+    """The logs of one cell in one configuration.
+
+    Attributes:
+        cell, configuration_sha256: of all of them.
+        fit: logs of the fit, in the order in which they were made.
+        holdout: logs that the fit must not see.
+    """
+
+    cell: str
+    configuration_sha256: str
+    fit: tuple[SeenLog, ...]
+    holdout: tuple[SeenLog, ...]
+
+
+def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
+    """Look at the heads of some logs; what is wrong with one is told in its place."""
+    known: dict[str, tuple[str, str]] = {}
+    return tuple(_seen(log, known) for log in logs)
+
+
+def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
+    """The logs of each cell and configuration, by name and digest.
+
+    The newest run with a payload is held out where the fit keeps another one with the same mounting and one without
+    load: its error is then measured on moves that no estimate has seen, and all gains can still be found.
+    """
+    groups: dict[tuple[str, str], list[SeenLog]] = {}
+    for log in seen:
+        groups.setdefault((log.cell, log.configuration_sha256), []).append(log)
+    return tuple(_roles(*key, groups[key]) for key in sorted(groups))
+
+
+def _roles(cell: str, digest: str, logs: list[SeenLog]) -> CellLogs:
+    # The order of a session, and by content where a clock does not tell: a fit's last digits depend on the order.
+    logs = sorted(logs, key=lambda log: (log.started_ns, log.fingerprint, log.log.name))
+    mountings = [log.mounting for log in logs]
+    loaded = [log for log in logs if log.mounting is not None]
+    held = loaded[-1:] if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1 else []
+    return CellLogs(cell, digest, tuple(log for log in logs if log not in held), tuple(held))
+
+
+def _seen(log: StoredLog, known: dict[str, tuple[str, str]]) -> SeenLog | UnknownLog:
+    try:
+        mark = fingerprint(log)
+        head = _head(log)
+        cell, digest = _described(log, head, known)
+    except DaqError as error:
+        return UnknownLog(log, error)
+    mounting = None if head.run.payload is None else head.run.payload.mounting
+    return SeenLog(log, mark, cell, digest, mounting, head.run.started_wall_ns)
+
+
+def _described(log: StoredLog, head: LogHead, known: dict[str, tuple[str, str]]) -> tuple[str, str]:
+    """Name and digest of a configuration; one that several logs share is read once."""
+    files = {name: data for name, data in head.files.items() if name != READBACK}
+    total = hashlib.sha256()
+    for name, data in sorted(files.items()):
+        total.update(f"{name}\0{len(data)}\0".encode() + data)
+    key = total.hexdigest()
+    if key not in known:
+        cell = cell_from_bundle(files, names={"cell.yaml": f"{log.address}, cell.yaml"})
+        known[key] = cell.name, cell.digest
+    return known[key]
+
+
+def _head(log: StoredLog) -> LogHead:
+    with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
+        if log.remote:
+            try:
+                return _unfinished_head(beginning(log, HEAD_BYTES, Path(folder)))
+            except LogUnreadable:
+                pass  # a longer head, or an older log: the whole of it tells
+        path = at_hand(log, Path(folder))
+        try:
+            return _whole_head(path)
+        except LogUnreadable as damage:
+            # A log with a damaged end still tells whose it is; the fit of its cell then tells of the damage.
+            try:
+                return _unfinished_head(path)
+            except LogUnreadable:
+                raise damage from None
+
+
+def _whole_head(path: Path) -> LogHead:
+    reader = LogReader(path)
+    next(iter(reader), None)
+    return reader.head
+
+
+def _unfinished_head(path: Path) -> LogHead:
+    reader = LogReader(path)
+    next(reader.until_damage(), None)
+    return reader.head
+
+
+# What a table tells of a calibration: small enough to be sent, kept and read back for thousands of cells.
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Of one calibration.
+
+    Attributes:
+        gains: one an axis.
+        effects: family and axis of each accepted effect.
+        error_percent: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%].
+        held_out: whether it is that of a run held out.
+        partial: it rests on a log that was never finished, or with losses.
+    """
+
+    gains: tuple[Gain, ...]
+    effects: tuple[tuple[str, str], ...]
+    error_percent: float
+    held_out: bool
+    partial: bool
+
+    @property
+    def worst(self) -> Gain:
+        """The gain that is known least well."""
+        return max(self.gains, key=lambda gain: gain.std_percent)
+
+
+def summary_of(calibration: Calibration) -> Summary:
+    """What the table tells of it."""
+    unseen = calibration.holdout_error_percent
+    return Summary(
+        gains=calibration.gains,
+        effects=tuple((effect.name, effect.axis) for effect in calibration.effects),
+        error_percent=(unseen or calibration.relative_error_percent).total,
+        held_out=unseen is not None,
+        partial=any(source.partial for source in calibration.sources),
+    )
+
+
+def summary_document(summary: Summary) -> dict[str, Any]:
+    """As lists, mappings and numbers."""
+    return asdict(summary)
+
+
+def summary_from(document: dict[str, Any]) -> Summary:
+    """What `summary_document` made, through JSON.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is something else.
+    """
+    return Summary(
+        gains=tuple(Gain(**gain) for gain in document["gains"]),
+        effects=tuple((str(name), str(axis)) for name, axis in document["effects"]),
+        error_percent=float(document["error_percent"]),
+        held_out=bool(document["held_out"]),
+        partial=bool(document["partial"]),
+    )

@@ -1,0 +1,284 @@
+"""Whether the cell lets the robot move: its interlock, asked anew before every motion."""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import stat
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import FrameType
+
+from daq.config.cell import Cell
+from daq.config.recalibration import Command, Interlock, InterlockFile, PlannedRun, Recalibration
+from daq.errors import MountFailed, NotReleased, TimeBoundReached
+from daq.workflow.record import network_of
+from drivers.canopen.network import Undisturbed
+from drivers.errors import DriveFault, StateRefused
+from drivers.profiles.cia402 import POWERLESS, State, decode
+
+# Programs of the cell's own: the interlock's and the mount's.
+
+
+TOLD = 400
+"""Characters of what a program said that are shown."""
+_KEPT_BYTES = 4 * TOLD
+"""As many as those characters may take in UTF-8."""
+_READ_BYTES = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """How a program ended.
+
+    Attributes:
+        code: exit code; negative for the signal that ended it; None where it never ran, or ran too long.
+        said: the end of what it said, or why it did not run.
+    """
+
+    code: int | None
+    said: str
+
+    def __str__(self) -> str:
+        ended = "no exit code" if self.code is None else f"exit code {self.code}"
+        return f"{ended}{f' ({self.said})' if self.said else ''}"
+
+
+Runner = Callable[[Command, tuple[str, ...], Path], Finished]
+"""Runs a command with further arguments in a folder."""
+
+
+def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
+    """Run a program to its end, without a shell and without our input.
+
+    It has a session of its own: a Ctrl-C that stops us does not end it half-way unasked, and when it takes too long, or
+    we are interrupted, all that it started is ended with it.
+
+    Args:
+        command: program, arguments, and how long it may take.
+        further: arguments behind those.
+        folder: in which it runs.
+    """
+    try:
+        process = subprocess.Popen(
+            (*command.arguments, *further),
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+    except OSError as error:
+        return Finished(None, f"{command.arguments[0]}: {(error.strerror or type(error).__name__).lower()}")
+    with process:
+        try:
+            said = _said(process, command.timeout_s)
+        except subprocess.TimeoutExpired:
+            _end(process)
+            return Finished(None, f"not ended within {command.timeout_s:g} s")
+        except BaseException:
+            _end(process)
+            raise
+    return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-TOLD:])
+
+
+def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
+    """The end of what a program says until it has ended; the rest of it is read, and not kept.
+
+    Raises:
+        subprocess.TimeoutExpired: it takes longer.
+    """
+    assert process.stdout is not None
+    ends_s, said = time.monotonic() + timeout_s, b""
+    with selectors.DefaultSelector() as output:
+        output.register(process.stdout, selectors.EVENT_READ)
+        while (left_s := ends_s - time.monotonic()) > 0:
+            if not output.select(left_s):
+                continue
+            piece = os.read(process.stdout.fileno(), _READ_BYTES)
+            if not piece:
+                process.wait(max(0.0, ends_s - time.monotonic()))
+                return said
+            said = (said + piece)[-_KEPT_BYTES:]
+    raise subprocess.TimeoutExpired(process.args, timeout_s)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+NOTHING = "none"
+"""What the mount command is told where a run is without load."""
+_LOOK_BYTES = 4096
+
+
+def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path) -> None:
+    """Go on only where the interlock says so; a program that cannot run and a file that cannot be read say no.
+
+    Args:
+        interlock: of the cell.
+        run: runs its command.
+        now: wall clock, asked when the file is: the command before it may take its time.
+        folder: in which the command runs.
+
+    Raises:
+        NotReleased: it does not let the robot move.
+    """
+    if interlock.command is not None:
+        ended = run(interlock.command, (), folder)
+        if ended.code != 0:
+            raise _held(f"interlock command {interlock.command.arguments[0]}", str(ended), "exit code 0")
+    if interlock.file is not None:
+        _require_file(interlock.file, now)
+
+
+def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
+    """Have the payload of a run mounted, or none; asked before every run, also where nothing changes.
+
+    Raises:
+        MountFailed: the command did not end with 0, in its time.
+    """
+    wanted = planned.payload or NOTHING
+    ended = run(section.mount, (wanted,), section.working_folder)
+    if ended.code != 0:
+        raise MountFailed(
+            f"mount command {section.mount.arguments[0]} {wanted}",
+            found=str(ended),
+            expected="exit code 0: it is mounted as the run needs it",
+            remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {planned.name}",
+        )
+
+
+def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
+    subject = f"interlock file {file.path}"
+    expected = f"{file.says!r} in its first line, written within the last {file.max_age_s:g} s"
+    try:
+        # A FIFO of that name must not keep us waiting for its other end.
+        descriptor = os.open(file.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        try:
+            # Of the file that is open: a gateway may put another in its place meanwhile.
+            found, asked = os.fstat(descriptor), now()
+            if not stat.S_ISREG(found.st_mode):
+                raise _held(subject, "no regular file", expected)
+            head = os.read(descriptor, _LOOK_BYTES)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
+    says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
+    if says != file.says:
+        raise _held(subject, repr(says[:80]), expected)
+    age_s = asked.timestamp() - found.st_mtime
+    # One from the future is of another clock: how old it is, nobody knows.
+    if not -file.max_age_s <= age_s <= file.max_age_s:
+        raise _held(subject, f"an age of {age_s:.0f} s", expected)
+
+
+def _held(subject: str, found: str, expected: str) -> NotReleased:
+    return NotReleased(
+        subject,
+        found=found,
+        expected=expected,
+        remedy="nothing moves: close the cell, leave nobody inside, set automatic mode; the next job takes it up",
+    )
+
+
+# A look at the drives before a job moves anything: who they are, no fault, and nobody else's power on them.
+
+
+FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)
+"""Without power in the motor, and with nobody's wish for it."""
+
+LEFT_BEHIND = (
+    " (so a recorder that was killed leaves a drive to which no SYNC comes any more: `drivegain record` takes it over, "
+    "or switch it off and on)"
+)
+
+
+def check_drives(cell: Cell, undisturbed: Undisturbed) -> None:
+    """Read identity and state of every drive; nothing is changed and nothing moves.
+
+    Args:
+        cell: its file.
+        undisturbed: keeps signals from the closing of the network.
+
+    Raises:
+        DriveFault: one has a fault; to reset it is a person's decision.
+        StateRefused: one has power already: another controller drives this robot.
+        DriverError: a drive does not answer, is another one than declared, or the bus has gone.
+    """
+    with network_of(cell, undisturbed) as network:
+        network.check_identities()
+        for axis, statusword in zip(network.axes, network.statuswords(), strict=True):
+            state = decode(statusword)
+            if state in FAULTS:
+                reason = f"{state} before the job began; find its cause, then reset it"
+                raise DriveFault(axis.node_id, reason, statusword)
+            if state not in IDLE:
+                left = LEFT_BEHIND if state is State.QUICK_STOP_ACTIVE else ""
+                raise StateRefused(axis.node_id, "no power before a job begins", f"{state}{left}", statusword)
+
+
+# A bound on the time of a whole job, which also ends a motion: by the alarm that the system keeps for each process.
+
+
+AGAIN_S = 1.0
+"""After an alarm that came while the axes were being stopped for another reason."""
+
+
+@contextmanager
+def time_bound(minutes: float) -> Iterator[Undisturbed]:
+    """Raise where the block is, once the time is up; what is yielded keeps the alarm from disturbing a stop.
+
+    In another thread than the main one there is no alarm: Python handles no signals there.
+
+    Args:
+        minutes: of the block [min].
+
+    Raises:
+        TimeBoundReached: in the block.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield nullcontext
+        return
+    stopping = 0
+
+    def up(_number: int, _frame: FrameType | None) -> None:
+        if stopping:
+            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+            return
+        raise TimeBoundReached(
+            "the job",
+            found=f"more than {minutes:g} min since it began",
+            expected="its end within max_duration_min",
+            remedy="the axes were told to stop; the next job goes on where this one ended; raise max_duration_min, or "
+            "see what takes so long in its log",
+        )
+
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        nonlocal stopping
+        stopping += 1
+        try:
+            yield
+        finally:
+            stopping -= 1
+
+    before = signal.signal(signal.SIGALRM, up)
+    signal.setitimer(signal.ITIMER_REAL, 60.0 * minutes)
+    try:
+        yield undisturbed
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)

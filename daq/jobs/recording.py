@@ -1,0 +1,308 @@
+"""The recordings of a session: their plans, the warm-up before them, and what is left of those that were cut short."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import uuid
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.config.controller import Controller
+from daq.config.policy import HistoryPlace
+from daq.config.recalibration import PlannedRun, Recalibration
+from daq.errors import (
+    CalibrationMissing,
+    CalibrationRefused,
+    CalibrationUnreadable,
+    ConfigurationError,
+    DataError,
+    LogUnreadable,
+    OutputFailed,
+    RunInvalid,
+)
+from daq.files import sha256_of
+from daq.jobs import session as sessions
+from daq.jobs.interlock import mount, require_release
+from daq.jobs.journal import Journal, Level
+from daq.jobs.session import CALIBRATION, REPORT, Basis, Fitted, Outcome, RecordedRun, Session, save
+from daq.jobs.tools import Tools
+from daq.log.container import UNFINISHED
+from daq.log.salvage import salvage
+from daq.report.fit import start_of
+from daq.report.residual_document import summary
+from daq.workflow.calibration_file import load
+from daq.workflow.calibration_file import save as save_calibration
+from daq.workflow.plan import Plan
+from daq.workflow.plan_file import load_plan, save_plan
+from daq.workflow.record import Recorded
+from drivers.canopen.network import Undisturbed
+from ident.calibration import Calibration
+from ident.errors import IdentificationError
+from ident.model.bodies import Payload
+
+WARM_UP = "warm-up"
+
+
+@dataclass(frozen=True, slots=True)
+class GainTarget:
+    """The controller whose file a job writes, and where it is written down.
+
+    Attributes:
+        controller: as the cell file has it.
+        file: of it, absolute.
+        history: of the cell.
+    """
+
+    controller: Controller
+    file: Path
+    history: HistoryPlace
+
+
+@dataclass(frozen=True, slots=True)
+class Cellside:
+    """What every step of a job needs.
+
+    Attributes:
+        file, cell, section: the cell file, what it says, and its `recalibration`.
+        target: what the gains found are compared with, and where they go.
+        tools: the functions of other rooms.
+        who: the job, by a name that a person recognises.
+        undisturbed: keeps signals from the stop of the axes.
+    """
+
+    file: Path
+    cell: Cell
+    section: Recalibration
+    target: GainTarget
+    tools: Tools
+    who: str
+    undisturbed: Undisturbed
+
+
+def log_of(session: Session, name: str) -> Path:
+    """Where the log of a run is."""
+    return session.folder / f"{name}.mcap"
+
+
+def basis_of(cell: Cell, section: Recalibration) -> Basis:
+    """What a session of this cell rests on now; a plan that is not there is another one."""
+    plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
+    return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
+
+
+def standing_runs(session: Session) -> Session:
+    """The session without the runs whose logs are not what its state says."""
+    runs = tuple(run for run in session.state.runs if sha256_of(log_of(session, run.name)) == run.sha256)
+    return replace(session, state=session.state.with_(runs=runs))
+
+
+def record_runs(side: Cellside, session: Session, journal: Journal) -> Session:
+    """Make all recordings that the session does not have yet; its state is written after each of them.
+
+    Raises:
+        MountFailed, NotReleased: before a run; what was recorded until then stands.
+        RunInvalid: its recorder does not stand for a run, however often it was made.
+        DriverError, OutputFailed, ConfigurationError: see `daq.workflow.record`.
+    """
+    session = standing_runs(session)
+    made = {run.name for run in session.state.runs}
+    left = [planned for planned in side.section.runs if planned.name not in made]
+    plans = {planned.name: _plan(side, session, planned, journal.within(step="plan")) for planned in left}
+    warm = not left
+    for planned in left:
+        told = journal.within(step=f"record {planned.name}")
+        mount(side.section, planned, side.tools.run)
+        told.say(Level.INFO, "mounted", payload=planned.payload or "none")
+        if not warm:
+            _warm_up(side, session, planned, plans[planned.name], journal.within(step=WARM_UP))
+            warm = True
+        run = _record_valid(side, session, planned, plans[planned.name], told)
+        session = save(replace(session, state=session.state.with_(runs=(*session.state.runs, run))))
+    return session
+
+
+def _plan(side: Cellside, session: Session, planned: PlannedRun, journal: Journal) -> Plan:
+    """Approved moves, or those of the seed; a plan of this session is made once."""
+    if planned.plan_file is not None:
+        return load_plan(planned.plan_file, side.cell)
+    path = session.folder / f"plan-{planned.seed}-{planned.duration_s:g}s.yaml"
+    if path.exists():
+        with suppress(ConfigurationError):  # what was damaged is made again
+            return load_plan(path, side.cell)
+    journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
+    try:
+        save_plan(side.tools.plan(side.cell, seed=planned.seed, duration_s=planned.duration_s), path)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    return load_plan(path, side.cell)  # as a person can read it
+
+
+def _warm_up(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> None:
+    """Make a run's moves without keeping its log until the joints are as warm as the later runs will find them.
+
+    It is recorded all the same: in the same way, with the same supervision.
+    """
+    passes = math.ceil(60.0 * side.section.warm_up_min / plan.duration_s)
+    for number in range(1, passes + 1):
+        journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
+        out = log_of(session, WARM_UP)
+        out.unlink(missing_ok=True)
+        out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+        _record(side, planned, plan, out)
+        out.unlink()
+
+
+def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> RecordedRun:
+    out = log_of(session, planned.name)
+    lost, missing = 0, (0,) * len(side.cell.axes)
+    for attempt in range(1, side.section.retries + 2):
+        _set_aside(out, journal)
+        journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
+        log = (recorded := _record(side, planned, plan, out)).log
+        for warning in recorded.warnings:
+            journal.say(Level.WARNING, "warning of the recorder", text=warning)
+        lost += log.lost_cycles
+        missing = tuple(one + other for one, other in zip(missing, log.missing, strict=True))
+        if log.valid:
+            journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
+            return RecordedRun(
+                name=planned.name,
+                sha256=sha256_of(out) or "",
+                attempts=attempt,
+                samples=log.samples,
+                lost_cycles=lost,
+                missing=missing,
+            )
+        journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
+    raise RunInvalid(
+        str(out),
+        found=f"{side.section.retries + 1} recordings, none without losses (the last: {log.reason})",
+        expected="one that its recorder stands for",
+        remedy="see to the bus and to the load of this computer; the next job records this run again",
+    )
+
+
+def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
+    """One recording. The interlock is asked before the drives are, and again right before they get power."""
+
+    def released() -> None:
+        require_release(side.section.interlock, side.tools.run, side.tools.now, side.section.working_folder)
+
+    released()
+    return side.tools.record(
+        side.file,
+        side.cell,
+        plan,
+        out,
+        payload=payload_of(side.cell, planned),
+        entered_kg=planned.mass_kg,
+        operator=side.who,
+        granted_by=f"the policy of cell {side.cell.name} and its interlock, for {side.who}",
+        run_id=str(uuid.uuid4()),
+        free=side.tools.free,
+        undisturbed=side.undisturbed,
+        # Waiting for the drives and mapping their PDOs takes seconds, in which somebody may open the cell.
+        before_motion=released,
+    )
+
+
+def payload_of(cell: Cell, planned: PlannedRun) -> Payload | None:
+    """What a run is declared to carry; that the cell has it was checked before anything moved."""
+    if planned.payload is None:
+        return None
+    return next(payload.payload for payload in cell.payloads if payload.name == planned.payload)
+
+
+def _set_aside(out: Path, journal: Journal) -> None:
+    """What an earlier recording of this name left: a log that the state does not know, or half of one.
+
+    Raises:
+        UsageError: somebody still writes it.
+        OutputFailed: the file system refuses.
+    """
+    part = out.with_name(out.name + UNFINISHED)
+    try:
+        if out.exists():
+            aside = next(_free_names(out, "aside"))
+            out.rename(aside)
+            journal.say(Level.NOTICE, "set aside", log=aside.name)
+        if part.exists():
+            aside = next(_free_names(out, "partial"))
+            try:
+                salvage(part, aside)
+                part.unlink()
+            except LogUnreadable as error:
+                aside = part.rename(aside.with_name(aside.name + UNFINISHED))
+                journal.say(Level.NOTICE, "nothing to salvage", found=error.found)
+            journal.say(Level.NOTICE, "half a recording kept as partial", log=aside.name)
+    except OSError as error:
+        raise OutputFailed.of(out, error) from error
+
+
+def _free_names(out: Path, kind: str) -> Iterator[Path]:
+    for number in range(1, 1000):
+        path = out.with_name(f"{out.stem}-{kind}-{number}{out.suffix}")
+        if not path.exists() and not path.with_name(path.name + UNFINISHED).exists():
+            yield path
+
+
+# From a session's logs to its calibration and its report.
+
+
+def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Session, Calibration]:
+    """Fit the logs, close the loop, and write calibration and report; nothing where that was done before.
+
+    Raises:
+        DataError, IdentificationError: the recordings cannot be used; the session is over.
+        OutputFailed: the file system refuses.
+    """
+    done = calibration_of_session(session)
+    if done is not None:
+        return session, done
+    logs = [log_of(session, run.name) for run in side.section.runs if not run.holdout]
+    unseen = [log_of(session, run.name) for run in side.section.runs if run.holdout]
+    journal.say(Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen])
+    try:
+        fitted = side.tools.fit(logs, holdout=unseen)
+        closed = side.tools.close_loop(fitted, side.section.seed, lambda step: journal.say(Level.INFO, step))
+        changed = side.tools.account(start_of(closed), closed.steps)
+    except (DataError, IdentificationError):
+        # The same logs would end in the same way: the next job records others.
+        sessions.save(replace(session, state=session.state.with_(outcome=Outcome.UNFIT)))
+        raise
+    calibration = side.tools.calibration(closed, side.tools.now())
+    path, report = session.folder / CALIBRATION, session.folder / REPORT
+    try:
+        save_calibration(calibration, path)
+        report.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    side.tools.save_report(closed, changed, calibration, report)
+    fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
+    for sentence in fit.sentences:
+        journal.say(Level.INFO, "found", text=sentence)
+    return sessions.save(replace(session, state=session.state.with_(fitted=fit))), calibration
+
+
+def calibration_of_session(session: Session) -> Calibration | None:
+    """The calibration that the state speaks of, None where there is none, or where it is not of the session's logs."""
+    path, fitted = session.folder / CALIBRATION, session.state.fitted
+    if fitted is None or sha256_of(path) != fitted.calibration_sha256:
+        return None
+    try:
+        found = _loaded(path, fitted.calibration_sha256)
+    except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
+        return None
+    own = {run.sha256 for run in session.state.runs}
+    return found if {source.sha256 for source in found.sources} == own else None
+
+
+@lru_cache(maxsize=2)
+def _loaded(path: Path, _sha256: str) -> Calibration:
+    """Read once for all that tell of it: a content of that digest stays what it is."""
+    return load(path)

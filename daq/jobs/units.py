@@ -1,0 +1,203 @@
+"""What makes a timer run the job: a systemd service with its timer, or a line for cron."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.config.recalibration import Recalibration
+from daq.errors import ExitCode, UsageError
+
+MARK = "# Made by `drivegain install-units`, which may replace this file."
+"""First line of what is ours; any other file of that name is somebody else's."""
+STOP_S = 30
+"""For the axes to stop and the session to be written down, after SIGTERM."""
+CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}
+_NEEDS_LITTLE = """\
+NoNewPrivileges=yes
+ProtectSystem=full
+ProtectHome=read-only
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectControlGroups=yes
+ProtectClock=yes
+ProtectHostname=yes
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+LockPersonality=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_CAN
+SystemCallArchitectures=native"""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A file for systemd: its name and its text."""
+
+    name: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Installation:
+    """For whom the units are made.
+
+    Attributes:
+        cell_file: absolute.
+        program: path of `drivegain`, absolute.
+        schedule: calendar expression of systemd.time(7), such as weekly or `Sun 03:00`.
+        user: whether it is a service of one user, and not of the system.
+        owner: of the cell file, in whose name the system's service runs.
+    """
+
+    cell_file: Path
+    program: Path
+    schedule: str
+    user: bool
+    owner: str
+
+
+def units_of(cell: Cell, section: Recalibration, wanted: Installation) -> tuple[Unit, Unit]:
+    """The service and its timer."""
+    name = unit_name(cell)
+    return Unit(f"{name}.service", _service(cell, section, wanted)), Unit(f"{name}.timer", _timer(cell, wanted))
+
+
+def unit_name(cell: Cell) -> str:
+    """Without its suffix; cells whose names differ in more than small letters, digits and hyphens get a digest too."""
+    plain = re.sub(r"[^a-z0-9]+", "-", cell.name.lower()).strip("-")
+    digest = "" if plain == cell.name else "-" + hashlib.sha256(cell.name.encode()).hexdigest()[:6]
+    return f"drivegain-recalibrate-{plain or 'cell'}{digest}"
+
+
+def cron_line(wanted: Installation) -> str:
+    """For `crontab -e`; cron mails what the job says on standard output.
+
+    Raises:
+        UsageError: the schedule is no word that cron has a line for.
+    """
+    when = CRON.get(wanted.schedule)
+    if when is None:
+        raise UsageError(
+            f"--schedule {wanted.schedule}",
+            found="a calendar expression of systemd",
+            expected=f"with --cron one of {', '.join(CRON)}",
+            remedy="choose one of them, and change the five fields in the line by hand",
+        )
+    command = " ".join(shlex.quote(part) for part in _command(wanted))
+    return f"{when}  {command.replace('%', chr(92) + '%')}"  # a % ends a command of crontab(5)
+
+
+def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str, ...]:
+    """What a person types then."""
+    systemctl = "systemctl --user" if wanted.user else "systemctl"
+    journal = "journalctl --user" if wanted.user else "journalctl"
+    service = timer.name.removesuffix(".timer") + ".service"
+    return (
+        f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
+        f"{systemctl} daemon-reload",
+        f"{systemctl} start {service}    # once, while somebody watches the cell",
+        f"{systemctl} enable --now {timer.name}",
+        f"{systemctl} list-timers {timer.name}",
+        f"{journal} -u {service} -o cat",
+    )
+
+
+def told_cell(wanted: Installation) -> str:
+    """How a service of ours tells for which cell it is."""
+    return f"--cell {_quoted(str(wanted.cell_file))}"
+
+
+def _command(wanted: Installation) -> tuple[str, ...]:
+    return (str(wanted.program), "recalibrate", "--cell", str(wanted.cell_file))
+
+
+def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:
+    command = " ".join(_quoted(part) for part in _command(wanted))
+    seconds = round(60 * section.max_duration_min) + 2 * STOP_S
+    # The lock of the bus is in a folder that all share, so the service must see the same /tmp and /run.
+    hardening = (
+        "" if wanted.user else f"\n# It reads its cell, writes beside it, and speaks CAN; no more.\n{_NEEDS_LITTLE}\n"
+    )
+    owner = "" if wanted.user else f"# Whose the cell file is: what the job writes stays theirs.\nUser={wanted.owner}\n"
+    writable = "" if wanted.user else _writable(cell, section, wanted.cell_file)
+    return f"""{MARK}
+[Unit]
+Description=drivegain: scheduled recalibration of cell {_plain(cell.name)}
+
+[Service]
+Type=oneshot
+ExecStart={command}
+{owner}WorkingDirectory={_plain(str(wanted.cell_file.parent))}
+# 10: a change was found and waits for a person. 11 to 14 (interlock, bus, time, held) fail the unit on purpose:
+# OnFailure= may tell somebody.
+SuccessExitStatus={ExitCode.PROPOSED.value}
+# Never again by itself: whoever stands at the cell decides.
+Restart=no
+# The job bounds its own time (max_duration_min) and stops the axes; this is behind that bound.
+TimeoutStartSec={seconds}
+# SIGTERM stops the axes and writes the session down.
+KillSignal=SIGTERM
+KillMode=mixed
+TimeoutStopSec={STOP_S}
+Environment=OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
+{hardening}{writable}"""
+
+
+def _timer(cell: Cell, wanted: Installation) -> str:
+    return f"""{MARK}
+[Unit]
+Description=drivegain: when cell {_plain(cell.name)} is recalibrated
+
+[Timer]
+OnCalendar={_plain(wanted.schedule)}
+# A date that passed while the computer was off is not made up for when it is switched on: no robot moves because the
+# power came back. The job's interlock would have to release it anyway.
+Persistent=false
+AccuracySec=1min
+
+[Install]
+WantedBy=timers.target
+"""
+
+
+def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
+    """Folders that ProtectHome= and ProtectSystem= would lock; of links, those where the files are."""
+    folders = {cell_file.parent, section.folder.parent, section.folder}
+    if cell.controller_path is not None:
+        folders.add(Path(os.path.realpath(cell.controller_path)).parent)
+    if cell.history is not None:
+        folders |= {cell.history.store.parent, cell.history.audit.parent}
+    if section.metrics is not None:
+        folders.add(section.metrics)
+    # "-": one that is not there yet must not keep the service from starting.
+    # A path is no command line: here a $ is a $.
+    return "".join(f"ReadWritePaths={_quoted('-' + str(folder), dollar='$')}\n" for folder in sorted(folders))
+
+
+def _quoted(part: str, *, dollar: str = "$$") -> str:
+    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them.
+
+    Raises:
+        UsageError: it has a character that no unit can say, and with another one it would be another file.
+    """
+    if not part.isprintable():
+        raise UsageError(
+            f"{part!r}",
+            found="a control character in a path",
+            expected="a path that can stand in a line of a unit",
+            remedy="rename the folder or file",
+        )
+    plain = _plain(part).replace("$", dollar)
+    if re.fullmatch(r"[A-Za-z0-9_/.:=@%+-]+", plain):
+        return plain
+    return '"' + plain.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _plain(text: str) -> str:
+    """In one line, and no specifier of systemd (%)."""
+    return "".join(letter if letter.isprintable() else " " for letter in text).replace("%", "%%")

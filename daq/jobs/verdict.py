@@ -1,0 +1,286 @@
+"""What becomes of a calibration: nothing, a proposal for a person, or the controller's new gains."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from daq.config.cell import Cell
+from daq.config.policy import AppliedBy, HistoryPlace
+from daq.errors import DaqError, OutputFailed
+from daq.files import replace_file, sha256, sha256_of
+from daq.jobs import session as sessions
+from daq.jobs.journal import Journal, Level
+from daq.jobs.recording import Cellside
+from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, WatchedGain
+from daq.ledger.audit import AuditAction, append, told_of
+from daq.ledger.audit import read as read_audit
+from daq.ledger.entry import Deed, Event
+from daq.ledger.judgement import Known, judge, known_of
+from daq.ledger.store import HistoryStore
+from daq.ledger.verify import enter_applied
+from daq.ledger.watch import alarm_words, watch
+from daq.workflow.calibration_file import read
+from daq.writeback.file_access import followed
+from daq.writeback.file_proposal import Proposal
+from daq.writeback.file_target import Written
+from daq.writeback.gates.table import Gate
+from daq.writeback.gates.target import GainChange
+from daq.writeback.request import Request
+from ident.calibration import Calibration
+from ident.drift.change import FALSE_ALARM
+
+# What the cell's history says of the gains in force, and what a job adds to it.
+
+
+class Past:
+    """The history of a cell, open; a context manager.
+
+    Args:
+        cell: that it is of.
+        place: of its files.
+        controller: file whose gains are in force.
+        now: wall clock.
+        who: the job.
+    """
+
+    def __init__(
+        self, cell: Cell, place: HistoryPlace, controller: Path, now: Callable[[], datetime], who: str
+    ) -> None:
+        self._target = str(followed(controller))
+        self._now = now
+        self._who = who
+        self._store = HistoryStore(place.store)
+        self._cell = cell
+        self._digest = ""
+
+    def __enter__(self) -> Self:
+        """Open it.
+
+        Raises:
+            HistoryUnreadable: see `daq.ledger.store`.
+        """
+        self._store.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._store.__exit__(kind, error, trace)
+
+    def keep(self, calibration: Calibration, path: Path) -> None:
+        """Enter this session's calibration; once, however often a session is taken up.
+
+        Raises:
+            HistoryMixed, HistoryUnreadable, OutputFailed: see `daq.ledger.store`.
+        """
+        self._digest = sha256_of(path) or ""
+        self._store.add(calibration, digest=self._digest, at=self._now())
+
+    def note_applied(self, audit: Path, sha256_after: str) -> None:
+        """The controller has this session's gains; noted once. Raises as `keep`.
+
+        Args:
+            audit: which tells of the write.
+            sha256_after: of the controller's file with these gains, by which a later way back to it is known.
+        """
+        if self._store.in_force(self._target) != self._digest:
+            told = told_of(audit, self._target, sha256_after)
+            event = Event(self._digest, Deed.APPLIED, self._now(), self._who, self._target, told, sha256_after)
+            enter_applied(self._cell, self._store, event)
+
+    def watched(self) -> tuple[WatchedGain, ...]:
+        """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
+        series = watch(self._store.entries(), self._store.acknowledgements())
+        return tuple(WatchedGain(axis=one.axis, alarm=alarm_words(one) or "") for one in series)
+
+    def known(self, changes: Sequence[GainChange]) -> Known:
+        """What the changes by this session's calibration are judged by. Raises as `keep`."""
+        return known_of(self._store, self._target, self._digest, changes)
+
+
+TOUCHED = "The controller's file was written or rolled back since the session began: a person decides."
+PROPOSAL, DIFF = "proposal.json", "proposal.diff"
+
+
+def settle(side: Cellside, session: Session, calibration: Calibration, past: Past, journal: Journal) -> Session:
+    """Compare a calibration with the gains in the controller, and do what follows from it; the state has the outcome.
+
+    Raises:
+        CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
+        ControllerChanged, ControllerBusy, ControllerUnfit, AuditUnusable, OutputFailed: see
+        `daq.writeback.file_proposal`.
+    """
+    session = _written_before(side, session, past, journal)
+    if session.state.outcome is not None:
+        return session
+    path, now = session.folder / CALIBRATION, side.tools.now()
+    request = Request(calibration, now, file=path, content=read(path))
+    proposal = side.tools.propose(side.cell, request)
+    decision = decision_of(proposal, past)
+    differs, touched = any(gain.differs for gain in decision.gains), _written_since(side, session)
+    if differs and touched:
+        decision = decision.model_copy(update={"remark": f"{decision.remark} {TOUCHED}"})
+    journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
+    after = sha256(proposal.after_content)
+    target = Target(
+        file=str(proposal.file),
+        base_sha256=proposal.base_sha256,
+        after_sha256=after,
+        looked_at=proposal.looked_at,
+        unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
+    )
+    _write_proposal(session, proposal, after)
+    # Before anything is written: whoever finds this state after a kill sees by the file's digest whether it was.
+    session = sessions.save(replace(session, state=session.state.with_(decision=decision, target=target)))
+    closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
+    if closed:
+        for refusal in closed:
+            journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
+        sessions.save(_with_outcome(session, Outcome.REFUSED))
+        _apply(side, proposal, now)  # which refuses it, and writes that down
+    if proposal.after_content == proposal.before_content or not differs:
+        return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
+    if proposal.refusals or by_a_person(side) or touched:
+        _propose(side, session, target, journal)
+        return sessions.save(_with_outcome(session, Outcome.PROPOSED))
+    written = _apply(side, proposal, now)
+    if written is not None:
+        journal.say(
+            Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
+        )
+    _note(side, past, after, journal)
+    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+
+
+def _apply(side: Cellside, proposal: Proposal, now: datetime) -> Written | None:
+    try:
+        return side.tools.apply(proposal, now, audit=side.target.history.audit, who=side.who)
+    except OSError as error:
+        raise OutputFailed.of(proposal.file, error) from error
+
+
+def _note(side: Cellside, past: Past, after_sha256: str, journal: Journal) -> None:
+    """The history's turn. The controller has its gains, and no trouble of the history's may call that undone."""
+    try:
+        past.note_applied(side.target.history.audit, after_sha256)
+    except DaqError as error:
+        journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
+
+
+def by_a_person(side: Cellside) -> bool:
+    """Whether a person applies: by the cell's policy, and wherever drives are written to."""
+    return side.cell.apply.by is AppliedBy.PERSON or bool(side.target.controller.objects)
+
+
+def decision_of(proposal: Proposal, past: Past) -> Decision:
+    """Whether any gain differs from the controller's by more than chance (`daq.ledger.judgement`).
+
+    An axis differs by itself where its probability among all of them says so.
+    """
+    known = past.known(proposal.changes)
+    found = judge(proposal.changes, known)
+    changes = {change.axis: change for change in proposal.changes}
+    gains = tuple(
+        JudgedGain(
+            axis=axis,
+            unit=changes[axis].unit,
+            old=changes[axis].old,
+            old_std=known.stds[axis],
+            new=changes[axis].new,
+            new_std=changes[axis].std,
+            change_percent=_finite(told.percent),
+            drift_sigma=_finite(told.sigmas),
+            differs=probability <= FALSE_ALARM,
+        )
+        for axis, told, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
+    )
+    return Decision(gains=gains, remark=found.words)
+
+
+def _written_before(side: Cellside, session: Session, past: Past, journal: Journal) -> Session:
+    """A job that was killed behind its write has written all the same: it is noted, and never done twice."""
+    target = session.state.target
+    if target is None or target.base_sha256 == target.after_sha256:
+        return session
+    if sha256_of(Path(target.file)) != target.after_sha256:
+        return session
+    journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
+    _note(side, past, target.after_sha256, journal)
+    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+
+
+def _written_since(side: Cellside, session: Session) -> bool:
+    """Whether the audit tells of a write of the controller's file, or of a way back, since the session began.
+
+    An earlier job of it may have been killed right behind its write, and a person may have rolled that back since: the
+    file is then what it was before, and the job must not do again what the person has undone.
+    """
+    entries = read_audit(side.target.history.audit)
+    begun = [
+        index
+        for index, entry in enumerate(entries)
+        if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
+    ]
+    file = str(followed(side.target.file))
+    ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
+    # Of an audit that does not know the begin, all of it is later: the part that knew it was moved away.
+    return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
+
+
+def _propose(side: Cellside, session: Session, target: Target, journal: Journal) -> None:
+    append(
+        side.target.history.audit,
+        AuditAction.PROPOSED,
+        at=side.tools.now(),
+        who=side.who,
+        subject=str(followed(side.target.file)),
+        details={
+            "session": session.state.session,
+            "calibration_sha256": sha256_of(session.folder / CALIBRATION) or "",
+            "sha256_before": target.base_sha256,
+            "sha256_after": target.after_sha256,
+        },
+    )
+    journal.say(Level.NOTICE, "proposed: a person must apply it", folder=str(session.folder))
+
+
+def _write_proposal(session: Session, proposal: Proposal, after_sha256: str) -> None:
+    """The change as a person and a program read it, beside the calibration."""
+    document = {
+        "file": str(proposal.file),
+        "base_sha256": proposal.base_sha256,
+        "after_sha256": after_sha256,
+        "changes": [
+            {
+                "axis": change.axis,
+                "key": change.key,
+                "old": _finite(change.old),
+                "new": _finite(change.new),
+                "std": _finite(change.std),
+                "unit": change.unit,
+                "change_percent": _finite(change.change_percent),
+            }
+            for change in proposal.changes
+        ],
+        "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
+    }
+    try:
+        replace_file(session.folder / PROPOSAL, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode())
+        replace_file(session.folder / DIFF, proposal.diff.encode())
+    except OSError as error:
+        raise OutputFailed.of(session.folder / PROPOSAL, error) from error
+
+
+def _with_outcome(session: Session, outcome: Outcome) -> Session:
+    return replace(session, state=session.state.with_(outcome=outcome))
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None

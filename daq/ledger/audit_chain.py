@@ -1,0 +1,361 @@
+"""Whether an audit is what was written: edited, removed, moved and added lines, and writes that never ended."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+# One line of the audit: what was asked of a controller, by whom, and the digest that chains it to the line before.
+
+
+FIRST = "0" * 64
+"""What the first entry follows."""
+
+_BEGINNING = b'{"action":"'
+"""Of every line: the keys are sorted."""
+
+
+class AuditAction(Enum):
+    """What happened."""
+
+    PROPOSED = "proposed"
+    REFUSED = "refused"
+    APPLY_BEGUN = "apply begun"
+    APPLIED = "applied"
+    ROLLBACK_BEGUN = "rollback begun"
+    ROLLED_BACK = "rolled back"
+    FAILED = "failed"
+    NOTHING_TO_DO = "nothing to do"
+    """Somebody asked for a write of what stands there already."""
+    RECALIBRATION_BEGUN = "recalibration begun"
+    RECALIBRATION_ENDED = "recalibration ended"
+    ACKNOWLEDGED = "acknowledged"
+    TORN_LINE = "torn line"
+    """The line before is what a writer left that was killed or had no room; details: its length and SHA-256."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditEntry:
+    """One entry.
+
+    Attributes:
+        number: from 1, without gaps.
+        at: ISO 8601 time with its zone.
+        who: the person or the job.
+        action: what happened.
+        subject: what it happened to: for a write, the controller file with symbolic links followed.
+        details: plain JSON; see docs/write-back.md for what each action says.
+        previous: `sha256` of the entry before, `FIRST` for the first.
+        sha256: of the canonical JSON of all of the above, hexadecimal.
+    """
+
+    number: int
+    at: str
+    who: str
+    action: AuditAction
+    subject: str
+    details: dict[str, object]
+    previous: str
+    sha256: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether the entry is what its digest was computed from."""
+        return self.sha256 == _digest(_content(self))
+
+
+def entry(
+    number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str
+) -> AuditEntry:
+    """A new entry with its digest.
+
+    Raises:
+        TypeError, ValueError: the details are no JSON, or have a number that is not finite.
+    """
+    # As it will be read: with lists for tuples, so that what is returned is what is in the file.
+    plain: dict[str, object] = json.loads(_canonical(dict(details)))
+    unsigned = AuditEntry(number, at, who, action, subject, plain, previous, "")
+    return AuditEntry(number, at, who, action, subject, plain, previous, _digest(_content(unsigned)))
+
+
+def encode(one: AuditEntry) -> bytes:
+    """The line, without its end."""
+    return _canonical({**_content(one), "sha256": one.sha256})
+
+
+def decode(line: bytes) -> AuditEntry | None:
+    """The entry in a line, its digest not yet compared; None where the line is not one that `encode` could write."""
+    try:
+        tree = json.loads(line)
+        found = _entry(tree)
+        return found if found is not None and encode(found) == line else None
+    except (ValueError, TypeError, RecursionError):
+        return None
+
+
+def is_fragment(line: bytes) -> bool:
+    """Whether a line can be the beginning of an entry that a writer did not finish: such a beginning is never JSON.
+
+    Zeros behind it, or alone, are what a power cut leaves. Any other text is somebody else's file.
+    """
+    begun = line.rstrip(b"\0")
+    if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
+        return False
+    try:
+        json.loads(line)
+    except ValueError:
+        return True
+    except RecursionError:
+        return False
+    return False
+
+
+def _entry(tree: Any) -> AuditEntry | None:
+    if not isinstance(tree, dict):
+        return None
+    texts = [tree.get(key) for key in ("at", "who", "action", "subject", "previous", "sha256")]
+    number, details = tree.get("number"), tree.get("details")
+    if not all(isinstance(text, str) for text in texts) or not isinstance(details, dict) or type(number) is not int:
+        return None
+    at, who, action, subject, previous, sha256 = map(str, texts)
+    return AuditEntry(number, at, who, AuditAction(action), subject, details, previous, sha256)
+
+
+def _content(one: AuditEntry) -> dict[str, object]:
+    return {
+        "number": one.number,
+        "at": one.at,
+        "who": one.who,
+        "action": one.action.value,
+        "subject": one.subject,
+        "details": one.details,
+        "previous": one.previous,
+    }
+
+
+def _canonical(tree: object) -> bytes:
+    """One spelling for one content: sorted keys, no spaces, ASCII, no NaN (which is no JSON)."""
+    return json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _digest(content: dict[str, object]) -> str:
+    return hashlib.sha256(_canonical(content)).hexdigest()
+
+
+_BEGUN = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
+GONE = "gone"
+"""In the place of the digest of a file that is not there."""
+_ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
+
+
+class Flaw(Enum):
+    """What somebody has done to a line."""
+
+    EDITED = "edited"
+    REMOVED = "removed"
+    MOVED = "moved"
+    ADDED = "added"
+    CUT_OFF = "cut off"
+
+
+@dataclass(frozen=True, slots=True)
+class AuditFlaw:
+    """One place where the audit is not what was written.
+
+    Attributes:
+        line: in the file, from 1; of what was removed, the line that stands in its place.
+        flaw: what was done there, as far as the chain tells.
+        says: the same in words.
+    """
+
+    line: int
+    flaw: Flaw
+    says: str
+
+
+class Content(Enum):
+    """What a controller file held after a write that was begun and not ended."""
+
+    BEFORE = "as before the write"
+    AFTER = "the new content"
+    OTHER = "neither: somebody has changed or removed it since"
+    UNKNOWN = "not known: the file cannot be read, or the entry has no digests"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenWrite:
+    """A write that was begun and whose end nobody wrote down: its writer was killed.
+
+    Attributes:
+        begun: the entry.
+        content: of the file afterwards: as the next write found it, or, where there was none, as it is now.
+    """
+
+    begun: AuditEntry
+    content: Content
+
+
+@dataclass(frozen=True, slots=True)
+class AuditVerdict:
+    """What an audit can be believed to say.
+
+    Attributes:
+        entries: all of them, in the order of the file.
+        flaws: by their lines; empty where the chain holds.
+        torn: lines, from 1, that a killed writer left unfinished; they are no flaw.
+        open_writes: begun and not ended.
+    """
+
+    entries: tuple[AuditEntry, ...]
+    flaws: tuple[AuditFlaw, ...]
+    torn: tuple[int, ...]
+    open_writes: tuple[OpenWrite, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every entry is what was written and none is missing, as far as a chain can tell."""
+        return not self.flaws
+
+    @property
+    def broken(self) -> int | None:
+        """First line that is not what was written; None where there is none."""
+        return self.flaws[0].line if self.flaws else None
+
+
+def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
+    """Follow the chain.
+
+    Args:
+        content: of the audit.
+        digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where it cannot be read.
+        heads: digests of entries that somebody noted elsewhere. A chain cannot tell that its last lines are missing;
+            one of these that is not in it does.
+    """
+    chain = _Chain(content)
+    for index, one in enumerate(chain.found):
+        if one is None:
+            chain.unfinished.append(index)
+        else:
+            chain.take(index, one)
+    chain.end()
+    entries = tuple(one for one in chain.found if one is not None)
+    unknown = sorted(set(heads) - {one.sha256 for one in entries})
+    if unknown:
+        says = f"{len(unknown)} entries that were noted elsewhere are missing: {', '.join(h[:12] for h in unknown)}"
+        chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
+    flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
+    return AuditVerdict(entries, flaws, tuple(chain.torn), _open_writes(entries, digest_now))
+
+
+def lines_of(content: bytes) -> list[bytes]:
+    """Lines without their ends; the last one may lack its end."""
+    lines = content.split(b"\n")
+    return lines if lines[-1] else lines[:-1]
+
+
+def torn_details(fragments: Sequence[bytes]) -> dict[str, object]:
+    """What the entry after unfinished lines says of them."""
+    joined = b"\n".join(fragments)
+    return {"torn_bytes": len(joined), "torn_sha256": hashlib.sha256(joined).hexdigest()}
+
+
+class _Chain:
+    """Walks from line to line and knows which entry must come next."""
+
+    def __init__(self, content: bytes) -> None:
+        self.lines = lines_of(content)
+        self.found = [decode(line) for line in self.lines]
+        self.numbers = Counter(one.number for one in self.found if one is not None)
+        self.flaws: list[AuditFlaw] = []
+        self.torn: list[int] = []
+        self.unfinished: list[int] = []
+        """Lines that are no entries, since the last one that is."""
+        self.number = 1
+        self.previous: str | None = FIRST
+        """Digest that the next entry must follow; None where the line before is broken and cannot say."""
+        self.place = 1
+        """Line of the entry before."""
+
+    def take(self, index: int, one: AuditEntry) -> None:
+        """The next line, which is an entry."""
+        self._settle(one)
+        place = index + 1
+        if not one.holds:
+            self._tell(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
+            self.number, self.previous, self.place = self.number + 1, None, place
+            return
+        if one.number < self.number:
+            twice = self.numbers[one.number] > 1
+            says = f"entry {one.number} {'is there more than once' if twice else 'stands after a later one'}"
+            self._tell(place, Flaw.ADDED if twice else Flaw.MOVED, says)
+            return
+        if one.number > self.number:
+            self._jumped(place, one.number)
+        elif self.previous is not None and one.previous != self.previous:
+            says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
+            self._tell(self.place, Flaw.EDITED, says)
+        self.number, self.previous, self.place = one.number + 1, one.sha256, place
+
+    def end(self) -> None:
+        """After the last line."""
+        self._settle(None)
+
+    def _settle(self, follower: AuditEntry | None) -> None:
+        """Lines that are no entries: left by a killed writer, or made so by somebody."""
+        fragments = [self.lines[index] for index in self.unfinished]
+        told = follower is not None and follower.action is AuditAction.TORN_LINE
+        if follower is not None and told and follower.details != torn_details(fragments):
+            says = f"entry {follower.number} tells of an unfinished line that is not there as it was"
+            self._tell(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
+        elif told or (follower is None and all(map(is_fragment, fragments))):
+            self.torn += [index + 1 for index in self.unfinished]
+        else:
+            for index in self.unfinished:
+                self._tell(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
+            if fragments:
+                self.number, self.previous = self.number + len(fragments), None
+        self.unfinished = []
+
+    def _jumped(self, place: int, number: int) -> None:
+        missing = range(self.number, number)
+        gone = [each for each in missing if each not in self.numbers]
+        if gone:
+            which = f"entry {gone[0]} is" if len(gone) == 1 else f"entries {gone[0]} to {gone[-1]} are"
+            self._tell(place, Flaw.REMOVED, f"{which} missing before entry {number}")
+        else:
+            self._tell(place, Flaw.MOVED, f"entry {number} stands before entry {missing[0]}")
+
+    def _tell(self, line: int, flaw: Flaw, says: str) -> None:
+        self.flaws.append(AuditFlaw(line, flaw, says))
+
+
+def _open_writes(entries: tuple[AuditEntry, ...], digest_now: Callable[[str], str | None]) -> tuple[OpenWrite, ...]:
+    # Anybody can write a chain that holds: what is no number names no entry.
+    ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
+    return tuple(
+        OpenWrite(one, _content_after(one, entries[place + 1 :], digest_now))
+        for place, one in enumerate(entries)
+        if one.action in _BEGUN and one.number not in ended
+    )
+
+
+def _content_after(begun: AuditEntry, later: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Content:
+    following = (one for one in later if one.action in _BEGUN and one.subject == begun.subject)
+    witness = next(following, None)
+    # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
+    found = digest_now(begun.subject) if witness is None else _digest_before(witness)
+    before, after = _digest_before(begun), begun.details.get("sha256_after")
+    if found is None or before is None or not isinstance(after, str):
+        return Content.UNKNOWN
+    return {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER)
+
+
+def _digest_before(begun: AuditEntry) -> str | None:
+    """Of the file when the write began, or that there was none; None where the entry does not tell."""
+    told = begun.details.get("sha256_before", 0)
+    return GONE if told is None else told if isinstance(told, str) else None

@@ -1,0 +1,271 @@
+"""What the history knows: calibrations, what was done with them, and changes that somebody has explained."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import Enum
+from itertools import islice
+from typing import Any
+
+from daq.errors import DaqError
+from daq.workflow.calibration_file import decode
+from ident.calibration import Calibration, Gain, Source
+
+
+class Deed(Enum):
+    """What was done to a controller."""
+
+    APPLIED = "applied"
+    ROLLED_BACK = "rolled back"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A write to a controller.
+
+    Attributes:
+        digest: of the calibration whose gains the controller had afterwards; None where that is not known: a
+            rollback to gains that are in no calibration.
+        deed: what was done.
+        at: when, UTC.
+        who: the person or the job.
+        target: the controller's file.
+        audit: SHA-256 of the entry in the audit that tells of it, None where none was given.
+        sha256_after: of what the target held afterwards, None where none was given.
+    """
+
+    digest: str | None
+    deed: Deed
+    at: datetime
+    who: str
+    target: str
+    audit: str | None = None
+    sha256_after: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One calibration.
+
+    Attributes:
+        digest: SHA-256 of its file.
+        created: when it was fitted, UTC; when it was entered where its own time cannot be read.
+        recorded: when the newest log of its fit was recorded, UTC; as `created` where no log tells.
+        logs: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings.
+        entered: when it was entered, UTC.
+        cell: name of the cell.
+        configuration_sha256: of the cell configuration that its logs carry.
+        method: of the fit.
+        software: that made it.
+        error_percent, holdout_percent: relative error of the fit, and on held-out data [%]; None where there was none.
+        rows: of the observation.
+        gains: one an axis, in the order of the axes.
+        events: writes after which a controller had its gains, oldest first.
+    """
+
+    digest: str
+    created: datetime
+    recorded: datetime
+    logs: str
+    entered: datetime
+    cell: str
+    configuration_sha256: str
+    method: str
+    software: str
+    error_percent: float
+    holdout_percent: float | None
+    rows: int
+    gains: tuple[Gain, ...]
+    events: tuple[Event, ...]
+
+    @property
+    def applied(self) -> bool:
+        """Whether a controller ever had its gains."""
+        return bool(self.events)
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """A change that somebody has explained; a new baseline begins.
+
+    Attributes:
+        axis: whose gain changed.
+        since: calibrations from this time on make the new baseline, UTC.
+        at: when it was acknowledged, UTC.
+        who: the person.
+        why: what had happened.
+        audit: SHA-256 of the entry in the audit that tells of it.
+    """
+
+    axis: str
+    since: datetime
+    at: datetime
+    who: str
+    why: str
+    audit: str
+
+
+def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
+    """When the newest log of a fit was recorded, UTC; `otherwise` where none tells."""
+    told = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
+    try:
+        return datetime.fromtimestamp(max(seconds for seconds in told if seconds is not None), UTC)
+    except (ValueError, OverflowError, OSError):
+        return otherwise.astimezone(UTC)
+
+
+def logs_of(calibration: Calibration, digest: str) -> str:
+    """Digest of the logs of a fit, as a set; that of the calibration itself where it names none."""
+    logs = sorted({one.sha256 for one in _fitted(calibration)})
+    return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
+
+
+def _fitted(calibration: Calibration) -> list[Source]:
+    return [one for one in calibration.sources if one.role == "fit"]
+
+
+def utc(text: str, otherwise: datetime) -> datetime:
+    """A time in ISO 8601 as UTC, one without a zone taken for UTC; `otherwise` where the text is no time."""
+    try:
+        read = datetime.fromisoformat(text)
+        return (read.replace(tzinfo=UTC) if read.tzinfo is None else read).astimezone(UTC)
+    except (ValueError, OverflowError):
+        return otherwise.astimezone(UTC)
+
+
+def iso(at: datetime) -> str:
+    """As the store keeps times: UTC, of one length, so that their order is that of the text.
+
+    Raises:
+        ValueError: a time without its zone.
+    """
+    if at.tzinfo is None:
+        raise ValueError(f"expected a time with its zone, found {at}")
+    return at.astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def zoned(text: str) -> datetime:
+    """A time as it was written down.
+
+    Raises:
+        ValueError: it is none, or has no zone.
+    """
+    found = datetime.fromisoformat(text)
+    if found.tzinfo is None:
+        raise ValueError(f"{text!r} is a time without its zone")
+    return found
+
+
+# Whether the rows of a history are what drivegain wrote, as far as they tell of each other; no key guards them.
+
+
+COLUMNS = (
+    "created",
+    "recorded",
+    "logs",
+    "entered",
+    "cell",
+    "configuration_sha256",
+    "method",
+    "software",
+    "error_percent",
+    "holdout_percent",
+    "rows",
+)
+GAIN_COLUMNS = ("axis", "value", "std", "unit", "nameplate")
+
+
+def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
+    """What the row of a calibration says, besides digest and document."""
+    holdout, created = calibration.holdout_error_percent, utc(calibration.created, entered)
+    told = (
+        iso(created),
+        iso(recorded_at(calibration, created)),
+        logs_of(calibration, digest),
+        iso(entered),
+        calibration.cell,
+        calibration.configuration_sha256,
+        calibration.method,
+        calibration.software,
+        calibration.relative_error_percent.total,
+        None if holdout is None else holdout.total,
+        calibration.rows,
+    )
+    return dict(zip(COLUMNS, told, strict=True))
+
+
+def gain_columns_of(calibration: Calibration) -> list[dict[str, object]]:
+    """What the rows of its gains say, in the order of the axes."""
+    return [{name: getattr(gain, name) for name in GAIN_COLUMNS} for gain in calibration.gains]
+
+
+def calibration_flaws(calibrations: Sequence[tuple[Any, ...]], gains: Sequence[tuple[Any, ...]]) -> Iterator[str]:
+    """Rows of calibrations that are not what their own document says, as sentences.
+
+    Args:
+        calibrations: digest, document, and `COLUMNS` of each.
+        gains: digest of the calibration, and `GAIN_COLUMNS` of each.
+
+    Raises:
+        ValueError: a time is none.
+    """
+    rows_of: dict[str, list[tuple[Any, ...]]] = {}
+    for digest, *gain in gains:
+        rows_of.setdefault(digest, []).append(tuple(gain))
+    for digest, document, *columns in calibrations:
+        name = f"calibration {digest[:12]}…"
+        stands = dict(zip(COLUMNS, columns, strict=True))
+        entered = zoned(stands["entered"])
+        try:
+            calibration = decode(document.encode(), f"document of {name}")
+        except DaqError as error:
+            yield f"{name}: its document is {error.found}, expected {error.expected}"
+            continue
+        yield from _differences(f"row of {name}", stands, columns_of(calibration, digest, entered))
+        expected = gain_columns_of(calibration)
+        rows = [dict(zip(GAIN_COLUMNS, row, strict=True)) for row in rows_of.get(digest, [])]
+        axes, wanted = ([row["axis"] for row in some] for some in (rows, expected))
+        if axes != wanted:
+            yield f"gains of {name}: found {_listed(axes)}, expected {_listed(wanted)} as its document says"
+            continue
+        for row, told in zip(rows, expected, strict=True):
+            yield from _differences(f"gain of {row['axis']} in {name}", row, told)
+
+
+def gap_flaws(table: str, there: set[int], last: int) -> Iterator[str]:
+    """Rows that are missing: they are numbered from 1 without gaps, and none is ever taken away.
+
+    Args:
+        table: its name.
+        there: numbers of its rows.
+        last: number that was given last.
+    """
+    missing = list(islice((number for number in range(1, last + 1) if number not in there), 5))
+    if missing:
+        yield f"{table} {_listed(missing)}: found no such row, expected all from 1 to {last}"
+
+
+def early_flaws(acknowledgements: Iterable[Acknowledgement]) -> Iterator[str]:
+    """Acknowledgements that would silence an axis beforehand."""
+    for noted in acknowledgements:
+        if noted.since > noted.at:
+            yield (
+                f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}, "
+                "expected one that does not begin later than the acknowledgement itself"
+            )
+
+
+def _differences(name: str, stands: dict[str, Any], expected: dict[str, Any]) -> Iterator[str]:
+    for column, told in expected.items():
+        # SQLite has no NaN: it keeps NULL.
+        wanted = None if isinstance(told, float) and math.isnan(told) else told
+        if stands[column] != wanted:
+            yield f"{name}: found {column} {stands[column]!r}, expected {wanted!r} as its document says"
+
+
+def _listed(names: Iterable[object]) -> str:
+    return ", ".join(map(str, names)) or "none"

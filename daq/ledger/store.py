@@ -1,0 +1,406 @@
+"""The history of a cell in one SQLite file: every calibration, which were applied, which changes were explained.
+
+With SQLite's rollback journal, not its write-ahead log: one file that can be copied, that opens on a medium that cannot
+be written, and on network folders. A writer that is killed leaves a journal, and whoever opens the file next takes the
+unfinished transaction back. Why SQLite at all: docs/decisions/0024.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+from collections.abc import Iterator
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+from urllib.parse import quote
+
+from daq.errors import HistoryMixed, HistoryUnreadable, OutputFailed
+from daq.ledger import schema
+from daq.ledger.entry import (
+    COLUMNS,
+    GAIN_COLUMNS,
+    Acknowledgement,
+    Deed,
+    Entry,
+    Event,
+    calibration_flaws,
+    columns_of,
+    early_flaws,
+    gain_columns_of,
+    gap_flaws,
+    iso,
+    zoned,
+)
+from daq.workflow.calibration_file import encode
+from ident.calibration import Calibration, Gain
+
+# An SQLite file that is opened, written and complained about in one way.
+
+
+BUSY_S = 20.0
+"""How long to wait for another process' transaction: each is a few rows."""
+
+_NOT_WRITABLE = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN")
+
+
+class Access(Enum):
+    """What is wanted of the file; the value is SQLite's `mode` of a URI."""
+
+    READ = "rw"
+    """Of a file that is there; SQLite opens for reading only what it may not write. Not "ro": that could not take back
+    what a killed writer left unfinished."""
+    WRITE = "rwc"
+
+
+def connect(path: Path, access: Access) -> sqlite3.Connection:
+    """Open the file, and look at whether it is a history.
+
+    Raises:
+        HistoryUnreadable: it is none, of another version, broken, or locked for long.
+        OutputFailed: there is none, and none can be made.
+    """
+    with telling(path, access):
+        address = f"file:{quote(os.fsencode(path.absolute()))}?mode={access.value}"
+        connection = sqlite3.connect(address, uri=True, timeout=BUSY_S, isolation_level=None)
+        try:
+            connection.execute("PRAGMA foreign_keys = ON")
+            connection.execute("PRAGMA trusted_schema = OFF")
+            # EXTRA: a power cut behind the commit does not bring the journal, and the old content, back.
+            connection.execute("PRAGMA synchronous = EXTRA")
+            if not schema.is_empty(connection):
+                schema.check(connection, path)
+        except BaseException:
+            connection.close()
+            raise
+    return connection
+
+
+@contextlib.contextmanager
+def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
+    """All that is written within is in the file, or nothing; the tables are made where there are none yet.
+
+    Raises:
+        HistoryUnreadable, OutputFailed: see `connect`.
+    """
+    with telling(path, Access.WRITE):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            if schema.is_empty(connection):
+                schema.create(connection)
+            yield
+            connection.execute("COMMIT")
+        except BaseException:
+            with contextlib.suppress(sqlite3.Error):
+                connection.execute("ROLLBACK")
+            raise
+
+
+@contextlib.contextmanager
+def telling(path: Path, access: Access) -> Iterator[None]:
+    """What SQLite raises, in our words.
+
+    Raises:
+        HistoryUnreadable: broken, no SQLite file, locked for long, or not readable.
+        OutputFailed: the disk is full, or the file or its folder cannot be written.
+    """
+    try:
+        yield
+    except ValueError as error:
+        if access is Access.WRITE:
+            raise
+        raise _broken(path, f"a row that drivegain did not write: {error}") from error
+    except sqlite3.Error as error:
+        name = getattr(error, "sqlite_errorname", "") or type(error).__name__
+        if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+            raise HistoryUnreadable(
+                str(path),
+                found=f"another program that keeps it locked for more than {BUSY_S:g} s",
+                expected="a lock for as long as a row takes",
+                remedy="see who has it open (`fuser`), and try again",
+            ) from error
+        if name.startswith(_NOT_WRITABLE) and access is Access.WRITE:
+            raise OutputFailed(
+                str(path),
+                found=f"{error} ({name})",
+                expected="a file in a folder that can be written, with room",
+                remedy="nothing was entered; free space or rights",
+            ) from error
+        raise _broken(path, f"{error} ({name})") from error
+
+
+def _broken(path: Path, found: str) -> HistoryUnreadable:
+    return HistoryUnreadable(
+        str(path),
+        found=found,
+        expected="the history that drivegain keeps of a cell",
+        remedy="check its rights; if it is broken keep a copy, restore the last good one from a backup, or enter "
+        "the calibrations anew in another file (`drivegain history CELL --add CALIBRATION`)",
+    )
+
+
+class HistoryStore:
+    """The history's file; use as a context manager. Without a file it is empty, and the first `add` makes it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._connection: sqlite3.Connection | None = None
+
+    def __enter__(self) -> HistoryStore:
+        """Open it.
+
+        Raises:
+            HistoryUnreadable: it is no history, of another version, broken, or locked for long.
+        """
+        if self.path.exists():
+            self._connection = connect(self.path, Access.READ)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
+        """Enter a calibration.
+
+        Args:
+            calibration: of this cell.
+            digest: SHA-256 of its file.
+            at: now, with its zone.
+
+        Returns:
+            whether it is new: the same file is entered once.
+
+        Raises:
+            HistoryMixed: another cell, other axes, or a gain in another unit than the history's.
+            HistoryUnreadable: see `__enter__`.
+            OutputFailed: the file cannot be written.
+        """
+        with self._writing() as connection:
+            if connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
+                return False
+            self._check_like(calibration)
+            connection.execute(
+                f"INSERT INTO calibration (digest, {', '.join(COLUMNS)}, document)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (digest, *columns_of(calibration, digest, at).values(), encode(calibration).decode()),
+            )
+            connection.executemany(
+                "INSERT INTO gain (digest, place, axis, value, std, unit, nameplate) VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [(digest, place, *gain.values()) for place, gain in enumerate(gain_columns_of(calibration))],
+            )
+        return True
+
+    def applied(
+        self,
+        digest: str,
+        *,
+        at: datetime,
+        who: str,
+        target: str,
+        audit: str | None = None,
+        sha256_after: str | None = None,
+    ) -> None:
+        """A calibration's gains were written.
+
+        Args:
+            digest: of the calibration, which was entered before.
+            at: when, with its zone.
+            who: the person or the job.
+            target: the controller's file, as the audit names it.
+            audit: SHA-256 of the entry in the audit that tells of it; `drivegain history --verify` looks for it there,
+                and so notices an audit whose end was cut off.
+            sha256_after: of what the target holds now, by which a rollback to it is recognised.
+
+        Raises:
+            ValueError: the calibration was never entered, or the time has no zone.
+            HistoryUnreadable, OutputFailed: as `add`.
+        """
+        with self._writing() as connection:
+            if not connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
+                raise ValueError(f"calibration {digest[:12]}… is not in the history")
+            self._note(connection, Event(digest, Deed.APPLIED, at, who, target, audit, sha256_after))
+
+    def rolled_back(
+        self, *, at: datetime, who: str, target: str, sha256_after: str, audit: str | None = None
+    ) -> str | None:
+        """A write to `target` was taken back: it holds again what it held before.
+
+        Args:
+            at, who, target, audit: as in `applied`.
+            sha256_after: of what the target holds now. What was written with a calibration is recognised by it; what a
+                person has entered in between is in no calibration.
+
+        Returns:
+            digest of the calibration whose gains these are, None where the history does not know.
+        """
+        with self._writing() as connection:
+            same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
+            digest = same[-1].digest if same else None
+            self._note(connection, Event(digest, Deed.ROLLED_BACK, at, who, target, audit, sha256_after))
+        return digest
+
+    def acknowledge(self, noted: Acknowledgement) -> None:
+        """A change of one gain is explained. Raises as `applied`."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT INTO acknowledgement (axis, since, at, who, why, audit) VALUES (?, ?, ?, ?, ?, ?)",
+                (noted.axis, iso(noted.since), iso(noted.at), noted.who, noted.why, noted.audit),
+            )
+
+    def entries(self) -> tuple[Entry, ...]:
+        """All calibrations, oldest first by when they were fitted."""
+        events = self.events()
+        rows = self._rows(
+            "SELECT digest, created, recorded, logs, entered, cell, configuration_sha256, method, software,"
+            " error_percent, holdout_percent, rows FROM calibration ORDER BY created, entered, digest"
+        )
+        gains: dict[str, list[Gain]] = {}
+        for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
+            gains.setdefault(digest, []).append(Gain(*gain))
+        with telling(self.path, Access.READ):
+            return tuple(_entry(row, gains.get(row[0], []), events) for row in rows)
+
+    def events(self) -> tuple[Event, ...]:
+        """All writes to controllers, oldest first."""
+        rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
+        with telling(self.path, Access.READ):
+            return tuple(Event(row[0], Deed(row[1]), zoned(row[2]), *row[3:]) for row in rows)
+
+    def acknowledgements(self) -> tuple[Acknowledgement, ...]:
+        """All of them, oldest first."""
+        rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
+        with telling(self.path, Access.READ):
+            return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
+
+    def audited(self) -> frozenset[str]:
+        """SHA-256 of all entries that the audit must have."""
+        noted = {event.audit for event in self.events()} | {noted.audit for noted in self.acknowledgements()}
+        return frozenset(sha256 for sha256 in noted if sha256 is not None)
+
+    def in_force(self, target: str | None = None) -> str | None:
+        """Digest of the calibration whose gains a controller has as far as the history knows; None where it does not.
+
+        Args:
+            target: the controller's file; None for whichever was written last.
+        """
+        events = [event for event in self.events() if target in {None, event.target}]
+        return events[-1].digest if events else None
+
+    def document(self, digest: str) -> bytes | None:
+        """The calibration file of this digest, None where it was never entered."""
+        rows = self._rows("SELECT document FROM calibration WHERE digest = ?", (digest,))
+        return str(rows[0][0]).encode() if rows else None
+
+    def integrity(self) -> tuple[str, ...]:
+        """What is broken in the file, by itself: what SQLite finds, and rows that contradict each other.
+
+        No key guards the rows: whoever changes all that belongs together is not found.
+
+        Returns:
+            sentences, each with what stands there and what was expected; nothing where all is well.
+        """
+        found = [str(row[0]) for row in self._rows("PRAGMA integrity_check")]
+        found += [f"row of {row[0]} without its {row[2]}" for row in self._rows("PRAGMA foreign_key_check")]
+        found = [text for text in found if text != "ok"]
+        if found:  # what a broken file says of itself is no more to be asked
+            return tuple(found)
+        calibrations = self._rows(
+            f"SELECT digest, document, {', '.join(COLUMNS)} FROM calibration ORDER BY created, digest"
+        )
+        gains = self._rows(f"SELECT digest, {', '.join(GAIN_COLUMNS)} FROM gain ORDER BY digest, place")
+        with telling(self.path, Access.READ):
+            return (
+                *calibration_flaws(calibrations, gains),
+                *(flaw for table in ("event", "acknowledgement") for flaw in gap_flaws(table, *self._numbers(table))),
+                *early_flaws(self.acknowledgements()),
+            )
+
+    def _numbers(self, table: str) -> tuple[set[int], int]:
+        """Of the rows that are there, and the last one that SQLite gave."""
+        there = {int(row[0]) for row in self._rows(f"SELECT number FROM {table}")}
+        given = self._rows("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,))
+        return there, max([*there, *(int(row[0]) for row in given), 0])
+
+    def _check_like(self, calibration: Calibration) -> None:
+        entries = self.entries()
+        if not entries:
+            return
+        known = entries[-1]
+        mine, theirs = ({g.axis: g.unit for g in gains} for gains in (calibration.gains, known.gains))
+        other = [axis for axis in mine if axis in theirs and mine[axis] != theirs[axis]]
+        if calibration.cell != known.cell:
+            found, expected = (
+                f"a calibration of cell {calibration.cell!r}",
+                f"of {known.cell!r}, as all in this history",
+            )
+        elif mine.keys() != theirs.keys():
+            found, expected = f"gains of {', '.join(mine)}", f"of {', '.join(theirs)}"
+        elif other:
+            axis = other[0]
+            found, expected = f"the gain of {axis} in {mine[axis]}", f"{theirs[axis]}, as in the calibrations before"
+        else:
+            return
+        raise HistoryMixed(
+            str(self.path),
+            found=found,
+            expected=expected,
+            remedy="gains are compared over time only where they mean the same: begin another history "
+            "(`history.store` of the cell file); nothing was entered",
+        )
+
+    def _note(self, connection: sqlite3.Connection, event: Event) -> None:
+        connection.execute(
+            "INSERT INTO event (digest, deed, at, who, target, audit, sha256_after) VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (
+                event.digest,
+                event.deed.value,
+                iso(event.at),
+                event.who,
+                event.target,
+                event.audit,
+                event.sha256_after,
+            ),
+        )
+
+    def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
+        if self._connection is None:
+            return []
+        with telling(self.path, Access.READ):
+            if schema.is_empty(self._connection):
+                return []
+            return self._connection.execute(query, values).fetchall()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        if self._connection is None:
+            self._connection = connect(self.path, Access.WRITE)
+        with transaction(self._connection, self.path):
+            yield self._connection
+
+
+def _entry(row: tuple[Any, ...], gains: list[Gain], events: tuple[Event, ...]) -> Entry:
+    digest, created, recorded, logs, entered, cell, configuration, method, software, error, holdout, rows = row
+    return Entry(
+        digest=digest,
+        created=zoned(created),
+        recorded=zoned(recorded),
+        logs=logs,
+        entered=zoned(entered),
+        cell=cell,
+        configuration_sha256=configuration,
+        method=method,
+        software=software,
+        error_percent=error,
+        holdout_percent=holdout,
+        rows=rows,
+        gains=tuple(gains),
+        events=tuple(event for event in events if event.digest == digest),
+    )

@@ -1,0 +1,288 @@
+"""The gains of a history as series, each with its chart: what changed, and whether that is more than noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import pairwise
+
+import numpy as np
+
+from daq.ledger.entry import Acknowledgement, Entry
+from ident.calibration import Gain
+from ident.drift.change import Change, Pattern, change_significance, dispersions, pattern
+from ident.drift.chart import CHART, Alarm, AlarmKind, Chart, Drift, cusum
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One gain of one calibration.
+
+    Attributes:
+        entry: the calibration.
+        gain: identified, with σ.
+        change: from the one before; None for the first.
+    """
+
+    entry: Entry
+    gain: Gain
+    change: Change | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Calibrations with one baseline.
+
+    Attributes:
+        began: index of the first of them in the points of its series.
+        drift: what became of the gain within.
+    """
+
+    began: int
+    drift: Drift
+
+    @property
+    def ended(self) -> int:
+        """Index behind the last of them."""
+        return self.began + len(self.drift.deviations)
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One gain over time.
+
+    Attributes:
+        axis, unit: of the gain.
+        dispersion: how much more repeated calibrations scatter than σ says; it is in every σ that is told here.
+        points: oldest recording first, one for the same logs; calibrations that held the gain fixed are left out, they
+            know nothing of it.
+        stretches: between changes that were explained, oldest first.
+        watching: whether the last of them goes on; not where no calibration came since the last explanation.
+        acknowledged: changes that were explained, oldest first.
+    """
+
+    axis: str
+    unit: str
+    dispersion: float
+    points: tuple[Point, ...]
+    stretches: tuple[Stretch, ...]
+    watching: bool
+    acknowledged: tuple[Acknowledgement, ...]
+
+    @property
+    def began(self) -> int:
+        """Index of the first point of the present baseline; as many as there are points where none came since."""
+        return self.stretches[-1].began if self.watching else len(self.points)
+
+    @property
+    def drift(self) -> Drift | None:
+        """From the present baseline on; None without points since."""
+        return self.stretches[-1].drift if self.watching else None
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether the newest calibration raises an alarm."""
+        return self.drift is not None and self.drift.alarmed
+
+    @property
+    def onset(self) -> datetime | None:
+        """When the last calibration before the change was recorded; None where the newest one raises no alarm."""
+        if self.drift is None or self.drift.onset is None:
+            return None
+        return self.points[self.began + self.drift.onset].entry.recorded
+
+    def stretch_at(self, index: int) -> Stretch:
+        """The stretch that a point is in, by its index in `points`."""
+        return next(stretch for stretch in self.stretches if stretch.began <= index < stretch.ended)
+
+    def alarm_at(self, index: int) -> Alarm | None:
+        """The alarm of a point, by its index in `points`."""
+        stretch = self.stretch_at(index)
+        return next((alarm for alarm in stretch.drift.alarms if stretch.began + alarm.index == index), None)
+
+
+def watch(
+    entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement], chart: Chart = CHART
+) -> tuple[Series, ...]:
+    """One series an axis, in the order of the axes.
+
+    Args:
+        entries: of one cell, with gains of the same axes and units.
+        acknowledgements: oldest first.
+        chart: limits.
+    """
+    if not entries:
+        return ()
+    axes = {gain.axis: gain.unit for gain in entries[-1].gains}
+    factors = dispersions_of(entries, tuple(axes))
+    return tuple(
+        _series(
+            axis,
+            unit,
+            _known(entries, axis),
+            factors[axis],
+            [noted for noted in acknowledgements if noted.axis == axis],
+            chart,
+        )
+        for axis, unit in axes.items()
+    )
+
+
+def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, float]:
+    """How much more a cell's calibrations scatter than their σ says, by axis, in the order of `axes`.
+
+    Of the calibrations that identified an axis, one for the same logs (`of_each_recording`). Axes that the same
+    recordings identified are told together (`ident.drift.change.dispersions`), also where a gain of one of them was
+    held fixed when these were fitted again; an axis that was identified from others is told by itself.
+
+    Args:
+        entries: of one cell.
+        axes: names; without an entry that identified it, an axis has what is said before there is a history.
+
+    Returns:
+        at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
+    """
+    alike: dict[tuple[str, ...], dict[str, list[Gain]]] = {}
+    for axis in axes:
+        known = _known(entries, axis)
+        alike.setdefault(tuple(entry.logs for entry, _ in known), {})[axis] = [gain for _, gain in known]
+    factors: dict[str, float] = {}
+    for together in alike.values():
+        values, stds = (
+            np.array([[getattr(gain, part) for gain in gains] for gains in together.values()])
+            for part in ("value", "std")
+        )
+        factors |= zip(together, map(float, dispersions(values, stds)), strict=True)
+    return {axis: factors[axis] for axis in axes}
+
+
+def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
+    """Calibrations that identified the gain of an axis, with it."""
+    known = {
+        entry.digest: gain
+        for entry in entries
+        for gain in entry.gains
+        if gain.axis == axis and gain.std > 0 and gain.value
+    }
+    identified = [entry for entry in entries if entry.digest in known]
+    return [(entry, known[entry.digest]) for entry in of_each_recording(identified)]
+
+
+def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
+    """One calibration for the same logs, in the order in which the logs were recorded.
+
+    What is watched is the robot: the same logs fitted again tell nothing new of it, and logs of last year tell of last
+    year, whenever they were fitted. Of several fits the newest counts that was applied, else the newest.
+
+    Args:
+        entries: of one cell.
+    """
+    chosen: dict[str, Entry] = {}
+    for entry in sorted(entries, key=lambda one: (one.applied, one.created, one.entered)):
+        chosen[entry.logs] = entry
+    return tuple(sorted(chosen.values(), key=lambda one: (one.recorded, one.created, one.entered)))
+
+
+def _series(
+    axis: str,
+    unit: str,
+    known: list[tuple[Entry, Gain]],
+    dispersion: float,
+    acknowledged: list[Acknowledgement],
+    chart: Chart,
+) -> Series:
+    starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
+    bounds = sorted({0, *starts, len(known)})
+    stretches = []
+    for began, ended in pairwise(bounds):
+        gains = [gain for _, gain in known[began:ended]]
+        stretches.append(
+            Stretch(began, cusum([g.value for g in gains], [g.std for g in gains], dispersion=dispersion, chart=chart))
+        )
+    points = []
+    for index, (entry, gain) in enumerate(known):
+        before = known[index - 1][1] if index else None
+        points.append(Point(entry, gain, None if before is None else _change(before, gain, dispersion)))
+    watching = bool(stretches) and len(known) not in starts
+    return Series(axis, unit, dispersion, tuple(points), tuple(stretches), watching, tuple(acknowledged))
+
+
+def _change(before: Gain, after: Gain, dispersion: float) -> Change:
+    return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
+
+
+# Alarms as sentences for a technician: what changed, since when, how sure, and what it may be.
+#
+# Questions, not verdicts: a gain tells that the torque for a current is another one, not why.
+
+
+_LESS = (
+    "less torque for the same current: magnets warmer than usual or demagnetised, a gear that turns harder under load, "
+    "or an amplifier that was exchanged or scales its current otherwise? Worn teeth alone do not change a ratio; they "
+    "show as backlash and friction (`drivegain residual`)"
+)
+_MORE = (
+    "more torque for the same current: magnets colder than usual, a gear that was greased or has run in, or an "
+    "amplifier that was exchanged or scales its current otherwise? Magnets do not grow stronger"
+)
+_ALL_LESS = (
+    "all gains fell by the same factor, as motors seldom do: is the payload heavier than the mass that was entered, or "
+    "was the scale of the currents changed (RMS or peak, rated current)?"
+)
+_ALL_MORE = (
+    "all gains rose by the same factor, as motors seldom do: is the payload lighter than the mass that was entered, or "
+    "was the scale of the currents changed (RMS or peak, rated current)?"
+)
+_SEVERAL = (
+    "several axes, each by an amount of its own: another temperature of the cell, a payload that was mounted "
+    "otherwise, or amplifiers that were exchanged?"
+)
+
+
+def alarm_words(series: Series) -> str | None:
+    """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
+    drift, onset = series.drift, series.onset
+    if drift is None or drift.alarm is None or onset is None:
+        return None
+    rose, since = drift.change_percent > 0, f"since {onset:%Y-%m-%d}"
+    percent, sigmas = f"{abs(drift.change_percent):.1f} %", f"{abs(drift.change_sigmas):.1f} σ"
+    moved = "rose" if rose else "fell"
+    match drift.alarm.kind:
+        case AlarmKind.DRIFT:
+            told = f"{moved} {percent} {since}"
+        case AlarmKind.JUMP:
+            told = f"{moved} {percent} at once, {since}"
+        case AlarmKind.TREND:
+            told = f"{'rises' if rose else 'falls'} steadily {since}, {percent} until now"
+    return f"gain of {series.axis} {told}, {sigmas}"
+
+
+def pattern_of(all_series: Sequence[Series]) -> Pattern:
+    """What the changes of all axes look like together; axes without a calibration since their baseline say nothing."""
+    known = [(s, s.drift) for s in all_series if s.drift is not None and s.drift.change_sigmas != 0]
+    changes = [drift.change_percent for _, drift in known]
+    stds = [drift.change_percent / drift.change_sigmas for _, drift in known]
+    return pattern(changes, stds, [series.alarmed for series, _ in known])
+
+
+def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
+    """What the alarms may come from; nothing where there are none."""
+    alarmed = [s.drift for s in all_series if s.alarmed and s.drift is not None]
+    rose = [drift.change_percent > 0 for drift in alarmed]
+    match pattern_of(all_series):
+        case Pattern.NONE:
+            return ()
+        case Pattern.COMMON:
+            found = [_ALL_MORE if rose[0] else _ALL_LESS]
+        case Pattern.ONE:
+            found = [_MORE if rose[0] else _LESS]
+        case Pattern.SEVERAL:
+            found = [_SEVERAL]
+    changed = len({entry for s in all_series for entry in _configurations(s)}) > 1
+    return (*found, *(["the cell's configuration changed in this time: what was changed?"] if changed else []))
+
+
+def _configurations(series: Series) -> tuple[str, ...]:
+    """Digests of the cell configuration from the baseline on."""
+    return tuple(point.entry.configuration_sha256 for point in series.points[series.began :])

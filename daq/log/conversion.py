@@ -1,0 +1,318 @@
+"""From raw counts to SI, as late as possible: a log and the cell that it carries become a `Run`."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from math import pi
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.config.cell import DEGREE, Cell
+from daq.config.cell_file import cell_from_bundle
+from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
+from daq.log.message import Readback
+from daq.log.reader import Log, LossyLogs, SampleBlock, read_log, tells_losses_alone
+from drivers.stream.sample import CellEvent, EventKind
+from ident.data.run import Recording, Run
+from ident.model.bodies import Payload
+
+_LOG = logging.getLogger("drivegain")
+FloatArray = NDArray[np.float64]
+LIMIT_MARGIN = 0.05
+"""Share of a joint's range by which positions may leave its limits."""
+LARGEST_SATURATED = 0.1
+"""Share of the samples of an axis in which a limit may act; they are masked."""
+STEP_TOLERANCE = 0.5
+"""Share of a period by which one time stamp may be nearer to, or further from, the one before.
+
+Half a period is the least that cannot be told from another cycle."""
+RATE_TOLERANCE = 0.01
+"""Relative difference between the rate asked for and the one that the time stamps show."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scaling:
+    """From raw numbers to SI.
+
+    Attributes:
+        rad_per_count: motor angle of a count [rad], shape (n,).
+        to_joint: R⁻¹, shape (n, n).
+        offset_rad: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,).
+        current_per_unit: unit of the current reference (A) for each raw unit, shape (n,).
+    """
+
+    rad_per_count: FloatArray
+    to_joint: FloatArray
+    offset_rad: FloatArray
+    current_per_unit: FloatArray
+
+    def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
+        """Joint positions [rad, or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)."""
+        motor_rad = counts * self.rad_per_count
+        return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
+
+    def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
+        """The same for one sample, for /joint_states."""
+        return [float(value) for value in self.joint_position(np.array(counts, dtype=np.int64))]
+
+
+def scaling(cell: Cell, readback: Readback) -> Scaling:
+    """The scaling of a cell whose amplifiers answered so.
+
+    Raises:
+        LogIncomplete: cell and readback differ in their axes, or neither tells what a count is.
+    """
+    names = tuple(axis.name for axis in readback.axes)
+    if names != cell.axis_names:
+        raise LogIncomplete(
+            f"cell {cell.name!r}",
+            found=f"a readback of {', '.join(names)}",
+            expected=f"one of {', '.join(cell.axis_names)}",
+            remedy="the log and the cell configuration do not belong together",
+        )
+    angles = []
+    for axis, answer in zip(cell.axes, readback.axes, strict=True):
+        if answer.position_rad_per_count is not None:
+            angles.append(answer.position_rad_per_count)
+        elif axis.counts_per_revolution is not None:
+            angles.append(2.0 * pi / axis.counts_per_revolution)
+        else:
+            raise LogIncomplete(
+                f"cell {cell.name!r}, axis {axis.name}",
+                found="no counts_per_revolution",
+                expected="it in the cell configuration, or a count in the log's readback",
+                remedy="add it to the cell file and record or import again",
+            )
+    return Scaling(
+        rad_per_count=np.array(angles),
+        to_joint=np.asarray(np.linalg.inv(cell.ratio), dtype=np.float64),
+        offset_rad=np.array([axis.zero_offset_rad for axis in cell.axes]),
+        current_per_unit=np.array([answer.current_per_unit for answer in readback.axes]),
+    )
+
+
+def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+    """Read a log as a run, with the cell that it carries, or with another description of it.
+
+    Warns of what was saved of an unfinished recording, of losses that were accepted, and of a first run at less than
+    the plan's speed.
+
+    Raises:
+        DataError: the log cannot be read, or its samples cannot be used.
+        ConfigurationError: the cell in the log is inconsistent.
+    """
+    log = read_log(path)
+    if log.partial:
+        _LOG.warning(
+            "%s is PARTIAL: saved from a recording that was never finished; nothing of it is written back", path
+        )
+    if (speed := log.head.run.speed) < 1.0:
+        _LOG.warning(
+            "%s was recorded at %g %% of the plan's speed: a first run tells less of gains and inertias than planned",
+            path,
+            100.0 * speed,
+        )
+    known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
+    run = run_from_log(log, known, lossy)
+    if cell is not None and run.payload is not None:
+        run = replace(run, payload=_weighed_again(run.payload, cell))
+    return run, known
+
+
+def _weighed_again(payload: Payload, cell: Cell) -> Payload:
+    """A payload as another description of the cell has it: who names another cell corrects what the log carries."""
+    for weighed in cell.payloads:
+        if (weighed.name, weighed.mounting) == (payload.name, payload.mounting) and "m" in payload.known:
+            return replace(payload, known={**payload.known, "m": weighed.mass_kg})
+    return payload
+
+
+def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
+    """Convert a log to SI.
+
+    Raises:
+        RunInvalid: its recorder marked it invalid.
+        CyclesLost: SYNC cycles are missing.
+        ClockImplausible: the time stamps show another rate, or one of them comes early or late.
+        CurrentSaturated: a limit acted in more than a tenth of an axis's samples.
+        PositionImplausible: positions far outside the joint limits.
+        LogIncomplete: cell and log do not belong together.
+    """
+    name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
+    told = tells_losses_alone(log.statistics.reason)
+    accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and told
+    if accepted:
+        _LOG.warning(
+            "%s has lost %s: its samples are left out, and nothing of it is written back",
+            log.path,
+            log.statistics.reason,
+        )
+    elif not log.statistics.valid:
+        raise RunInvalid(
+            str(log.path),
+            found=f"a run that its recorder marked invalid ({log.statistics.reason or 'no reason given'})",
+            expected="a valid run",
+            remedy="record it again" + ("; or, to look at it all the same, --accept-losses" if told else ""),
+        )
+    _check_cycles(log, rate_hz)
+    scale = scaling(cell, log.head.readback)
+    position_rad = scale.joint_position(_positions(log))
+    valid = _answered(samples) & ~_saturated(samples, cell)
+    _check_saturation(str(log.path), samples, cell)
+    check_limits(str(log.path), position_rad, cell, valid)
+    return Run(
+        name=name,
+        time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
+        position_rad=position_rad,
+        current_a=samples.current_raw * scale.current_per_unit,
+        payload=log.head.run.payload,
+        move=moves(log.events, samples.time_ns),
+        digest=log.digest,
+        valid=valid,
+        started_s=float(samples.time_ns[0]) * 1e-9,
+        partial=log.partial or accepted,
+        recording=_recording(log, cell),
+    )
+
+
+def _recording(log: Log, cell: Cell) -> Recording:
+    run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
+    return Recording(
+        # An import is told no time and writes that of 1970.
+        recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
+        entered_kg=run.entered_kg,
+        serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
+        saturated_percent=tuple(float(share) for share in 100.0 * _saturated(log.samples, cell).mean(axis=0)),
+        lost_cycles=log.statistics.lost_cycles,
+        missing=log.statistics.missing,
+        controller_sha256=run.controller_sha256,
+    )
+
+
+def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Number of the move that each sample belongs to, shape (k,); None where no move was written down.
+
+    A move lasts until the next one starts, so the standstill between two belongs to the first of them; what comes
+    before the first start belongs to the first move.
+    """
+    starts = sorted((event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START)
+    if not starts:
+        return None
+    begin_ns = np.array([start[0] for start in starts], dtype=np.int64)
+    number = np.array([start[1] for start in starts], dtype=np.int64)
+    return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
+
+
+def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray[np.bool_] | None = None) -> None:
+    """Refuse positions that no joint of this cell can have.
+
+    Args:
+        name: of the recording, for the message.
+        position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
+        cell: with the limits.
+        valid: samples that count, shape (k, n).
+
+    Raises:
+        PositionImplausible: a joint is outside its limits by more than 5 % of its range.
+    """
+    for index, axis in enumerate(cell.axes):
+        column = position_rad[:, index] if valid is None else position_rad[valid[:, index], index]
+        lower, upper = axis.limits.position
+        margin = LIMIT_MARGIN * (upper - lower)
+        if column.size and (column.min() < lower - margin or column.max() > upper + margin):
+            unit = axis.unit
+            confused = "degrees were taken for radians" if unit is DEGREE else "mm were taken for m"
+            raise PositionImplausible(
+                f"{name}, axis {axis.name}",
+                found=f"joint positions from {column.min() / unit.si:.5g} to {unit.spell(column.max())}",
+                expected=f"{lower / unit.si:.5g} to {unit.spell(upper)}, the limits in the cell configuration",
+                remedy=f"most likely {confused} (or counts for either); else check motor or joint side, ratio and zero "
+                "offset",
+            )
+
+
+def unwrapped(counts: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Positions of an encoder counter of 32 bits that may have run over, shape (k, n).
+
+    From sample to sample a jump of more than half the range is a wrap: no motor makes 2³¹ counts in one period. The
+    first sample is taken as it is.
+    """
+    # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
+    steps = np.diff(counts.astype(np.int32).view(np.uint32), axis=0).view(np.int32)
+    return np.concatenate((counts[:1].astype(np.int64), steps)).cumsum(axis=0, dtype=np.int64)
+
+
+def _positions(log: Log) -> NDArray[np.int64]:
+    """Motor counts, unwrapped where they are an encoder's and not numbers that an import has scaled, shape (k, n)."""
+    counts = log.samples.position_counts
+    counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
+    return np.where(counter, unwrapped(counts), counts)
+
+
+def _answered(samples: SampleBlock) -> NDArray[np.bool_]:
+    """Whether the axis answered the SYNC, shape (k, n)."""
+    bits = np.arange(samples.position_counts.shape[1], dtype=np.uint32)
+    return np.asarray((samples.missing[:, None] >> bits & 1) == 0, dtype=np.bool_)
+
+
+def _saturated(samples: SampleBlock, cell: Cell) -> NDArray[np.bool_]:
+    """Whether the amplifier says that a limit acts (6041h, bit of its profile), shape (k, n)."""
+    bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
+    masks = np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16)
+    return np.asarray((samples.statusword & masks) != 0, dtype=np.bool_)
+
+
+def _check_saturation(name: str, samples: SampleBlock, cell: Cell) -> None:
+    share = _saturated(samples, cell).mean(axis=0)
+    worst = int(np.argmax(share))
+    if share[worst] > LARGEST_SATURATED:
+        raise CurrentSaturated(
+            f"{name}, axis {cell.axes[worst].name}",
+            found=f"a limit acting in {100.0 * share[worst]:.1f} % of the samples",
+            expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
+            remedy="plan slower moves, or a smaller payload",
+        )
+
+
+def _check_cycles(log: Log, rate_hz: float) -> None:
+    cycle, time_ns = log.samples.cycle, log.samples.time_ns
+    if len(cycle) < 2:
+        raise CyclesLost(str(log.path), found="one sample", expected="a run", remedy="record it again")
+    steps = np.diff(cycle.astype(np.int64))
+    if np.any(steps != 1):
+        first = int(np.argmax(steps != 1))
+        raise CyclesLost(
+            str(log.path),
+            found=f"cycle {cycle[first + 1]} after {cycle[first]} ({np.count_nonzero(steps != 1)} gaps)",
+            expected="every SYNC cycle once",
+            remedy="record again with less load on the bus and the computer; lost cycles are never interpolated",
+        )
+    _check_steps(log, rate_hz)
+    duration_s = float(time_ns[-1] - time_ns[0]) * 1e-9
+    stamped_hz = (len(cycle) - 1) / duration_s if duration_s > 0.0 else 0.0
+    if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
+        raise ClockImplausible(
+            str(log.path),
+            found=f"time stamps at {stamped_hz:.6g} Hz",
+            expected=f"{rate_hz:.6g} Hz, as asked for",
+            remedy="was the computer's clock set during the run? record it again",
+        )
+
+
+def _check_steps(log: Log, rate_hz: float) -> None:
+    """Every SYNC in its time: central differences take the samples as evenly spaced."""
+    cycle, period_ns = log.samples.cycle, 1e9 / rate_hz
+    step_ns = np.diff(log.samples.time_ns)
+    off = np.abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns
+    if off.any():
+        first = int(np.argmax(off))
+        raise ClockImplausible(
+            str(log.path),
+            found=f"cycle {cycle[first + 1]} {step_ns[first] * 1e-6:.4g} ms after cycle {cycle[first]} "
+            f"({np.count_nonzero(off)} such steps)",
+            expected=f"{period_ns * 1e-6:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
+            remedy="SYNC came late: record again with less load on the computer, or with a longer sync.period_us",
+        )

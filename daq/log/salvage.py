@@ -1,0 +1,179 @@
+"""What can be saved of a recording that was never finished: a log of its own, labelled partial."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+from daq.config.cell_file import cell_from_bundle
+from daq.errors import LogIncomplete, LogUnreadable, UsageError
+from daq.log.container import UNFINISHED
+from daq.log.conversion import scaling
+from daq.log.metadata import RunStatistics
+from daq.log.reader import LogReader, SampleBlock
+from daq.log.writer import LogContent, LogWriter
+from drivers.stream.sample import CellEvent, EventKind, Sample
+
+_HARMLESS = (
+    EventKind.EMCY_RESET,
+    EventKind.NMT,
+    EventKind.STATE,
+    EventKind.LIMIT,
+    EventKind.MOVE_START,
+    EventKind.MOVE_END,
+    EventKind.CAPTURE,
+    EventKind.STOP,
+)
+"""Events of sound runs; after any other a recorder might not have called the run valid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Salvaged:
+    """What came of it.
+
+    Attributes:
+        log: the new file.
+        statistics: of the new file; partial, and valid as far as the samples and events tell.
+        duration_s: of the samples [s].
+        left_out_bytes: of the damaged file, from the first byte that could not be trusted.
+        damage: what was found there; empty where the samples are whole and only the end of the file is missing.
+    """
+
+    log: Path
+    statistics: RunStatistics
+    duration_s: float
+    left_out_bytes: int
+    damage: str
+
+
+def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _samples: None) -> Salvaged:
+    """Write what stands before the damage of a log into a new one. The damaged file is only read.
+
+    Args:
+        damaged: a `.part` whose recorder died, or a log that was cut off or damaged later.
+        out: the log to write; must not exist.
+        progress: told the samples so far.
+
+    Raises:
+        UsageError: the recorder still writes the file, or nothing is wrong with it.
+        OutputExists, OutputFailed: the log cannot be written.
+        LogUnreadable: not even one sample, or not the start of the log, can be saved.
+        ConfigurationError: the cell configuration in it is inconsistent.
+    """
+    _refuse_running(damaged)
+    _refuse_name_of_the_whole(damaged, out)
+    if not damaged.name.endswith(UNFINISHED):
+        _refuse_whole(damaged)
+    reader = LogReader(damaged)
+    blocks = reader.until_damage()
+    first = next(blocks, None)
+    if first is None:
+        raise reader.damage or LogIncomplete(
+            str(damaged), found="no samples", expected="at least one", remedy="record the run again"
+        )
+    head = reader.head
+    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{damaged}, cell.yaml"})
+    scale = scaling(cell, head.readback)
+    run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
+    content = LogContent(run, head.files, head.readback, cell.axis_names)
+    # Nothing but this file is lost by a crash here, so no clock is needed to flush in time.
+    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0)
+    with log:
+        try:
+            _copy(reader, chain((first,), blocks), log, len(cell.axes), progress)
+        except BaseException:
+            log.part.unlink(missing_ok=True)  # half of what was saved is of no use
+            raise
+    size = damaged.stat().st_size
+    damage = "" if reader.damage is None else f"{reader.damage.subject}: {reader.damage.found}"
+    left_out = 0 if reader.damage is None else size - reader.whole_bytes
+    return Salvaged(out, log.statistics, log.statistics.samples / run.rate_hz, left_out, damage)
+
+
+def _copy(
+    reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, axes: int, progress: Callable[[int], None]
+) -> None:
+    told = 0
+    for block in blocks:
+        _check_width(reader.path, block, axes)
+        for event in reader.events[told:]:
+            log.event(event)
+        told = len(reader.events)
+        for sample in _samples(block):
+            log.write(sample)
+        progress(log.statistics.samples)
+    for event in reader.events[told:]:
+        log.event(event)
+    log.conclude(*_verdict(reader, log.statistics), partial=True)
+
+
+def _samples(block: SampleBlock) -> Iterator[Sample]:
+    columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
+    for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
+        yield Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing)
+
+
+def _verdict(reader: LogReader, counted: RunStatistics) -> tuple[bool, str]:
+    """The recorder's own, where it came to say it; else what samples and events tell of losses and faults."""
+    if reader.concluded:
+        return reader.statistics.valid, reader.statistics.reason
+    found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
+    found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
+    found += [_told(event) for event in reader.events if event.kind not in _HARMLESS][:3]
+    return not found, ", ".join(found)
+
+
+def _told(event: CellEvent) -> str:
+    return f"{event.kind.value} ({event.text})"
+
+
+def _check_width(damaged: Path, block: SampleBlock, axes: int) -> None:
+    width = block.position_counts.shape[1]
+    if width != axes:
+        raise LogIncomplete(
+            str(damaged),
+            found=f"samples of {width} axes",
+            expected=f"{axes}, as in its cell configuration",
+            remedy="it is no recording of this software",
+        )
+
+
+def _refuse_name_of_the_whole(damaged: Path, out: Path) -> None:
+    if damaged == out.with_name(out.name + UNFINISHED):
+        raise UsageError(
+            str(out),
+            found="the name that the whole recording would have had",
+            expected="one that says what it is",
+            remedy=f"choose another --out, such as {out.stem}-partial{out.suffix}",
+        )
+
+
+def _refuse_running(damaged: Path) -> None:
+    with suppress(FileNotFoundError, IsADirectoryError, PermissionError), damaged.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise UsageError(
+                str(damaged),
+                found="a recording that still runs",
+                expected="one whose recorder has ended",
+                remedy="wait for its end, or interrupt it with Ctrl-C, which stops the axes",
+            ) from error
+        except OSError:
+            return  # a file system without locks
+
+
+def _refuse_whole(damaged: Path) -> None:
+    reader = LogReader(damaged)
+    try:
+        for _ in reader:
+            pass
+    except LogUnreadable:
+        return
+    raise UsageError(
+        str(damaged), found="a whole log", expected="a damaged or unfinished one", remedy="use it as it is"
+    )

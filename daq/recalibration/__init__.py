@@ -1,1 +1,0 @@
-"""The scheduled recalibration: preflight, record, fit, decide, propose or apply, report."""

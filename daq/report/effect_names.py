@@ -1,0 +1,70 @@
+"""Effects as a technician calls them: the axis by its name, the effect in a few words."""
+
+from __future__ import annotations
+
+from ident.effects.effect import Abscissa, Effect, PlacedEffect, Side
+from ident.effects.unnamed import Periodic, Smooth
+
+WORDS = {
+    "stribeck": "dry friction that changes at low speed",
+    "nonlinear-viscous": "friction that does not grow in proportion to the speed",
+    "asymmetric-viscous": "viscous friction that differs between the two directions",
+    "load-friction": "friction that grows with the load",
+    "spring": "a spring",
+    "position-friction": "friction that changes with the position",
+    "cogging": "torque ripple that repeats with the motor's turn",
+    "saturation": "a motor that gives less torque per ampere at large current",
+    "lag": "a current that is seen later than the position",
+    "time-skew": "positions and currents that were not sampled at the same time",
+    "warm-up": "friction that changes while the robot warms up",
+    "presliding": "friction that builds up only some way after each reversal",
+    "backlash": "free play in the gear",
+    "elasticity": "a gear that gives under load",
+    "coupling": "friction shared with another joint",
+    "inertial-coupling": "inertia shared with another joint",
+    "hinge": "a cable or hose that pulls from some position on",
+    "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
+}
+"""By family. One that is not here is called by its name."""
+
+
+def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
+    """`load-friction on J3`, `coupling on J4 with J5`.
+
+    Args:
+        placed: effect and axis.
+        axes: their names.
+    """
+    if placed.effect.side is Side.ALL_MOTORS:
+        return f"{placed.effect.name} on all axes"
+    other = other_axis(placed.effect)
+    pair = "" if other is None else f" with {axes[other]}"
+    return f"{placed.effect.name} on {axes[placed.axis]}{pair}"
+
+
+def in_words(effect: Effect, axes: tuple[str, ...]) -> str:
+    """What an axis has, to follow "J3 has": `friction that grows with the load`."""
+    if is_unnamed(effect):
+        return f"a torque that depends on {variable_words(effect, axes)} and that no named effect explains"
+    words = WORDS.get(effect.name, f"the effect {effect.name!r}")
+    other = other_axis(effect)
+    return words if other is None else words.replace("another joint", axes[other])
+
+
+def variable_words(effect: Effect, axes: tuple[str, ...]) -> str:
+    """The variable that shows an effect, without its unit: `the joint position`."""
+    other = other_axis(effect)
+    if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:
+        return f"the velocity of {axes[other]}"
+    return "the " + effect.abscissa.value.partition(" [")[0]
+
+
+def other_axis(effect: Effect) -> int | None:
+    """Index of the second axis of an effect that speaks of two."""
+    number = effect.settings.get("other_axis", 0)
+    return int(number) - 1 if number else None
+
+
+def is_unnamed(effect: Effect) -> bool:
+    """Whether it is a smooth or periodic term, which fits anything and names nothing."""
+    return isinstance(effect, Smooth | Periodic)

@@ -1,0 +1,298 @@
+"""The main job from end to end on a simulated cell, over the same driver that a real one is recorded with.
+
+This file and the simulate verb are the only ones that may read a simulation file: the truth is looked at to judge the
+result, after it stands.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import OutputExists, UsageError
+from daq.report.fit import draw
+from daq.simulation.simulation_file import load_simulation, require_simulator
+from daq.workflow.calibration_file import as_document, save
+from daq.workflow.fit import Fit, calibration_of, close_loop, fit
+from daq.workflow.plan import Plan, plan
+from daq.workflow.plan_file import save_plan
+from daq.workflow.record import Recorded, network_of, record
+from daq.writeback.file_proposal import Proposal, apply, propose_for
+from daq.writeback.file_target import Written
+from daq.writeback.request import Request
+from drivers.canopen.bus import open_bus
+from drivers.canopen.scan import FoundNode
+from drivers.simulation.spec import CellSpec
+from ident.calibration import Calibration
+from ident.discovery.loop import Evidence
+from ident.estimators.identify import Identification
+
+MARK = ".drivegain-demo"
+RETRIES = 2
+"""Of a run that came out invalid."""
+PLANS = ("a", "b", "c")
+RUNS = (
+    ("bare-1", None, "a"),
+    ("loaded-1", "disc", "a"),
+    ("bare-2", None, "b"),
+    ("loaded-2", "disc", "b"),
+    ("unused", "disc", "c"),
+)
+"""Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last is held out."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What may be chosen of a demonstration.
+
+    Attributes:
+        out: folder that it fills; files of an earlier demonstration in it are replaced.
+        simulation: file of the simulated cell.
+        seed: of plans, noise and significance test.
+        duration_s: of each run [s].
+    """
+
+    out: Path
+    simulation: Path
+    seed: int
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Telling:
+    """Whom to tell what is being done.
+
+    Attributes:
+        step: a new step begins, in words.
+        progress: done, total and a remark within it.
+    """
+
+    step: Callable[[str], None]
+    progress: Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that the demonstration found.
+
+    Attributes:
+        cell: declared.
+        nodes: found on the bus.
+        plans: made.
+        recorded: logs.
+        fitted: with the effects that were found.
+        calibration: as saved.
+        truth: true gain by axis.
+        proposal, written: what the controller file would get, and what its copy got.
+    """
+
+    cell: Cell
+    nodes: tuple[FoundNode, ...]
+    plans: tuple[Plan, ...]
+    recorded: tuple[Recorded, ...]
+    fitted: Fit
+    calibration: Calibration
+    truth: dict[str, float]
+    proposal: Proposal
+    written: Written | None
+
+
+def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Telling) -> Outcome:
+    """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
+
+    Args:
+        settings: what may be chosen.
+        now: wall clock with time zone.
+        telling: whom to tell.
+
+    Raises:
+        DaqError, DriverError, IdentificationError: whatever a real cell could raise.
+    """
+    require_simulator()
+    cell_file = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(cell_file)
+    out = settings.out
+    logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
+    _make_room(out, logs)
+    telling.step("scan the bus")
+    nodes = _scan(settings, cell)
+    telling.step("plan exciting moves")
+    plans = tuple(_plan(settings, cell, index, telling) for index in range(len(PLANS)))
+    recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, telling) for index in range(len(RUNS)))
+    telling.step("identify all gains and parameters")
+    fitted = fit(logs[:-1], holdout=logs[-1:])
+    telling.step("look for what the model lacks")
+    fitted = close_loop(fitted, settings.seed, lambda step: telling.progress(0, 0, step))
+    calibration = calibration_of(fitted, now())
+    save(calibration, out / "calibration.yaml")
+    telling.step("write the calibration to a copy of the controller file")
+    proposal, written = _write_back(cell, calibration, out, now())
+    telling.step("draw the pictures")
+    spec = load_simulation(settings.simulation)
+    truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
+    draw(fitted, calibration, truth, out)
+    return Outcome(cell, nodes, plans, recorded, fitted, calibration, truth, proposal, written)
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The outcome as `summary.json` holds it."""
+    before, after = outcome.fitted.identification, outcome.fitted.final
+    effects = outcome.calibration.effects
+    first = effects[0] if effects else None
+    paper = outcome.fitted.paper
+    return {
+        "gains": [
+            {
+                "axis": gain.axis,
+                "nameplate": gain.nameplate,
+                "identified": gain.value,
+                "std_percent": gain.std_percent,
+                "truth": outcome.truth[gain.axis],
+                "error_percent": 100.0 * (gain.value / outcome.truth[gain.axis] - 1.0),
+                "paper_tls": None if paper is None else float(paper.gains[index]),
+            }
+            for index, gain in enumerate(outcome.calibration.gains)
+        ],
+        "effect": None if first is None else {"name": first.name, "axis": first.axis},
+        "effects": as_document(outcome.calibration)["effects"],
+        "error_before_percent": _total(before),
+        "error_after_percent": _total(after),
+        "error_before_percent_axes": _axes(before),
+        "error_after_percent_axes": _axes(after),
+        "plans": [
+            {
+                "moves": len(plan.moves),
+                "condition": plan.condition,
+                "predicted_std_percent": list(plan.predicted_std_percent),
+            }
+            for plan in outcome.plans
+        ],
+        "logs": [
+            {
+                "log": run.path.name,
+                "samples": run.log.samples,
+                "lost_cycles": run.log.lost_cycles,
+                "valid": run.log.valid,
+            }
+            for run in outcome.recorded
+        ],
+        "controller_diff": outcome.proposal.diff,
+        "applied": outcome.written is not None,
+    }
+
+
+def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
+    """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
+        raise OutputExists(
+            str(out),
+            found="something that is no folder of a demonstration",
+            expected="no such folder, an empty one, or that of an earlier demonstration",
+            remedy="choose another --out",
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARK).write_text("Made by `drivegain demo`, which may replace what is in this folder.\n")
+    for log in logs:
+        log.unlink(missing_ok=True)
+        log.with_name(log.name + ".part").unlink(missing_ok=True)
+    for picture in out.glob("residual-*.png"):
+        picture.unlink()
+
+
+@contextmanager
+def _simulated(cell: Cell, spec: CellSpec) -> Iterator[None]:
+    """A simulated cell that answers on the bus of the demonstration."""
+    from drivers.simulation.cell import SimulatedCell  # noqa: PLC0415 - its packages are an optional extra
+
+    bus = open_bus(bus_address(cell))
+    try:
+        with SimulatedCell(spec, bus):
+            yield
+    finally:
+        bus.shutdown()
+
+
+def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
+    with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
+        nodes = network.scan()
+        network.check_identities()
+        return nodes
+
+
+def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
+    exchanges = 800
+    made = plan(
+        cell,
+        seed=10 * settings.seed + index,
+        duration_s=settings.duration_s,
+        exchanges=exchanges,
+        progress=lambda done, std: telling.progress(done, exchanges, f"plan {PLANS[index]}, worst gain σ {std:.2f} %"),
+    )
+    save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
+    return made
+
+
+def _record_valid(
+    settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, telling: Telling
+) -> Recorded:
+    """One run, made again where its recorder does not stand for it; the last attempt is kept as it is, for the fit."""
+    name, payload, plan_name = RUNS[index]
+    telling.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+    for attempt in range(1, RETRIES + 1):
+        recorded = _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+        if recorded.log.valid:
+            return recorded
+        # A busy computer lets the simulated cell answer late, or twice in a period.
+        telling.step(f"record {name} again ({attempt} of at most {RETRIES} times): {recorded.log.reason}")
+        recorded.path.unlink()
+    return _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+
+
+def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, telling: Telling) -> Recorded:
+    name, payload, _ = RUNS[index]
+    spec = load_simulation(settings.simulation, payload)
+    declared = {candidate.name: candidate for candidate in cell.payloads}
+    mounted = None if payload is None else declared[payload]
+    # Another noise in every run, as another day would bring; the plant is the same.
+    with _simulated(cell, replace(spec, seed=spec.seed + 100 * settings.seed + index)):
+        return record(
+            cell_file,
+            cell,
+            moves,
+            settings.out / f"{name}.mcap",
+            payload=None if mounted is None else mounted.payload,
+            entered_kg=None if mounted is None else mounted.mass_kg,  # the simulated disc is what it is called
+            operator="demo",
+            granted_by="the demonstration: a simulated cell",
+            run_id=f"demo-{settings.seed}-{name}",
+            progress=lambda done, total: telling.progress(done, total, "moves"),
+        )
+
+
+def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) -> tuple[Proposal, Written | None]:
+    source = cell.controller_path
+    if source is None:
+        raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
+    target = out / "controller.yaml"
+    shutil.copyfile(source, target)
+    proposal = propose_for(cell, Request(calibration, now), target)
+    return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
+
+
+def _total(identification: Identification | Evidence) -> float | None:
+    error = identification.holdout_error
+    return None if error is None else error.total
+
+
+def _axes(identification: Identification | Evidence) -> list[float] | None:
+    error = identification.holdout_error
+    return None if error is None else list(error.axes)

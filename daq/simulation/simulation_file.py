@@ -1,0 +1,261 @@
+"""A simulation file: the truth of a simulated cell. Only `simulate` and `demo` read it; no fit, plan or report does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from daq.config.cell import DEGREE, MILLIMETRE
+from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.environment import shipped_configurations
+from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.spec import AxisSpec, Body, CellSpec, Dialect, UndeclaredEffect
+
+# What goes wrong in a simulated cell, and when: `faults` of a simulation file, or a scenario file of faults alone.
+
+
+AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]
+"""J3, or 3."""
+
+
+LONGEST_S = 1e6
+LAST_CYCLE = 10**12
+"""No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them."""
+
+
+class FaultModel(StrictModel):
+    """Something that goes wrong; times count from power-on, in the time of the plant."""
+
+    fault: FaultKind
+    axis: AxisName | None = None
+    at_s: Annotated[float, Field(ge=0, le=LONGEST_S)] | None = None
+    at_cycle: Annotated[int, Field(ge=0, le=LAST_CYCLE)] | None = None
+    for_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
+    cycles: Annotated[int, Field(ge=1, le=LAST_CYCLE)] | None = None
+    emcy_code: Annotated[int, Field(ge=0x1000, le=0xFFFF)] | None = None
+
+    @model_validator(mode="after")
+    def _one_spelling(self) -> FaultModel:
+        if self.at_s is not None and self.at_cycle is not None:
+            raise ValueError("at_s or at_cycle, not both")
+        if self.for_s is not None and self.cycles is not None:
+            raise ValueError("for_s or cycles, not both")
+        if (self.emcy_code is not None) != (self.fault is FaultKind.EMERGENCY):
+            raise ValueError("emcy_code for the fault emergency, and for no other")
+        return self
+
+    def spec(self, period_us: int) -> FaultSpec:
+        """In SYNCs."""
+        begin = self.at_cycle or 0 if self.at_s is None else round(self.at_s * 1e6 / period_us)
+        cycles = self.cycles if self.for_s is None else max(1, round(self.for_s * 1e6 / period_us))
+        axis = None if self.axis is None else axis_index(self.axis)
+        return FaultSpec(self.fault, axis, begin, cycles, self.emcy_code or 0)
+
+
+class ScenarioModel(StrictModel):
+    """A whole scenario file."""
+
+    faults: Annotated[tuple[FaultModel, ...], Field(min_length=1)]
+
+
+def load_scenario(path: Path, axes: int, period_us: int) -> tuple[FaultSpec, ...]:
+    """Read a scenario file; its faults come on top of those of the simulation file.
+
+    Args:
+        path: of the file.
+        axes: that the cell has.
+        period_us: of its SYNC.
+
+    Raises:
+        ConfigurationError: the file is missing, wrong, or names an axis that the cell lacks.
+    """
+    document = parse_yaml(read_bytes(path), str(path))
+    model = read_model(document, ScenarioModel)
+    if wrong := absent_axes(model.faults, axes):
+        raise ConfigurationInconsistent(**describe(document, wrong), remedy="correct the scenario file")
+    return tuple(fault.spec(period_us) for fault in model.faults)
+
+
+def absent_axes(faults: Sequence[FaultModel], axes: int) -> list[Fault]:
+    """What is wrong with faults on axes that the cell lacks."""
+    return [
+        Fault(("faults", number, "axis"), f"axis {fault.axis}", f"J1 to J{axes}")
+        for number, fault in enumerate(faults)
+        if fault.axis is not None and axis_index(fault.axis) >= axes
+    ]
+
+
+def axis_index(axis: str | int) -> int:
+    """Index from 0 of an axis given as "J3" or by its number from 1."""
+    number = int(re.sub(r"^J", "", axis)) if isinstance(axis, str) else axis
+    return number - 1
+
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class AxisSpecModel(StrictModel):
+    """The fields of drivers.simulated.spec.AxisSpec; of a prismatic joint N for Nm, m for rad and kg for kg m²."""
+
+    node_id: Annotated[int, Field(ge=1, le=127)]
+    vendor_id: U32
+    product_code: U32
+    revision: U32
+    serial: U32
+    counts_per_revolution: Annotated[int, Field(gt=0)]
+    rated_current_a: Positive
+    peak_current_a: Positive
+    gain_nm_per_a: float
+    motor_inertia_kg_m2: NotNegative
+    viscous_nm_s_rad: NotNegative
+    coulomb_nm: NotNegative
+    motor_viscous_nm_s_rad: NotNegative
+    motor_coulomb_nm: NotNegative
+    offset_nm: float
+    current_noise_a: NotNegative
+    noise_correlation_s: NotNegative
+    dialect: Dialect = Dialect.CIA402
+    toggle_bit: Literal[8, 14, 15] | None = None
+    entered_gain_nm_per_a: float = 0.0
+
+
+class BodyModel(StrictModel):
+    """A payload's true inertia."""
+
+    mass_kg: Positive
+    centre_m: tuple[float, float, float]
+    inertia_kg_m2: tuple[float, float, float, float, float, float]
+
+
+class EffectModel(StrictModel):
+    """An undeclared effect."""
+
+    name: Annotated[str, Field(min_length=1)]
+    axis: AxisName
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+
+class SimulationModel(StrictModel):
+    """A whole simulation file."""
+
+    urdf: Annotated[str, Field(min_length=1)]
+    gravity_m_s2: tuple[float, float, float]
+    ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1)]
+    sync_period_us: Annotated[int, Field(ge=250, le=1_000_000)]
+    substeps: Annotated[int, Field(ge=1, le=100)]
+    seed: Annotated[int, Field(ge=0)]
+    start_deg: tuple[float | None, ...] = ()
+    start_mm: tuple[float | None, ...] = ()
+    axes: Annotated[tuple[AxisSpecModel, ...], Field(min_length=1, max_length=32)]
+    payloads: dict[str, BodyModel] = Field(default_factory=dict)
+    effects: tuple[EffectModel, ...] = ()
+    faults: tuple[FaultModel, ...] = ()
+
+
+def require_simulator() -> None:
+    """Refuse to simulate without the packages that move the simulated cell.
+
+    Raises:
+        ConfigurationMissing: with the extra to install.
+    """
+    missing = [package for package in ("pinocchio", "numba") if find_spec(package) is None]
+    if missing:
+        raise ConfigurationMissing(
+            "the simulated cell",
+            found=f"no package {' and '.join(missing)}",
+            expected="the mechanics and the compiler of the optional extra `simulation`",
+            remedy="pip install 'drivegain[simulation]'",
+        )
+
+
+def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
+    """Read a simulation file.
+
+    Args:
+        path: of the file.
+        payload: name of the mounted body, or None.
+
+    Raises:
+        ConfigurationError: the file is missing, wrong, or contradicts itself.
+        UsageError: there is no such payload.
+    """
+    document = parse_yaml(read_bytes(path), str(path))
+    model = read_model(document, SimulationModel)
+    _check(document, model)
+    if payload is not None and payload not in model.payloads:
+        raise UsageError(
+            f"payload {payload!r}",
+            found="no such body in the simulation",
+            expected=f"one of {', '.join(model.payloads) or 'none: it has no payloads'}",
+            remedy=f"choose one, or add it to {path}",
+        )
+    return CellSpec(
+        urdf=read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace"),
+        gravity_m_s2=model.gravity_m_s2,
+        ratio=np.array(model.ratio, dtype=np.float64),
+        axes=tuple(AxisSpec(**axis.model_dump()) for axis in model.axes),
+        start_rad=np.array(
+            [
+                MILLIMETRE.si * (millimetres or 0.0) if degrees is None else DEGREE.si * degrees
+                for degrees, millimetres in _starts(model)
+            ]
+        ),
+        payload=None if payload is None else Body(**model.payloads[payload].model_dump()),
+        effects=tuple(UndeclaredEffect(e.name, axis_index(e.axis), dict(e.parameters)) for e in model.effects),
+        sync_period_us=model.sync_period_us,
+        substeps=model.substeps,
+        seed=model.seed,
+        faults=tuple(fault.spec(model.sync_period_us) for fault in model.faults),
+    )
+
+
+def shipped_simulation(name: str = "demo") -> Path:
+    """A simulation file that comes with drivegain."""
+    return shipped_configurations() / "simulation" / f"{name}.yaml"
+
+
+def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
+    """Of each joint: degrees and millimetres, one of them None."""
+    n = len(model.axes)
+    return list(zip(model.start_deg or (None,) * n, model.start_mm or (None,) * n, strict=True))
+
+
+def _check(document: Document, model: SimulationModel) -> None:
+    n = len(model.axes)
+    faults = []
+    if len(model.ratio) != n or any(len(row) != n for row in model.ratio):
+        faults.append(Fault(("ratio",), f"{len(model.ratio)} rows", f"{n} × {n}, a row for each motor"))
+    if len(model.start_deg) != n and (model.start_deg or not model.start_mm):
+        faults.append(Fault(("start_deg",), f"{len(model.start_deg)} angles", f"{n}, one for each joint"))
+    elif len(model.start_mm) not in (0, n):
+        faults.append(Fault(("start_mm",), f"{len(model.start_mm)} positions", f"{n}, one for each joint"))
+    else:
+        faults += [
+            Fault(("start_mm" if model.start_mm else "start_deg",), f"joint {joint}: {found}", "deg, or mm, and null")
+            for joint, found in enumerate(_starts(model), start=1)
+            if found.count(None) != 1
+        ]
+    if len({axis.node_id for axis in model.axes}) != n:
+        faults.append(Fault(("axes",), "a node id used twice", "each node once"))
+    faults += [
+        Fault(("axes", index, "gain_nm_per_a"), "0", "a gain that is not zero")
+        for index, axis in enumerate(model.axes)
+        if axis.gain_nm_per_a == 0.0
+    ]
+    faults += [
+        Fault(("effects", index, "axis"), f"axis {effect.axis}", f"J1 to J{n}")
+        for index, effect in enumerate(model.effects)
+        if axis_index(effect.axis) >= n
+    ]
+    faults += absent_axes(model.faults, n)
+    if faults:
+        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the simulation file")

@@ -1,0 +1,1 @@
+"""Plan, record, fit, validate: the steps of a calibration."""

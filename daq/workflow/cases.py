@@ -1,0 +1,218 @@
+"""The paper's cases 1 to 4 on the same logs: what is known of the payload, and by which estimator (§4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import Cell, model_of
+from daq.errors import ConfigurationInconsistent
+from daq.workflow.fit import Fit, Reading, calibration_of, check_signs
+from ident.calibration import Calibration, Parameter, Source
+from ident.equations.reduction import Reduction, reduce_runs
+from ident.equations.system import require_distinct
+from ident.errors import DataUnfit
+from ident.estimators.comparison import Essential, essential
+from ident.estimators.estimate import Method
+from ident.estimators.identify import Identification, estimate_with, require_seen_payload
+from ident.estimators.least_squares import tls
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
+
+
+class Known(Enum):
+    """What the fit is told of a mounted payload (n_kL of eq. 5)."""
+
+    NOTHING = "nothing"
+    MASS = "mass"
+    CAD = "cad"
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One way of identifying.
+
+    Attributes:
+        name: of its calibration file.
+        title: over its column of a table.
+        method: estimator.
+        known: of the payload.
+        gains_fixed: hold the gains at their nameplate values.
+    """
+
+    name: str
+    title: str
+    method: Method
+    known: Known
+    gains_fixed: bool = False
+
+
+CASES = (
+    Case("manufacturer", "nameplate gains, WLS", Method.WLS, Known.NOTHING, gains_fixed=True),
+    Case("case-1", "case 1: WLS, CAD", Method.WLS, Known.CAD),
+    Case("case-2", "case 2: WLS, mass", Method.WLS, Known.MASS),
+    Case("case-3", "case 3: TLS, CAD", Method.TLS, Known.CAD),
+    Case("case-4", "case 4: TLS, mass", Method.TLS, Known.MASS),
+    Case("ml", "ml, mass", Method.ML, Known.MASS),
+)
+"""The five sets of §4.3, and ours. The paper's WLS and TLS weight the rows of each joint."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReducedLogs:
+    """Logs of one cell, read once; what is known of a payload is chosen afterwards.
+
+    Attributes:
+        cell: as the logs describe it, or as given.
+        logs, holdout: of the fit, and those that it has not seen.
+        sources: the same, with digests and roles.
+        used, unseen: their rows, reduced.
+    """
+
+    cell: Cell
+    logs: tuple[Path, ...]
+    holdout: tuple[Path, ...]
+    sources: tuple[Source, ...]
+    used: Reduction
+    unseen: Reduction
+
+
+@dataclass(frozen=True, slots=True)
+class CaseFit:
+    """A fit, and what it was told of the payloads.
+
+    Attributes:
+        fitted: without effects.
+        payloads: one for each mounting, as the fit took them.
+        essential: how its base parameters were chosen, None where all of them stay.
+    """
+
+    fitted: Fit
+    payloads: tuple[Payload, ...]
+    essential: Essential | None
+
+
+def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None) -> ReducedLogs:
+    """Read and reduce.
+
+    Args:
+        logs: of the fit.
+        holdout: logs that the fit must not see.
+        cell: another description of the cell than the one in the logs.
+
+    Raises:
+        DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
+    """
+    reading = Reading(logs, cell)
+    model, conditioning = model_of(reading.cell), reading.cell.conditioning
+    used = reduce_runs(model, reading.runs(logs, "fit"), conditioning)
+    unseen = reduce_runs(model, reading.runs(holdout, "holdout"), conditioning, payloads=used.payloads)
+    for payload in unseen.payloads[len(used.payloads) :]:
+        raise DataUnfit(
+            ", ".join(unseen.runs), f"held out with mounting {payload.mounting!r}, which no run of the fit carries"
+        )
+    return ReducedLogs(reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen)
+
+
+def fit_case(
+    logs: ReducedLogs, method: Method, known: Known, *, gains_fixed: bool = False, ratio: float | None = None
+) -> CaseFit:
+    """One fit of logs that were read.
+
+    Args:
+        logs: with a weighed payload where the gains are free.
+        method: estimator.
+        known: of the payloads.
+        gains_fixed: hold the gains at their nameplate values.
+        ratio: r_σ of the essential parameters; None keeps all base parameters.
+
+    Raises:
+        ConfigurationInconsistent: CAD values are asked for, and the cell has none.
+        IdentificationError: see ident/estimators/identify.py.
+    """
+    payloads = tuple(payload_as(payload, logs.cell, known) for payload in logs.used.payloads)
+    used, unseen = replace(logs.used, payloads=payloads), replace(logs.unseen, payloads=payloads)
+    system = used.system(used.base(), used.payload_columns())
+    require_distinct(system, gains=not gains_fixed)
+    nameplate = np.array([axis.nameplate_gain for axis in logs.cell.axes])
+    estimate = estimate_with(method, system, nameplate if gains_fixed else None)
+    if not gains_fixed:
+        check_signs(estimate, nameplate)
+        if method is Method.ML:
+            require_seen_payload(estimate, system)
+    rest = unseen.system(system.base, system.payload_columns) if unseen.runs else None
+    result = Identification(used.model, used.conditioning, system, rest, estimate)
+    paper = None if gains_fixed else tls(system)
+    fitted = Fit(logs.cell, logs.logs, logs.holdout, logs.sources, result, (), paper)
+    if ratio is None:
+        return CaseFit(fitted, payloads, None)
+    return replace(essential_fit(fitted, ratio), payloads=payloads)
+
+
+def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
+    """The same fit with its essential parameters alone (§4.2); the others are zero, and certain.
+
+    Args:
+        fitted: without effects.
+        ratio: r_σ.
+
+    Raises:
+        IdentificationError: the estimator refuses.
+    """
+    before = fitted.identification
+    estimate = before.estimate
+    fixed = estimate.gains if estimate.gains_fixed else None
+    found = essential(before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio)
+    after = replace(fitted, identification=replace(before, estimate=found.whole))
+    return CaseFit(after, before.system.payloads, found)
+
+
+def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
+    """A payload with what a fit is told of it.
+
+    Args:
+        payload: as the log has it.
+        cell: whose payload of that name and mounting says what its drawing says.
+        known: how much.
+
+    Raises:
+        ConfigurationInconsistent: the drawing is asked for, and the cell says no more than the mass.
+    """
+    if known is Known.NOTHING:
+        return replace(payload, known={})
+    if known is Known.MASS:
+        return replace(payload, known={name: value for name, value in payload.known.items() if name == "m"})
+    of_cell = next((p for p in cell.payloads if (p.name, p.mounting) == (payload.name, payload.mounting)), None)
+    drawn = {**({} if of_cell is None else of_cell.known), **payload.known}
+    if set(drawn) == {"m"}:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}, payload {payload.name!r}",
+            found="its mass alone",
+            expected="its centre_m and inertia_kg_m2, because they are asked for",
+            remedy="add them to the cell file and name it with --cell, or fit with the mass alone",
+        )
+    return replace(payload, known=drawn)
+
+
+def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
+    """The calibration, with what it was told of the payloads as parameters without deviation.
+
+    Args:
+        case: fitted.
+        created: when, with its time zone.
+    """
+    calibration = calibration_of(case.fitted, created)
+    removed = set() if case.essential is None else {removal.name for removal in case.essential.removed}
+    given = tuple(
+        Parameter(f"{name}:{payload.mounting}", payload.known[name], 0.0, unit)
+        for payload in case.payloads
+        for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
+        if name in payload.known
+    )
+    kept = tuple(parameter for parameter in calibration.parameters if parameter.name not in removed)
+    condition = calibration.condition if case.essential is None else case.essential.estimate.condition
+    return replace(calibration, parameters=kept + given, condition=condition)

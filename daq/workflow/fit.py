@@ -1,0 +1,468 @@
+"""From logs to a calibration."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.config.cell import Cell, model_of
+from daq.environment import software
+from daq.errors import ConfigurationError, LogRepeated, LogsDiffer, ModelContradicted, RolesExchanged, UsageError
+from daq.log.conversion import load_run
+from daq.log.reader import LossyLogs
+from daq.report.effect_names import placed_name
+from daq.workflow.experiment import LAG_ONE, experiment_of
+from daq.workflow.plan import extra_moves
+from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.discovery.loop import Evidence, Step, close_the_loop, gather
+from ident.discovery.search import Finding
+from ident.discovery.signals import session_began_s
+from ident.effects.effect import PlacedEffect, Side
+from ident.equations.system import System
+from ident.errors import IdentificationError, PayloadUnseen
+from ident.estimators.comparison import Comparison, compare
+from ident.estimators.estimate import Estimate, Method, RelativeError, of_squares
+from ident.estimators.identify import Identification, estimate_with, identify
+from ident.estimators.least_squares import tls
+from ident.model.bodies import LINK_PARAMETERS
+from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
+from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """An identification with the cell and the logs it speaks of.
+
+    Attributes:
+        cell: as the logs describe it.
+        logs, holdout: what was fitted, and what was not; they are read again where rows are needed.
+        sources: the same, with digests and roles.
+        identification: the estimate without effects.
+        steps: turns of the loop, empty where nobody looked for effects.
+        paper: the paper's total least squares on the same equations, None with fixed gains.
+        lossy: what was done with logs that tell of losses.
+    """
+
+    cell: Cell
+    logs: tuple[Path, ...]
+    holdout: tuple[Path, ...]
+    sources: tuple[Source, ...]
+    identification: Identification
+    steps: tuple[Step, ...]
+    paper: Estimate | None
+    lossy: LossyLogs = LossyLogs.REFUSED
+
+    @property
+    def final(self) -> Identification | Evidence:
+        """With all accepted effects."""
+        return self.steps[-1].after if self.steps else self.identification
+
+    def evidence(self) -> Evidence:
+        """The rows behind the identification, without effects; the logs are read again."""
+        used, unseen = ((load_run(log, self.cell, self.lossy)[0] for log in logs) for logs in (self.logs, self.holdout))
+        return gather(self.identification, used, unseen)
+
+
+class Reading:
+    """Logs of one cell, read one after the other, and what was met on the way."""
+
+    def __init__(self, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> None:
+        self._given = cell
+        self._lossy = lossy
+        self._first: tuple[Path, Run] | None = None
+        self._seen: dict[str, Path] = {}
+        self.sources: list[Source] = []
+        run, self.cell = load_run(logs[0], cell, lossy)
+        self._first = (logs[0], run)
+
+    def runs(self, logs: Sequence[Path], role: str) -> Iterator[Run]:
+        """One run after the other; the first log is not read twice.
+
+        Raises:
+            LogsDiffer: a log is of another cell or configuration than the first one.
+            LogRepeated: a recording was given twice: it would count twice, or be held out of nothing.
+        """
+        for log in logs:
+            if self._first is not None and self._first[0] == log:
+                run, cell = self._first[1], self.cell
+                self._first = None
+            else:
+                run, cell = load_run(log, self._given, self._lossy)
+            if cell.digest != self.cell.digest:
+                raise LogsDiffer(
+                    str(log),
+                    found=f"cell {cell.name!r}, configuration {cell.digest[:12]}",
+                    expected=f"cell {self.cell.name!r}, configuration {self.cell.digest[:12]}, as in the first log",
+                    remedy="fit logs of one cell and one configuration, or name the right one with --cell",
+                )
+            # By its samples: a file that was rewritten is the same recording still.
+            content = hashlib.sha256(run.position_rad.tobytes() + run.current_a.tobytes()).hexdigest()
+            if content in self._seen:
+                raise LogRepeated(
+                    str(log),
+                    found=f"the same recording as {self._seen[content]}",
+                    expected="every recording once, in the fit or held out",
+                    remedy="name other logs",
+                )
+            self._seen[content] = log
+            self.sources.append(_source(run, role))
+            yield run
+
+
+def _source(run: Run, role: str) -> Source:
+    mounted = run.payload
+    name, mass_kg = (None, None) if mounted is None else (mounted.name, mounted.known.get("m"))
+    return Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
+
+
+def fit(
+    logs: Sequence[Path],
+    *,
+    holdout: Sequence[Path] = (),
+    method: Method | None = None,
+    gains_fixed: bool = False,
+    cell: Cell | None = None,
+    lossy: LossyLogs = LossyLogs.REFUSED,
+) -> Fit:
+    """Identify gains and parameters.
+
+    Args:
+        logs: without load and with a weighed payload; any, where the gains are fixed.
+        holdout: logs that the fit must not see.
+        method: estimator; ``ml``, or with fixed gains the classical IDIM-WLS, when None.
+        gains_fixed: hold the gains at their nameplate values.
+        cell: another description of the cell than the one in the logs.
+        lossy: what to do with logs that tell of losses.
+
+    Raises:
+        DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
+    """
+    try:
+        return _fit(logs, holdout, method, gains_fixed, cell, lossy)
+    except PayloadUnseen as error:
+        raise PayloadUnseen(error.std_percent, error.runs, _culprit(logs, cell, lossy)) from error
+
+
+def _fit(
+    logs: Sequence[Path],
+    holdout: Sequence[Path],
+    method: Method | None,
+    gains_fixed: bool,
+    cell: Cell | None,
+    lossy: LossyLogs,
+) -> Fit:
+    reading = Reading(logs, cell, lossy)
+    declared = reading.cell
+    nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
+    result = identify(
+        model_of(declared),
+        reading.runs(logs, "fit"),
+        declared.conditioning,
+        holdout=reading.runs(holdout, "holdout"),
+        method=method or (Method.WLS if gains_fixed else Method.ML),
+        fixed_gains=nameplate if gains_fixed else None,
+    )
+    if not gains_fixed:
+        check_signs(result.estimate, nameplate)
+    check_explained(result.training_error, declared.axis_names)
+    paper = None if gains_fixed else tls(result.system)
+    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper, lossy)
+
+
+def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
+    """Every estimator on the logs of a fit, which are read again for each filter.
+
+    Args:
+        fitted: with free gains.
+        progress: told what is being done.
+
+    Raises:
+        UsageError: its gains were held fixed.
+    """
+    if fitted.final.estimate.gains_fixed:
+        raise UsageError(
+            "--compare",
+            found="--gains fixed",
+            expected="free gains: it is their estimators that differ",
+            remedy="leave out one of the two",
+        )
+    found = fitted.identification
+    return compare(
+        found.model,
+        lambda: (load_run(log, fitted.cell, fitted.lossy)[0] for log in fitted.logs),
+        found.conditioning,
+        progress,
+    )
+
+
+def _culprit(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
+    """Which log contradicts the others about the payload: without it they agree."""
+    for log in logs:
+        try:
+            rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell, lossy)
+        except IdentificationError:
+            continue
+        gains = rest.identification.estimate
+        std = float(np.max(gains.gains_std / np.abs(gains.gains)))
+        return f"without {log} they do (σ at most {100.0 * std:.1f} %): was the payload of that run declared as it was?"
+    return ""
+
+
+ALL_AXES = "all axes"
+"""Where an effect is that acts on every motor alike."""
+LARGEST_TOTAL_PERCENT = 50.0
+LARGEST_AXIS_PERCENT = 100.0
+"""Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
+DOUBTFUL_PERCENT = 25.0
+"""In total; the default gate of `apply` stands here."""
+
+
+def check_explained(error: RelativeError, axes: tuple[str, ...]) -> None:
+    """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
+
+    Raises:
+        ModelContradicted: the relative error is above LARGEST_TOTAL_PERCENT, or LARGEST_AXIS_PERCENT on an axis.
+    """
+    worst = int(np.nanargmax(error.axes))
+    if error.total > LARGEST_TOTAL_PERCENT or error.axes[worst] > LARGEST_AXIS_PERCENT:
+        raise ModelContradicted(
+            "the fit",
+            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}",
+            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis {LARGEST_AXIS_PERCENT:g} %",
+            remedy="look for what contradicts the model: two channels exchanged or one reversed, a wrong drive train, "
+            "gravity or URDF, a payload or drawing (--known cad) that is not the one that was mounted",
+        )
+
+
+def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
+    """The payload's weight sets the sign of all gains together: taken from the wrong runs it turns them all."""
+    if np.all(np.sign(estimate.gains) == -np.sign(nameplate)):
+        raise RolesExchanged(
+            "all drive gains",
+            found=", ".join(f"{gain:.3g}" for gain in estimate.gains),
+            expected="the signs of the nameplate: " + ", ".join(f"{gain:.3g}" for gain in nameplate),
+            remedy="were the payload's run and the run without load exchanged (look at `drivegain info` of each log), "
+            "or do all currents count the other way?",
+        )
+
+
+def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
+    """Look for effects that the model lacks, and refit with those that pass.
+
+    Args:
+        start: of method ``ml``; another one is refitted by it, because candidates are judged in its terms.
+        seed: of the bootstrap.
+        progress: told what is being done.
+
+    Raises:
+        IdentificationError: a refit failed.
+    """
+    evidence = start.evidence()
+    before = start.identification
+    if before.estimate.method is not Method.ML:
+        fixed = before.estimate.gains if before.estimate.gains_fixed else None
+        before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
+        evidence = replace(evidence, estimate=before.estimate)
+    steps = close_the_loop(evidence, np.random.default_rng(seed), progress=progress)
+    return replace(start, identification=before, steps=steps)
+
+
+def calibration_of(fitted: Fit, created: datetime) -> Calibration:
+    """The calibration that a fit amounts to.
+
+    Args:
+        fitted: with or without effects.
+        created: when, with its time zone.
+    """
+    final = fitted.final
+    estimate = final.estimate
+    gains = tuple(
+        Gain(axis.name, float(value), float(std), axis.gain_unit, axis.nameplate_gain)
+        for axis, value, std in zip(fitted.cell.axes, estimate.gains, estimate.gains_std, strict=True)
+    )
+    parameters = tuple(
+        Parameter(column.name, float(value), float(std), column.unit)
+        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    )
+    return Calibration(
+        cell=fitted.cell.name,
+        method=estimate.method.value,
+        gains=gains,
+        parameters=parameters,
+        effects=_effects(fitted, parameters),
+        relative_error_percent=final.training_error,
+        holdout_error_percent=final.holdout_error,
+        condition=estimate.condition,
+        rows=estimate.rows,
+        filter=final.conditioning.document(),
+        sources=fitted.sources,
+        configuration_sha256=fitted.cell.digest,
+        created=created.isoformat(timespec="seconds"),
+        software=software(),
+        session_began_s=session_began_s(final.trained) if isinstance(final, Evidence) else None,
+        nameplate_holdout_error_percent=_nameplate_error(fitted),
+        recording_configuration_sha256=fitted.cell.recording_digest,
+    )
+
+
+def _nameplate_error(fitted: Fit) -> RelativeError | None:
+    """What the hold-out would be told of with the nameplate's gains: same model, effects included, parameters refitted.
+
+    Without the effects, what they tell would be credited to the gains. ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the
+    scale of its gain, but ‖Y_j‖ does: the total is put together with the ‖Y_j‖ of the calibration, so that a smaller
+    gain alone makes no total smaller.
+    """
+    final = fitted.final
+    training, unseen = _systems(final)
+    if unseen is None or final.estimate.gains_fixed:
+        return None
+    nameplate = np.array([axis.nameplate_gain for axis in fitted.cell.axes])
+    method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method  # tls corrects gains
+    try:
+        held = estimate_with(method, training, nameplate)
+    except (IdentificationError, np.linalg.LinAlgError):
+        return None
+    axes = held.relative_error(unseen).axes
+    gains = np.concatenate((final.estimate.gains, np.zeros(len(held.parameters) + 1)))
+    size = unseen.joints.square_sum(gains)
+    moved = size > 0.0
+    left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
+    return RelativeError(axes, of_squares(size, left).total)
+
+
+def _systems(model: Identification | Evidence) -> tuple[System, System | None]:
+    """The equations of the fit, and those that it has not seen; of evidence, with the columns of its effects."""
+    if isinstance(model, Identification):
+        return model.system, model.holdout
+    return model.training.system(), None if model.holdout is None else model.holdout.system()
+
+
+def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
+    kept = fitted.steps[-1].after.effects if fitted.steps else ()
+    return tuple(_accepted(fitted, placed, parameters) for placed in kept)
+
+
+def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
+    before, step, finding = _joined(fitted, placed)
+    names = {column.name for column in placed.columns}
+    error_before, error_after = _unused_error(before, placed), _unused_error(step.after, placed)
+    if error_before is None or error_after is None:
+        # Without a run that was held out, the moves that were left out in turn must do.
+        error_before, error_after = finding.error_before_percent, finding.error_after_percent
+    return AcceptedEffect(
+        name=placed.effect.name,
+        axis=axis_of(placed, fitted.cell),
+        settings={name: float(value) for name, value in placed.effect.settings.items()},
+        coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
+        error_before_percent=error_before,
+        error_after_percent=error_after,
+        ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in finding.ambiguity),
+    )
+
+
+def axis_of(placed: PlacedEffect, cell: Cell) -> str:
+    """Name of the axis that an effect is on; what acts on every motor alike is placed on the first for order only."""
+    return ALL_AXES if placed.effect.side is Side.ALL_MOTORS else cell.axes[placed.axis].name
+
+
+def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[Identification | Evidence, Step, Finding]:
+    """The last turn that added an effect, with the model before it: an idle one may have gone and come back."""
+    models: list[Identification | Evidence] = [fitted.identification, *(step.after for step in fitted.steps)]
+    for before, step in zip(reversed(models[:-1]), reversed(fitted.steps), strict=True):
+        had = before.effects if isinstance(before, Evidence) else ()
+        if step.accepted is not None and placed in step.after.effects and placed not in had:
+            return before, step, step.accepted
+    raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
+
+
+def _unused_error(model: Identification | Evidence, placed: PlacedEffect) -> float | None:
+    """On the runs held out [%]: of the axis, or in total for what acts on all motors; None where they say nothing."""
+    error: RelativeError | None = model.holdout_error
+    if error is None:
+        return None
+    figure = error.total if placed.effect.side is Side.ALL_MOTORS else error.axes[placed.axis]
+    return figure if np.isfinite(figure) else None
+
+
+# How well a fit has seen each gain, by what, and which moves would show it better.
+
+
+FloatArray = NDArray[np.float64]
+
+
+def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """Judge every gain of a fit with free gains; the logs are read again.
+
+    The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
+    scaled from the prediction as the fit's deviation is: moves tell of it, not the size of the noise.
+
+    Args:
+        fitted: effects, if it has any, are left out of the judgement.
+    """
+    found = fitted.identification
+    estimate, system = found.estimate, found.system
+    standard = np.zeros(len(found.model.columns))
+    standard[list(system.base.independent)] = estimate.parameters[: len(system.base.independent)]
+    # ml's noise is that of the current references, the others' that of the joint torques.
+    noise = estimate.axis_noise / (1.0 if estimate.method is Method.ML else np.abs(estimate.gains))
+    expectation = Expectation(
+        model=found.model,
+        gains=estimate.gains,
+        parameters=standard,
+        payloads=_payloads(found),
+        noise_a=effective_noise(noise, LAG_ONE),
+    )
+    design = Design(expectation, system.base)
+    judged = verdicts(design, list(_excitations(fitted)), _extras(fitted))
+    true = 100.0 * fitted.final.estimate.gains_std / np.abs(fitted.final.estimate.gains)
+    return tuple(_scaled(gain, float(std)) for gain, std in zip(judged, true, strict=True))
+
+
+def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
+    """The verdicts, or none where the gains were given or all are known so well that nobody needs to ask by what."""
+    estimate = fitted.final.estimate
+    good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
+    return () if good else gain_verdicts(fitted)
+
+
+def _payloads(found: Identification) -> tuple[ExpectedPayload, ...]:
+    first, payloads = len(found.system.columns), []
+    for payload, indices in zip(found.system.payloads, found.system.payload_columns, strict=True):
+        parameters = payload.known_parameters
+        parameters[list(indices)] = found.estimate.parameters[first : first + len(indices)]
+        first += len(indices)
+        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
+    return tuple(payloads)
+
+
+def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
+    found = fitted.identification
+    mountings = [payload.mounting for payload in found.system.payloads]
+    for log in fitted.logs:
+        run, _ = load_run(log, fitted.cell, fitted.lossy)
+        data = differentiate(run, found.model.drive_train, found.conditioning)
+        mounted = None if run.payload is None else mountings.index(run.payload.mounting)
+        yield recorded(found.model.drive_train, data, found.conditioning), (mounted,)
+
+
+def _extras(fitted: Fit) -> tuple[ExtraMoves, ...]:
+    """None where the cell does not say enough to plan moves in it."""
+    try:
+        return extra_moves(experiment_of(fitted.cell))
+    except ConfigurationError:
+        return ()
+
+
+def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:
+    factor = std_percent / gain.std_percent if np.isfinite(gain.std_percent) and gain.std_percent else 1.0
+    advice = gain.advice and replace(gain.advice, std_percent=factor * gain.advice.std_percent)
+    alone = {source: factor * alone for source, alone in gain.alone_percent.items()}
+    return replace(gain, std_percent=std_percent, alone_percent=alone, advice=advice)

@@ -1,0 +1,173 @@
+"""`plan.yaml`: moves that a person can read, change and approve before anything moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.yaml_file import StrictModel, parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationInconsistent
+from daq.files import replace_file
+from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
+from daq.workflow.plan import Plan, units_of
+from ident.planning.clearance import Checker
+
+LONGEST_S = 3600.0
+Velocity = Annotated[float, Field(ge=0.01, le=1)]
+"""Slower than a hundredth of its limits a move would hardly end."""
+Acceleration = Annotated[float, Field(ge=0.0001, le=1)]
+"""A hundredth of the speed on the same ways is a ten-thousandth of the acceleration."""
+
+
+class _Move(StrictModel):
+    target_deg: tuple[float, ...] | None = None
+    target: tuple[float, ...] | None = None
+    velocity: Velocity
+    acceleration: Acceleration
+    dwell_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+
+    @model_validator(mode="after")
+    def _one_target(self) -> _Move:
+        if (self.target_deg is None) == (self.target is None):
+            raise ValueError("target_deg, or target where some axes are in mm")
+        return self
+
+
+class _Plan(StrictModel):
+    format: Literal["drivegain-plan"]
+    cell: str
+    seed: int
+    condition: Annotated[float, Field(gt=0)]
+    # Plans of earlier versions have none.
+    predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
+
+
+def save_plan(plan: Plan, path: Path) -> None:
+    """Write a plan; a file of that name is replaced whole.
+
+    Raises:
+        OSError: from the file system.
+    """
+    key = _key(plan.units)
+    predicted = ", ".join(f"{value:.3f}" for value in plan.predicted_std_percent)
+    lines = [
+        "# Synchronised point-to-point moves; velocity and acceleration are shares of the joint limits.",
+        f"# Targets: {', '.join(unit.name for unit in plan.units)}.",
+        "format: drivegain-plan",
+        f"cell: {plan.cell}",
+        f"seed: {plan.seed}",
+        f"condition: {plan.condition:.1f}    # of the weighted observation matrix",
+        f"predicted_std_percent: [{predicted}]    # of each gain, moves made without load and with the payload",
+        "moves:",
+    ]
+    for move in plan.moves:
+        values = zip(move.target_rad, plan.units, strict=True)
+        target = ", ".join(f"{value / unit.si:.3f}" for value, unit in values)
+        lines.append(
+            f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: {move.acceleration:.4f}, "
+            f"dwell_s: {move.dwell_s:.3f}}}"
+        )
+    replace_file(path, ("\n".join(lines) + "\n").encode())
+
+
+def load_plan(path: Path, cell: Cell) -> Plan:
+    """Read a plan for a cell; one that was changed by hand is checked as strictly as one that was made.
+
+    Raises:
+        ConfigurationError: the file is missing, is not what its schema says, a target lies outside the joint limits,
+            the plan takes longer than an hour, or a way leaves the declared workspace or clearance.
+    """
+    model = read_model(parse_yaml(read_bytes(path), str(path)), _Plan)
+    if model.cell != cell.name:
+        raise ConfigurationInconsistent(
+            str(path),
+            found=f"a plan for cell {model.cell!r}",
+            expected=f"one for {cell.name!r}",
+            remedy="make a plan for this cell: `drivegain plan CELL`",
+        )
+    if len(model.predicted_std_percent) not in (0, len(cell.axes)):
+        raise ConfigurationInconsistent(
+            f"{path}: predicted_std_percent",
+            found=f"{len(model.predicted_std_percent)} numbers",
+            expected=f"{len(cell.axes)}, one a gain",
+            remedy="make the plan anew: `drivegain plan CELL`",
+        )
+    moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
+    duration_s = duration_of(cell, moves)
+    if duration_s > LONGEST_S:
+        raise ConfigurationInconsistent(
+            f"{path}: moves",
+            found=f"{duration_s:.0f} s of moves and dwells",
+            expected=f"at most {LONGEST_S:.0f} s",
+            remedy="leave moves out, or raise velocity and acceleration",
+        )
+    _check_room(path, cell, moves)
+    return Plan(
+        cell=model.cell,
+        seed=model.seed,
+        condition=model.condition,
+        predicted_std_percent=model.predicted_std_percent,
+        duration_s=duration_s,
+        moves=moves,
+        units=units_of(cell),
+    )
+
+
+def _key(units: tuple[JointUnit, ...]) -> str:
+    return "target_deg" if all(unit == DEGREE for unit in units) else "target"
+
+
+def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
+    key = "target_deg" if move.target is None else "target"
+    values = move.target_deg or move.target or ()
+    where = f"{path}: moves[{number}].{key}"
+    expected_key = _key(units_of(cell))
+    if key != expected_key:
+        units = ", ".join(f"{axis.name} {axis.unit.name}" for axis in cell.axes)
+        raise ConfigurationInconsistent(
+            where, found=key, expected=f"{expected_key} ({units})", remedy="correct the move"
+        )
+    if len(values) != len(cell.axes):
+        raise ConfigurationInconsistent(
+            where,
+            found=f"{len(values)} positions",
+            expected=f"{len(cell.axes)}, one a joint",
+            remedy="correct the move",
+        )
+    target = tuple(value * axis.unit.si for value, axis in zip(values, cell.axes, strict=True))
+    for axis, position in zip(cell.axes, target, strict=True):
+        lower, upper = axis.limits.position
+        if not lower <= position <= upper:
+            raise ConfigurationInconsistent(
+                f"{where}, {axis.name}",
+                found=axis.unit.spell(position),
+                expected=f"{axis.unit.spell(lower)} to {axis.unit.spell(upper)}, the joint's limits",
+                remedy="correct the move, or the limits if they are wrong",
+            )
+    return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
+
+
+def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
+    """Refuse ways that leave what the cell file declares; that a guessed arm touches itself refuses nothing."""
+    if cell.clearance is None:
+        return
+    robot = model_of(cell).robot
+    lightest = min((payload.mass_kg for payload in cell.payloads), default=1.0)
+    scene = scene_of(cell, robot, lightest)
+    checker = Checker(robot, replace(scene.checker.scene, pairs=())) if scene.guessed else scene.checker
+    for number, way in enumerate(paths_of(cell, moves), start=1):
+        found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
+        if found is not None:
+            where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
+            raise ConfigurationInconsistent(
+                f"{path}: moves[{number}], on the way there",
+                found=f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})",
+                expected=f"at least {1000 * cell.clearance.minimum_m:.0f} mm",
+                remedy="correct the move, or `workspace` and `clearance` in the cell file",
+            )

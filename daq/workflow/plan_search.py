@@ -1,0 +1,284 @@
+"""The search for moves: exchange, judged by the worst gain's predicted standard deviation (see
+ident/planning/excitation.py).
+
+The information of a plan is the sum over its moves. A changed target touches two moves, so a proposal costs two small
+sums and one factorisation; the regressors of a whole round of proposals are made at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.errors import PlanUnfit
+from daq.workflow.experiment import Experiment, PlannedMove, path_of
+from drivers.motion.move import Trapezoid
+from ident.planning.clearance import Obstruction
+
+FloatArray = NDArray[np.float64]
+
+POSITION_MARGIN = 0.03
+"""Share of a joint's range that targets keep from its limits."""
+DWELL_S = 0.1
+NEAR = 0.15
+"""Standard deviation of a near target, as a share of the joint's range."""
+ROUND = 8
+"""Proposals whose regressors are made at once."""
+THINNING = 2
+"""Every second row is enough to compare proposals by."""
+SHARPNESS = 8.0
+"""The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
+FEWEST_MOVES = 5
+MOST_TRIES = 100
+"""Random postures or ways that are tried from one place before it counts as shut in."""
+MOST_RETREATS = 30
+MOST_STARTS = 10
+"""Random plans that are begun before the run counts as too short."""
+PLACES = 3
+"""Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says."""
+
+
+class Kind(Enum):
+    """Of a proposal."""
+
+    ANEW = "another target"
+    NEAR = "a target moved in some of the axes"
+    SWING = "one axis to the other end of its range, the others as they were"
+    SPEED = "another speed and acceleration"
+    INSERT = "one more move"
+    SHIFT = "a move taken out here and put in there"
+
+
+KINDS = (Kind.ANEW, Kind.NEAR, Kind.SWING, Kind.SPEED, Kind.INSERT, Kind.SHIFT)
+CHANCES = (0.2, 0.25, 0.2, 0.15, 0.1, 0.1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draft:
+    """Moves with the ways between them and what each way tells.
+
+    Attributes:
+        moves: the first only says where the run starts.
+        paths, informations: of moves[1:].
+    """
+
+    moves: tuple[PlannedMove, ...]
+    paths: tuple[Trapezoid, ...]
+    informations: tuple[FloatArray, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """From the first target to the end of the last dwell."""
+        return float(sum(path.duration_s for path in self.paths) + sum(move.dwell_s for move in self.moves))
+
+
+class Search:
+    """Random moves, and their exchange."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        rng: np.random.Generator,
+        duration_s: float,
+        speed: float,
+        largest_condition: float,
+    ) -> None:
+        self._experiment = experiment
+        self._cell = experiment.cell
+        self._rng = rng
+        self._duration_s = duration_s
+        self._speed = speed
+        self._largest_condition = largest_condition
+        limits = np.array([axis.limits.position for axis in self._cell.axes])
+        margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
+        self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
+
+    def random_moves(self) -> Draft:
+        """Clear random moves that fill the duration.
+
+        Raises:
+            PlanUnfit: it has no room for five moves, or no clear way is found.
+        """
+        most: list[PlannedMove] = []
+        for _ in range(MOST_STARTS):
+            moves, paths = self._filled()
+            if len(moves) >= FEWEST_MOVES:
+                return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
+            most = max(most, moves, key=len)
+        raise self._unfit(f"room for {len(most)} moves", "at least 5, better 30", "allow a longer run")
+
+    def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
+        moves, paths = [self._clear_start()], list[Trapezoid]()
+        left, retreats = self._duration_s - DWELL_S, 0
+        while True:
+            move = self._clear_move(np.array(moves[-1].target_rad))
+            if move is not None:
+                path = path_of(self._cell, np.array(moves[-1].target_rad), move)
+                left -= path.duration_s + move.dwell_s
+                if left < 0.0:
+                    return moves, paths
+                moves.append(move)
+                paths.append(path)
+                continue
+            # A corner that the random targets before it led into.
+            retreats += 1
+            if retreats > MOST_RETREATS:
+                raise self._blocked("way")
+            if paths:
+                left += paths.pop().duration_s + moves.pop().dwell_s
+            else:
+                moves = [self._clear_start()]
+
+    def improve(self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]) -> Draft:
+        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed.
+
+        Args:
+            draft: to begin with.
+            tries: proposals; every one of them is made.
+            progress: told the number of tries and the predicted deviations so far [%].
+        """
+        best, worst = self._judge(draft, np.inf)
+        done = 0
+        while done < tries:
+            count = min(ROUND, tries - done)
+            chosen = draft
+            # One a round: proposals that were made from the same moves do not go together.
+            for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
+                value, found = self._judge(candidate, best)
+                if value < best:
+                    chosen, best, worst = candidate, value, found
+            draft = chosen
+            done += count
+            progress(done, worst)
+        return draft
+
+    def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
+        """What the search lowers, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
+        information = np.sum(draft.informations, axis=0)
+        found = self._experiment.design.std_percent(information)
+        value = _worst(found)
+        if value < to_beat:  # the condition can only raise it
+            value *= max(1.0, self._experiment.design.condition(information) / self._largest_condition) ** 2
+        return value, found
+
+    def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
+        rng = self._rng
+        kind = KINDS[int(rng.choice(len(KINDS), p=CHANCES))]
+        index, other = (int(number) for number in rng.integers(len(moves), size=2))
+        before, old, after = moves[:index], moves[index], moves[index + 1 :]
+        random = self._random_move()
+        match kind:
+            case Kind.ANEW:
+                changed: tuple[PlannedMove, ...] = (*before, random, *after)
+            case Kind.NEAR:
+                changed = (*before, self._near(old), *after)
+            case Kind.SWING:
+                changed = (*before, self._swing(old, moves[max(index - 1, 0)]), *after)
+            case Kind.SPEED:
+                speedy = replace(old, velocity=random.velocity, acceleration=random.acceleration)
+                changed = (*before, speedy, *after)
+            case Kind.INSERT:
+                changed = (*before, random, old, *after)
+            case Kind.SHIFT:
+                rest = (*before, *after)
+                changed = (*rest[:other], old, *rest[other:])
+        return changed
+
+    def _near(self, move: PlannedMove) -> PlannedMove:
+        count = len(self._low)
+        step = self._rng.normal(0.0, NEAR, count) * (self._high - self._low) * (self._rng.random(count) < 0.5)
+        target = np.clip(np.array(move.target_rad) + step, self._low, self._high)
+        return replace(move, target_rad=self._written(target))
+
+    def _swing(self, move: PlannedMove, before: PlannedMove) -> PlannedMove:
+        axis = int(self._rng.integers(len(self._low)))
+        low, high = self._low[axis], self._high[axis]
+        inwards = 0.25 * float(self._rng.random()) * (high - low)
+        target = np.array(move.target_rad)
+        target[axis] = high - inwards if before.target_rad[axis] < 0.5 * (low + high) else low + inwards
+        return replace(move, target_rad=self._written(target))
+
+    def _drafts(self, draft: Draft, proposals: Sequence[tuple[PlannedMove, ...]]) -> list[Draft]:
+        """The proposals that are short enough and whose new ways are clear, with what they tell."""
+        known = {
+            _way(pair): (path, information)
+            for pair, path, information in zip(pairwise(draft.moves), draft.paths, draft.informations, strict=True)
+        }
+        fresh: dict[_Way, Trapezoid] = {}
+        kept = []
+        for moves in proposals:
+            ways = [_way(pair) for pair in pairwise(moves)]
+            new = {way: path_of(self._cell, np.array(way[0]), way[1]) for way in ways if way not in known}
+            lengths = [new[way].duration_s if way in new else known[way][0].duration_s for way in ways]
+            # The time is quick to tell, the clearance is not.
+            if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
+                continue
+            if all(self._obstruction(path) is None for way, path in new.items() if way not in fresh):
+                kept.append((moves, ways))
+                fresh |= new
+        told = self._experiment.informations(list(fresh.values()), THINNING)
+        known |= {way: (path, information) for (way, path), information in zip(fresh.items(), told, strict=True)}
+        return [
+            Draft(moves, tuple(known[way][0] for way in ways), tuple(known[way][1] for way in ways))
+            for moves, ways in kept
+        ]
+
+    def _clear_start(self) -> PlannedMove:
+        for _ in range(MOST_TRIES):
+            move = self._random_move()
+            if self._experiment.scene.checker.margins(np.array(move.target_rad)[:, None])[0] > 0.0:
+                return move
+        raise self._blocked("posture")
+
+    def _clear_move(self, start: FloatArray) -> PlannedMove | None:
+        for _ in range(MOST_TRIES):
+            move = self._random_move()
+            if self._experiment.scene.checker.obstruction(start, np.array(move.target_rad)) is None:
+                return move
+        return None
+
+    def _obstruction(self, path: Trapezoid) -> Obstruction | None:
+        return self._experiment.scene.checker.obstruction(path.start, path.end)
+
+    def _random_move(self) -> PlannedMove:
+        # Slow and fast moves both: friction is told from inertia by moves of different speed and acceleration.
+        return PlannedMove(
+            target_rad=self._written(self._rng.uniform(self._low, self._high)),
+            velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
+            acceleration=round(self._speed * float(self._rng.uniform(0.4, 1.0)), PLACES),
+            dwell_s=DWELL_S,
+        )
+
+    def _written(self, target: FloatArray) -> tuple[float, ...]:
+        """As the plan file will say it: what is judged is what is made."""
+        units = [axis.unit.si for axis in self._cell.axes]
+        return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
+
+    def _blocked(self, what: str) -> PlanUnfit:
+        return self._unfit(
+            f"no clear {what} among hundreds of random ones",
+            "room to move in",
+            "correct `workspace` and `clearance` in the cell file, or the joint limits",
+        )
+
+    def _unfit(self, found: str, expected: str, remedy: str) -> PlanUnfit:
+        subject = f"plan of {self._duration_s:g} s for cell {self._cell.name!r}"
+        return PlanUnfit(subject, found=found, expected=expected, remedy=remedy)
+
+
+_Way = tuple[tuple[float, ...], PlannedMove]
+
+
+def _way(pair: tuple[PlannedMove, PlannedMove]) -> _Way:
+    return pair[0].target_rad, pair[1]
+
+
+def _worst(std_percent: FloatArray) -> float:
+    # Unseen gains are as bad as each other; the norm of inf would hide the rest.
+    bounded = np.minimum(std_percent, 1e6)
+    return float(np.max(bounded) * np.sum((bounded / np.max(bounded)) ** SHARPNESS) ** (1.0 / SHARPNESS))

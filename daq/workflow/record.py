@@ -1,0 +1,373 @@
+"""One run: a plan's moves made by the cell, every sample of them in a log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daq.config import cell as declared
+from daq.config.bus import cell_address, drive_axes, load_warnings
+from daq.config.cell import Cell
+from daq.config.cell_file import bundle
+from daq.environment import software
+from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
+from daq.files import sha256
+from daq.log.conversion import Scaling, scaling
+from daq.log.message import readback_of_drives
+from daq.log.metadata import RunInfo, RunStatistics
+from daq.log.writer import LogContent, LogWriter
+from daq.workflow.experiment import path_of
+from daq.workflow.plan import Plan
+from daq.workflow.safeguards import (
+    DiskRoom,
+    FreeBytes,
+    check_currents,
+    check_entered_mass,
+    free_bytes,
+    largest_log_bytes,
+    short_searches,
+)
+from daq.writeback.formats.document import read_bytes
+from drivers.canopen.network import CanopenNetwork, Undisturbed
+from drivers.errors import MotionRefused
+from drivers.motion.execute import execute
+from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.stream import StreamStatistics, SyncStream
+from drivers.stream.sync import (
+    DriveProducer,
+    FollowedSync,
+    KernelProducer,
+    LockstepSync,
+    Pacing,
+    SyncProducer,
+    TimedSync,
+)
+from ident.model.bodies import Payload
+
+FloatArray = NDArray[np.float64]
+
+LOCKSTEP_TIMEOUT_S = 3.0
+"""A simulated cell on a busy machine may be that late; one that ended is told of in four seconds."""
+GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
+"""Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
+SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
+"""Without a SYNC of its producer's, whichever is longer, after which this program sends it, to stop the axes."""
+ALLOWANCE_S = 10.0
+"""Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
+LATE_LOSSES_S = 0.25
+"""After the last sample: the interface's own counters are looked at five times a second (drivers/stream/capture.py)."""
+SPACE_CHECK_S = 0.1
+"""Of recorded time, between two looks at the room on the disk."""
+ROUNDING = 1.001
+"""Whole counts may ask a drive for this much more than a limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """Where the times come from [ns]."""
+
+    wall_ns: Callable[[], int] = time.time_ns
+    monotonic_ns: Callable[[], int] = time.monotonic_ns
+
+    def wall_minus_monotonic_ns(self) -> int:
+        """The offset of the two now [ns], as near as two readings can be."""
+        before, wall, after = self.monotonic_ns(), self.wall_ns(), self.monotonic_ns()
+        return wall - (before + after) // 2
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A finished recording: its log, what the log holds, what the bus did, and what to know of its currents."""
+
+    path: Path
+    log: RunStatistics
+    stream: StreamStatistics
+    warnings: tuple[str, ...] = ()
+
+
+def network_of(cell: Cell, undisturbed: Undisturbed = nullcontext) -> CanopenNetwork:
+    """The amplifiers of a cell; use it as a context manager.
+
+    Args:
+        cell: its file.
+        undisturbed: keeps signals from the stop of the axes.
+
+    Raises:
+        ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
+    """
+    pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
+    # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
+    guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
+    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, undisturbed=undisturbed)
+
+
+def record(
+    cell_file: Path,
+    cell: Cell,
+    plan: Plan,
+    out: Path,
+    *,
+    payload: Payload | None,
+    operator: str,
+    granted_by: str | None,
+    run_id: str,
+    speed: float = 1.0,
+    entered_kg: float | None = None,
+    clocks: Clocks | None = None,
+    free: FreeBytes = free_bytes,
+    undisturbed: Undisturbed = nullcontext,
+    progress: Callable[[int, int], None] = lambda _move, _moves: None,
+    before_motion: Callable[[], None] = lambda: None,
+) -> Recorded:
+    """Make a plan's moves and log every sample.
+
+    Args:
+        cell_file: of the cell; it goes into the log with all it refers to.
+        cell: what it says.
+        plan: the moves.
+        out: log to write; must not exist.
+        payload: what is mounted, None without load.
+        operator: who stands for the recording.
+        granted_by: who allows the motion; None refuses it.
+        run_id: unique.
+        speed: share of its planned speed that the plan's moves have been given (`daq.workflow.plan.slowed`), for the
+        log.
+        entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
+        clocks: wall and monotonic time.
+        free: room on the disk of a folder.
+        undisturbed: keeps signals from the stop of the axes.
+        progress: told the moves done and their number.
+        before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it
+            raises leaves the axes without power and no file.
+
+    Raises:
+        UsageError: the mass from the scale is not the payload's; nothing has moved and no file was made.
+        MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
+        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
+            marked invalid.
+        ConfigurationInconsistent, OutputExists, OutputFailed: see daq/errors.py.
+        DriverError: from the bus; the axes were stopped. What was recorded until then stays in an unfinished log
+            (`.part`), which no fit reads and `daq.log.salvage` makes a partial log of.
+    """
+    clocks = clocks or Clocks()
+    if granted_by is None:
+        raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
+    check_entered_mass(cell, payload, entered_kg)
+    with short_searches(), network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
+        network.prepare()
+        warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
+        readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
+        scale = scaling(cell, readback)
+        rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
+        # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
+        # the schedule of the recording's waits for nobody, and what follows here takes many periods.
+        if producer is not None:
+            producer.start()
+        start_counts = _standing(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
+        permission = MotionPermission(granted_by, motor_limits(cell, scale))
+        moves = motor_moves(cell, plan, scale, start_counts)
+        check_moves(start_counts, moves, permission, cell.axis_names)
+        room = DiskRoom(out, free)
+        longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
+        room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
+        short: DiskSpaceShort | None = None
+        # Not behind the first SYNC of the recording's stream: its schedule would not wait for the answer.
+        before_motion()
+        started_ns = clocks.monotonic_ns()
+        run = RunInfo(
+            run_id=run_id,
+            rate_hz=rate_hz,
+            payload=payload,
+            operator=operator,
+            software=software(),
+            started_wall_ns=started_ns + clocks.wall_minus_monotonic_ns(),
+            started_monotonic_ns=started_ns,
+            speed=speed,
+            entered_kg=entered_kg,
+            controller_sha256=controller_digest(cell),
+        )
+        content = LogContent(run, files, readback, cell.axis_names)
+        with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
+            done = 0
+
+            def keep(event: CellEvent) -> None:
+                nonlocal done
+                log.event(event)
+                if event.kind is EventKind.MOVE_END:
+                    done += 1
+                    progress(done, len(moves))
+
+            stream = SyncStream(network, _pacing(cell, run.started_wall_ns, clocks, producer), keep)
+            for sample in until_complete(stream):
+                log.write(sample)
+            with closing(execute(network, stream, moves, permission)) as samples:
+                try:
+                    keep_samples(samples, log, room, max(1, round(SPACE_CHECK_S * rate_hz)))
+                except DiskSpaceShort as error:
+                    short = error
+            stream.read_on(LATE_LOSSES_S)
+            valid, reason = _verdict(stream.statistics)
+            if short is not None:
+                valid, reason = False, f"stopped after {done} of {len(moves)} moves: {short.found}"
+            log.conclude(valid, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns())
+        if short is not None:
+            raise short
+        return Recorded(out, log.statistics, stream.statistics, warnings)
+
+
+def controller_digest(cell: Cell) -> str | None:
+    """SHA-256 of the controller's file as it is now; None where the cell names none, or it is not to be had."""
+    path = cell.controller_path
+    try:
+        return None if path is None else sha256(read_bytes(path))
+    except ControllerUnfit:
+        return None
+
+
+def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: DiskRoom, check_every: int) -> None:
+    """Log every sample of a walk, and end the walk when they cannot be kept any more.
+
+    Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
+    confirm; only closed, it would have nobody to tell.
+
+    Args:
+        samples: of `drivers.motion.execute.execute`.
+        log: open.
+        room: for it.
+        check_every: samples, between two looks at the room.
+
+    Raises:
+        DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.
+    """
+    for number, sample in enumerate(samples):
+        try:
+            log.write(sample)
+            if number % check_every == 0:
+                room.check()
+        except BaseException as error:
+            samples.throw(error)
+            raise
+
+
+def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
+    """How long the moves of motors take, with their dwells, from where the axes stand [s]."""
+    total_s, here = 0.0, tuple(start_counts)
+    for move in moves:
+        total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
+        here = move.target_counts
+    return total_s
+
+
+def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
+    """Samples up to the first in which every axis says where it is; before that no move can be planned.
+
+    Raises:
+        SampleLost: there is none within the cycles that the stream tolerates without one.
+        DriverError: from the bus.
+    """
+    samples = [next(stream)]
+    while samples[-1].missing:
+        samples.append(next(stream))  # the stream's own bound on incomplete cycles in a row ends this
+    return tuple(samples)
+
+
+def _standing(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
+    """Where the axes are, as their PDOs and their objects both say [counts]."""
+    asking = SyncStream(network, pacing)
+    start = until_complete(asking)[-1]
+    asking.check()
+    network.check_feedback(start)
+    return start.position_counts
+
+
+def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
+    """What each motor may do so that no joint can leave its limits by one motor alone [counts].
+
+    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). That each joint keeps its own
+    limits is checked where joints are spoken of: in the plan.
+    """
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
+    forwards, backwards = np.maximum(cell.ratio, 0.0), np.minimum(cell.ratio, 0.0)
+    low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
+    high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
+    turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
+    velocity = turns @ np.array([axis.limits.velocity for axis in cell.axes])
+    acceleration = turns @ np.array([axis.limits.acceleration for axis in cell.axes])
+    return tuple(
+        AxisLimits(int(np.floor(least)), int(np.ceil(most)), float(fast), float(hard))
+        for least, most, fast, hard in zip(low, high, velocity, acceleration, strict=True)
+    )
+
+
+def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
+    """A plan's joint trapezoids as the motors make them: R is linear, and all axes share the ramps [counts]."""
+    moves = []
+    here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
+    for planned in plan.moves:
+        path = path_of(cell, here_rad, planned)
+        target_rad = np.array(planned.target_rad)
+        target = tuple(
+            int(count) for count in np.rint(cell.ratio @ (target_rad - scale.offset_rad) / scale.rad_per_count)
+        )
+        speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
+        ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
+        # The motors' own limits for this move: the fastest trapezoid within them is the joints' one.
+        exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
+        dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
+        moves.append(synchronised_move(here, target, exact, dwell))
+        here_rad, here = target_rad, target
+    return tuple(moves)
+
+
+def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
+    """Whether a run may be used: whatever the stream cannot explain makes it invalid."""
+    losses = {
+        "missing answers": statistics.missing,
+        "late answers": statistics.late,
+        "answers of wrong length": statistics.wrong_length,
+        "answers twice": statistics.duplicate,
+        "PDOs that no axis was told to send": statistics.surplus,
+        "periods without SYNC": statistics.skipped_periods,
+        "frames dropped by the kernel": statistics.kernel_dropped,
+        "frames dropped by the interface": statistics.interface_dropped,
+        "frames dropped by the capture process": statistics.backlog_dropped,
+    }
+    found = ", ".join(f"{count} {name}" for name, count in losses.items() if count)
+    return not found, found
+
+
+def _sync(cell: Cell) -> declared.Sync:
+    if cell.sync is None:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}", found="no `sync`", expected="its period and pacing", remedy="complete the cell file"
+        )
+    return cell.sync
+
+
+def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManager[SyncProducer | None]:
+    """Who sends SYNC in place of this program; None where this program does."""
+    sync = cell.sync
+    if sync is None or sync.producer == declared.RECORDER:
+        return nullcontext()
+    if sync.producer == declared.KERNEL:
+        return KernelProducer(network, sync.period_us)
+    return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
+
+
+def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
+    sync = _sync(cell)
+    period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
+    if producer is not None:
+        in_kernel = isinstance(producer, KernelProducer)
+        silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
+        return FollowedSync(period_ns, producer.name, in_kernel, silence_s, producer.seen, start_ns, clock)
+    if sync.pacing is declared.Pacing.LOCKSTEP:
+        return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
+    return TimedSync(period_ns, start_ns=start_ns, clock=clock)

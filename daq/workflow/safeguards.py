@@ -1,0 +1,349 @@
+"""One mover a bus: a lock that every recording and every job takes before it says anything to the drives.
+
+The locks are those of flock(2) on files in a folder of the system: they end with their process, however it ends. They
+keep out other programs of drivegain on this computer; somebody else's master is heard on the bus itself (BusBusy).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import os
+import re
+import shutil
+import socket
+import stat
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from ipaddress import IPv4Address, IPv6Address, ip_address
+from pathlib import Path
+
+from daq.config.cell import Bus, Cell, WeighedPayload
+from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError
+from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
+from daq.log.writer import JOINT_STATE_NS
+from daq.report.fit import actual_current_note
+from drivers.profiles.scale import ScaleReading, check_name_plate
+from ident.model.bodies import Payload
+from ident.model.model import DriveTrain
+
+SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
+"""Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
+MODE = 0o644
+VIRTUAL = "virtual"
+"""python-can's bus within one process: a bus of that name in another process is another bus."""
+
+
+@contextmanager
+def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
+    """Keep all buses of a cell for oneself.
+
+    Args:
+        cell: its file; one without a bus needs no lock.
+        folder: of the lock files; the first folder of SHARED_FOLDERS that everybody may write into, when None.
+
+    Raises:
+        BusTaken: another recording or job has one of them.
+        OutputFailed: the lock file cannot be made, or something else is there.
+    """
+    where = folder or _shared_folder()
+    # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
+    buses = sorted({lock_name(bus): bus for bus in cell.buses}.items())
+    with ExitStack() as held:
+        for name, bus in buses:
+            held.enter_context(_held(where / name, bus))
+        yield
+
+
+def lock_name(bus: Bus) -> str:
+    """Of a bus's lock file: by its interface and channel, and of a hub by its host's address and its port."""
+    parts = [bus.interface, bus.channel]
+    if bus.interface == "socketcand":
+        parts += [_address(bus), str(bus.port)]
+    elif bus.interface == VIRTUAL:
+        parts.append(str(os.getpid()))
+    return "drivegain-" + "-".join(re.sub(r"[^A-Za-z0-9.]", "_", part) for part in parts) + ".lock"
+
+
+def _address(bus: Bus) -> str:
+    """One for all names of a host; its name where nobody knows an address, since then nobody reaches it either."""
+    try:
+        found = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError):
+        return bus.host.lower()
+    # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
+    address = min((_unmapped(str(where[0])) for *_, where in found), key=lambda one: (one.version, str(one)))
+    # Who connects to the unspecified address comes to this machine, as by a loopback address.
+    return "localhost" if address.is_loopback or address.is_unspecified else str(address)
+
+
+def _unmapped(written: str) -> IPv4Address | IPv6Address:
+    """An address; of one of IPv4 within IPv6 (::ffff:10.0.0.7) that of IPv4."""
+    address = ip_address(written)
+    return (address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address
+
+
+def _shared_folder() -> Path:
+    for folder in SHARED_FOLDERS:
+        with suppress(OSError):
+            if folder.stat().st_mode & stat.S_IWOTH:
+                return folder
+    return SHARED_FOLDERS[-1]
+
+
+@contextmanager
+def _held(lock: Path, bus: Bus) -> Iterator[None]:
+    """The file is removed at the end: whoever opened it just before sees by the inode that it has no name any more."""
+    while True:
+        try:
+            descriptor = _open(lock)
+        except OSError as error:
+            raise OutputFailed.of(lock, error) from error
+        try:
+            _check_regular(descriptor, lock)
+            _take(descriptor, lock, bus)
+            if _is_at(descriptor, lock):
+                try:
+                    yield
+                finally:
+                    # In a shared folder it stays where another user made it.
+                    with suppress(OSError):
+                        lock.unlink()
+                return
+        finally:
+            os.close(descriptor)
+
+
+def _open(lock: Path) -> int:
+    """To read is enough to lock; and to open another user's file in a shared folder, O_CREAT must not be asked for."""
+    while True:
+        with suppress(FileNotFoundError):
+            # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
+            return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with suppress(FileExistsError):
+            made = os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
+            # Whatever the umask says: who cannot open it would not learn that the bus is taken.
+            os.fchmod(made, MODE)
+            return made
+
+
+def _check_regular(descriptor: int, lock: Path) -> None:
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        raise OutputFailed(
+            str(lock),
+            found="something that is no regular file",
+            expected="the lock file of the bus, or none",
+            remedy="nothing has moved; see who has put it there, and remove it",
+        )
+
+
+def _take(descriptor: int, lock: Path, bus: Bus) -> None:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise BusTaken(
+            f"bus {bus.interface}:{bus.channel}",
+            found=f"another recording or job of drivegain on it (it holds {lock})",
+            expected="one at a time: two of them would move one robot",
+            remedy=f"wait for its end; `fuser {lock}` shows its process",
+        ) from error
+
+
+def _is_at(descriptor: int, path: Path) -> bool:
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    return False
+
+
+# Room on the disk for a recording: asked before anything moves, watched while it runs.
+
+
+FreeBytes = Callable[[Path], int]
+"""Room left for this user on the disk of a folder [bytes]."""
+
+RESERVE_BYTES = 64 * 2**20
+"""Never used: others write to the same disk, and the stop of the axes and the end of the log need some too."""
+INDEX_BYTES = 16
+"""Of each message, in the index behind its chunk."""
+MESSAGE_HEAD_BYTES = 31
+CHUNKS_BYTES_S = 4096.0
+"""Of each second: heads and indexes of its chunks."""
+ENDS_BYTES = 2**16
+"""Definitions and metadata, at the start and again at the end."""
+
+
+def free_bytes(folder: Path) -> int:
+    """Room left for this user on the disk of a folder [bytes]; OSError when there is no such folder."""
+    return shutil.disk_usage(folder).free
+
+
+def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
+    """Size of a log at most: as if nothing could be compressed [bytes].
+
+    Args:
+        names: of the axes.
+        rate_hz: samples a second.
+        duration_s: of the run [s].
+        attached: what stands at its start.
+    """
+    state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
+    of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
+    of_states = 1e9 / JOINT_STATE_NS * (MESSAGE_HEAD_BYTES + len(state) + INDEX_BYTES)
+    growth_bytes_s = of_samples + of_states + CHUNKS_BYTES_S
+    return round(duration_s * growth_bytes_s) + ENDS_BYTES + sum(map(len, attached.values()))
+
+
+class DiskRoom:
+    """The room for one log.
+
+    Args:
+        log: to be written.
+        free: tells the room.
+    """
+
+    def __init__(self, log: Path, free: FreeBytes = free_bytes) -> None:
+        self._log = log
+        self._free = free
+
+    def require(self, needed_bytes: int) -> None:
+        """Ask before anything moves.
+
+        Raises:
+            DiskSpaceShort: there is less than that, and a reserve.
+            OutputFailed: there is no such folder.
+        """
+        free = self._ask()
+        if free < needed_bytes + RESERVE_BYTES:
+            raise DiskSpaceShort(
+                str(self._log.parent),
+                found=f"{_megabytes(free)} free",
+                expected=f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in "
+                "reserve",
+                remedy="nothing has moved; free space, name a folder on another disk, or plan a shorter run",
+            )
+
+    def check(self) -> None:
+        """Ask while the log grows.
+
+        Raises:
+            DiskSpaceShort: the reserve is all that is left.
+            OutputFailed: the folder has gone.
+        """
+        free = self._ask()
+        if free < RESERVE_BYTES:
+            raise DiskSpaceShort(
+                str(self._log),
+                found=f"{_megabytes(free)} left on its disk",
+                expected=f"{_megabytes(RESERVE_BYTES)} in reserve",
+                remedy="the axes were told to stop; the log up to there is finished and marked invalid: free space and "
+                "record again",
+            )
+
+    def _ask(self) -> int:
+        try:
+            return self._free(self._log.parent)
+        except OSError as error:
+            raise OutputFailed.of(self._log.parent, error) from error
+
+
+def _megabytes(number: int) -> str:
+    return f"{number / 1e6:.1f} MB"
+
+
+# Whether the ampere that the drives tell can be true of the motors of the cell; asked before anything is recorded.
+
+
+def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
+    """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
+
+    Args:
+        cell: with nameplate gains and drive train.
+        readings: of its drives, in the order of the axes (drivers.scale.read_scale).
+
+    Returns:
+        What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
+
+    Raises:
+        ScaleImplausible: the two torque constants differ by a factor of five or more.
+    """
+    told: dict[str, list[str]] = {}
+    for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
+        found = reading.warnings
+        if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
+            found += (f"the gain is in {axis.gain_unit}; the torque constant cannot be checked",)
+        else:
+            found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
+        for warning in found:
+            told.setdefault(warning, []).append(axis.name)
+    note = actual_current_note(cell)
+    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in told.items())
+    return grouped if note is None else (note, *grouped)
+
+
+# The payload's mass, entered twice: once in the cell file, once from the scale. All gains are in proportion to it.
+
+
+_ROUNDING_KG = 1e-9
+"""Two spellings of one number are one number."""
+
+
+def tolerance_kg(payloads: Iterable[WeighedPayload], name: str) -> float:
+    """How far two weighings of a body may differ [kg]; 0 for one that the cell does not have."""
+    return next((payload.mass_tolerance_kg for payload in payloads if payload.name == name), 0.0)
+
+
+def agree(one_kg: float, other_kg: float, within_kg: float) -> bool:
+    """Whether two weighings are of the same body."""
+    return abs(one_kg - other_kg) <= within_kg + _ROUNDING_KG
+
+
+def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | None) -> None:
+    """Refuse a mass from the scale that is not the cell file's, before anything moves.
+
+    Args:
+        cell: with the tolerance.
+        payload: that is mounted, with the mass of the cell file.
+        entered_kg: from the scale; None where nobody entered one.
+
+    Raises:
+        UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.
+    """
+    if entered_kg is None:
+        return
+    if payload is None:
+        raise UsageError(
+            "--mass",
+            found=f"{entered_kg:g} kg and no payload",
+            expected="the mass of what is mounted",
+            remedy="name the payload too, or leave out its mass",
+        )
+    declared_kg, within_kg = payload.known["m"], tolerance_kg(cell.payloads, payload.name)
+    if not agree(entered_kg, declared_kg, within_kg):
+        raise UsageError(
+            f"payload {payload.name!r}",
+            found=f"{entered_kg:g} kg from the scale",
+            expected=f"{declared_kg:g} kg within {within_kg:g} kg, as in the cell file",
+            remedy="weigh it again and correct the wrong one of the two: all gains are in proportion to this mass",
+        )
+
+
+# Python's search for garbage, kept short while SYNC must go out in time.
+
+
+NEVER = 2**31 - 1
+"""Searches of the middle generation before one of everything."""
+
+
+@contextmanager
+def short_searches() -> Iterator[None]:
+    """What has lived for long is not searched until the block ends; what is made meanwhile is.
+
+    A search through all that the program and its libraries have made takes tens of milliseconds, in which nothing else
+    of the process runs: so many periods without SYNC at 1 kHz, and a run that is marked invalid.
+    """
+    young, middle, old = gc.get_threshold()
+    gc.set_threshold(young, middle, NEVER)
+    try:
+        yield
+    finally:
+        gc.set_threshold(young, middle, old)

@@ -1,1 +1,0 @@
-"""The calibration goes home: what would change, which gates are closed, and the change itself."""

@@ -1,0 +1,1 @@
+"""Controller files by format: find the gains, replace them, keep every other byte."""

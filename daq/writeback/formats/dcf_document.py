@@ -1,0 +1,285 @@
+"""A device configuration file (CiA 306 DCF): where the gains of drives stand, and the same bytes with others there.
+
+A number is decimal, or hexadecimal after `0x`. An integer with another zero before it (`010`) is octal to CiA 306 and
+decimal to many a tool: it is refused, not guessed.
+
+An object is named by index and subindex, both hexadecimal: `6076`, `2003:01`, `2003sub1`. Its number is the
+`ParameterValue` of its section. A data sheet (EDS) has none, and none is put there: that would be a new line.
+"""
+
+from __future__ import annotations
+
+import configparser
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from daq.errors import ControllerUnfit
+from daq.writeback.formats.scalar import (
+    CORRECT_KEY,
+    IntegerStyle,
+    KeyPath,
+    Scalar,
+    check_leaves,
+    check_text,
+    spliced,
+    unfit,
+)
+
+_LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
+_SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
+_ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
+_KEY = re.compile(r"(?:0x)?([0-9a-f]{4})h?(?:(?:sub|:)(?:0x)?([0-9a-f]{1,2})h?)?", re.IGNORECASE)
+_TITLE = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]+))?")
+_DECIMAL = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+_CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
+"""The number of a type: Python's int(…, 0) takes underscores, signs and 0b too."""
+_OCTAL = re.compile(r"[-+]?0[0-9]+")
+_VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
+_VARIABLE = 7
+_BYTE_ORDER_MARK = "ï»¿"
+"""That of UTF-8, each byte a character."""
+_INTEGERS = {
+    0x02: (8, True),
+    0x03: (16, True),
+    0x04: (32, True),
+    0x10: (24, True),
+    0x15: (64, True),
+    0x05: (8, False),
+    0x06: (16, False),
+    0x07: (32, False),
+    0x16: (24, False),
+    0x1B: (64, False),
+}
+"""Bits and sign by the number of the type (CiA 301, table of data types)."""
+_REALS = (0x08, 0x11)
+
+
+@dataclass(frozen=True, slots=True)
+class DcfDocument:
+    """A DCF as it was read.
+
+    Attributes:
+        name: what to call it in messages.
+        text: all of it, each byte a character (ISO 8859-1), so that nothing is lost whatever encoding it was meant in.
+    """
+
+    name: str
+    text: str
+
+    @property
+    def content(self) -> bytes:
+        """The text as it stands in the file."""
+        return self.text.encode("latin-1")
+
+    def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
+        """Find the values of some objects, in their order.
+
+        Raises:
+            ControllerUnfit: an object is not there, is there twice, or has no number that can be changed on its own.
+        """
+        sections = _sections(self.text)
+        return tuple(self._locate(sections, key) for key in keys)
+
+    def with_values(self, spelling: Mapping[str, str]) -> DcfDocument:
+        """The same text with other values of some objects, read back by two parsers.
+
+        Raises:
+            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
+        """
+        changed = DcfDocument(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling))
+        changed.check_against(self, spelling)
+        return changed
+
+    def check_against(self, before: DcfDocument, spelling: Mapping[str, str]) -> None:
+        """Refuse unless this file differs from `before` in the named values alone, for our reader and configparser.
+
+        Raises:
+            ControllerUnfit: it differs in more, or in less.
+        """
+        sections = _sections(before.text)
+        targets: dict[KeyPath, str] = {
+            (self._section(sections, key).title, _VALUE): number for key, number in spelling.items()
+        }
+        for leaves in (_read, _parsed):
+            check_leaves(self.name, leaves(before), leaves(self), targets)
+        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
+
+    def _section(self, sections: list[_Section], key: str) -> _Section:
+        match = _KEY.fullmatch(key)
+        if match is None:
+            raise unfit(self.name, key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
+        index, subindex = int(match[1], 16), int(match[2] or "0", 16)
+        found = [section for section in sections if _named(section.title) == (index, subindex)]
+        if len(found) > 1:
+            lines = " and ".join(str(section.line) for section in found)
+            raise unfit(self.name, key, f"it {len(found)} times, on lines {lines}", "remove all but one")
+        if not found:
+            subs = [s.title for s in sections if s.title.startswith(f"{index:04x}")]
+            has = f"it has {', '.join(subs[:12])}" if subs else "it does not have this index at all"
+            titles = ([f"{index:04x}"] if subindex == 0 else []) + [f"{index:04x}sub{subindex:x}"]
+            raise unfit(self.name, key, f"no section [{'] or ['.join(titles)}] ({has})", CORRECT_KEY)
+        return found[0]
+
+    def _locate(self, sections: list[_Section], key: str) -> Scalar:
+        section = self._section(sections, key)
+        doubled = sorted({e.name for e in section.entries if [o.name for o in section.entries].count(e.name) > 1})
+        if doubled:
+            raise unfit(self.name, key, f"{', '.join(doubled)} twice in [{section.title}]", "remove one of them")
+        entries = {entry.name: entry for entry in section.entries}
+        if self._number(entries, key, _OBJECT_TYPE, _VARIABLE) != _VARIABLE:
+            raise unfit(self.name, key, f"[{section.title}], an array or record", "name one of its subindices")
+        entry = entries.get(_VALUE)
+        if entry is None:
+            raise unfit(
+                self.name,
+                key,
+                f"[{section.title}] without ParameterValue",
+                "a data sheet (EDS) has none: give the device's DCF, or add the line with the value of now",
+            )
+        kind = self._number(entries, key, _TYPE, 0)
+        where = f"line {entry.line}: {entry.value!r:.60}"
+        if kind in (*_REALS, *_INTEGERS) and _OCTAL.fullmatch(entry.value):
+            raise unfit(
+                self.name,
+                key,
+                f"{where}, octal by its leading zero",
+                "write the value that is meant without a zero before it",
+                "a plain decimal number, or an integer after 0x",
+            )
+        if kind in _REALS:
+            if not _DECIMAL.fullmatch(entry.value):
+                raise unfit(self.name, key, f"{where} in a real object", "write a plain decimal number")
+            return Scalar(key, float(entry.value), entry.value, entry.start, entry.end, entry.line)
+        if kind not in _INTEGERS:
+            raise unfit(
+                self.name, key, f"DataType {kind:#06x} in [{section.title}]", "name an integer or a real object"
+            )
+        style = self._style(entries, key, kind)
+        try:
+            value = style.read(entry.value)
+        except ValueError as error:
+            raise unfit(
+                self.name, key, where, "write a plain integer, decimal or 0x", "an integer of its type"
+            ) from error
+        return Scalar(key, float(value), entry.value, entry.start, entry.end, entry.line, style)
+
+    def _style(self, entries: dict[str, _Entry], key: str, kind: int) -> IntegerStyle:
+        """The integers of a type within the limits that the file gives them."""
+        bits, signed = _INTEGERS[kind]
+        lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+        whole = IntegerStyle(bits, lowest, highest)
+        bounds = []
+        for name, given in (("lowlimit", lowest), ("highlimit", highest)):
+            entry = entries.get(name)
+            try:
+                bounds.append(given if entry is None or not entry.value else whole.read(entry.value))
+            except ValueError as error:
+                found = f"line {entry.line if entry else 0}: {entry.value if entry else '':.60} as {name}"
+                raise unfit(self.name, key, found, "correct the limit", "an integer, or nothing") from error
+        return IntegerStyle(bits, max(lowest, bounds[0]), min(highest, bounds[1]))
+
+    def _number(self, entries: dict[str, _Entry], key: str, name: str, default: int) -> int:
+        entry = entries.get(name)
+        if entry is None or not entry.value:
+            return default
+        if not _CODE.fullmatch(entry.value):
+            expected = f"{name} in decimal digits without a leading zero, or in hexadecimal digits after 0x"
+            raise unfit(self.name, key, f"line {entry.line}: {entry.value!r:.60}", "correct it", expected)
+        return int(entry.value, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """`name = value`; the place is that of the value."""
+
+    name: str
+    value: str
+    start: int
+    end: int
+    line: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """What stands under one `[title]`, keys and titles in lower case: CiA 306 does not tell them apart."""
+
+    title: str
+    line: int
+    entries: list[_Entry] = field(default_factory=list)
+
+
+def dcf_document(content: bytes, name: str) -> DcfDocument:
+    """A DCF from its bytes.
+
+    Raises:
+        ControllerUnfit: they are no text, or in an encoding of two bytes a character.
+    """
+    if b"\0" in content:
+        raise ControllerUnfit(
+            name,
+            found=f"byte {content.index(0)} that is zero",
+            expected="a DCF in ASCII, ISO 8859-1 or UTF-8",
+            remedy="save it in one of these; nothing was written",
+        )
+    return DcfDocument(name, content.decode("latin-1"))
+
+
+def _named(title: str) -> tuple[int, int] | None:
+    """Index and subindex that a title names: `2003sub1` and `2003sub01` are one object; None where it names none."""
+    match = _TITLE.fullmatch(title)
+    return None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
+
+
+def _sections(text: str) -> list[_Section]:
+    """The sections in their order; comments and what is no `name=value` are passed over."""
+    sections: list[_Section] = []
+    for number, line in enumerate(_LINE.finditer(text), start=1):
+        written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
+        if written.lstrip().startswith(";"):
+            continue
+        title, entry = _SECTION.fullmatch(written), _ENTRY.fullmatch(written)
+        if title is not None:
+            sections.append(_Section(title[1].strip().lower(), number))
+        elif entry is not None and sections:
+            start = line.end(1) - len(written) + entry.start(2)
+            sections[-1].entries.append(_Entry(entry[1].lower(), entry[2], start, start + len(entry[2]), number))
+    return sections
+
+
+def _read(document: DcfDocument) -> dict[KeyPath, str]:
+    leaves: dict[KeyPath, str] = {}
+    for section in _sections(document.text):
+        for entry in section.entries:
+            path, again = (section.title, entry.name), 1
+            while path in leaves:
+                again += 1
+                path = (section.title, f"{entry.name} ({again})")
+            leaves[path] = entry.value
+    return leaves
+
+
+def _parsed(document: DcfDocument) -> dict[KeyPath, str]:
+    """The leaves as configparser sees them."""
+    parser = configparser.RawConfigParser(
+        strict=False,
+        allow_no_value=True,
+        delimiters=("=",),
+        comment_prefixes=(";",),
+        empty_lines_in_values=False,
+        default_section="\0",
+    )
+    try:
+        parser.read_string(document.text.removeprefix(_BYTE_ORDER_MARK))
+    except configparser.Error as error:
+        raise ControllerUnfit(
+            document.name,
+            found=f"no DCF ({' '.join(str(error).split())[:200]})",
+            expected="sections of name=value (CiA 306)",
+            remedy="correct the file; nothing was written",
+        ) from error
+    return {
+        (section.strip().lower(), name): value or ""
+        for section in parser.sections()
+        for name, value in parser.items(section)
+    }

@@ -1,0 +1,190 @@
+"""A controller's YAML: where its gains stand, and the same text with other numbers there."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from daq.errors import ControllerUnfit
+from daq.writeback.formats.scalar import CORRECT_KEY, DottedDocument, KeyPath, Leaves, Scalar, unfit, utf8
+
+_NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+_OCTAL = re.compile(r"[-+]?0[0-9]+")
+"""To YAML 1.1; a decimal number to YAML 1.2."""
+_MERGE = "<<"
+_FLOAT = "tag:yaml.org,2002:float"
+
+
+@dataclass(frozen=True, slots=True)
+class YamlDocument(DottedDocument):
+    """A YAML file as it was read.
+
+    ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
+    """
+
+    # A frozen text has one tree; to make it is what takes the time here.
+    _composed: list[Node] = field(default_factory=list, init=False, repr=False, compare=False)
+    _readings: list[tuple[Leaves, Leaves]] = field(default_factory=list, init=False, repr=False, compare=False)
+
+    def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
+        """See `DottedDocument.locate`."""
+        root = self._root()
+        references = Counter[int]()
+        _count_references(root, references)
+        return tuple(self._locate(root, key, references) for key in keys)
+
+    def readings(self) -> tuple[Leaves, Leaves]:
+        """YAML 1.2's and 1.1's."""
+        if not self._readings:
+            self._readings.append((_leaves(self._root()), _leaves(_composed_1_1(self.text, self.name))))
+        return self._readings[0]
+
+    def _root(self) -> Node:
+        if not self._composed:
+            self._composed.append(_composed_1_2(self.text, self.name))
+        return self._composed[0]
+
+    def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
+        node = root
+        walked: KeyPath = ()
+        for step in key.split("."):
+            node = self._child(node, step, key, walked)
+            walked = (*walked, step)
+            # A value that another place refers to by an alias cannot be changed without changing that place too.
+            if references[id(node)] > 1:
+                raise unfit(
+                    self.name, key, f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)", "write it out"
+                )
+        if not isinstance(node, ScalarNode):
+            raise unfit(self.name, key, "a list or mapping", "name the key of a number")
+        quote = node.style or ""
+        end = node.end_mark.index - len(quote)
+        start = end - len(node.value)
+        # An anchor or a tag may stand before the number; an escape within quotes makes its text another than its value.
+        opened = self.text[start - 1 : start] == quote if quote else self._begins(node, start)
+        if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
+            raise unfit(self.name, key, f"{node.value!r:.60}", "write a plain decimal number")
+        if _OCTAL.fullmatch(node.value):
+            found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
+            raise unfit(self.name, key, found, "write it without leading zeros")
+        # Anchor and tag stand before the number. A new gain has a point, and is no integer even where this one is.
+        tags = [part for part in self.text[node.start_mark.index : start].split() if part.startswith("!")]
+        if tags and (tags[0] == "!" or node.tag != _FLOAT):
+            raise unfit(self.name, key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
+        return Scalar(key, float(node.value), node.value, start, end, node.start_mark.line + 1)
+
+    def _begins(self, node: ScalarNode, start: int) -> bool:
+        return start == node.start_mark.index or self.text[start - 1].isspace()
+
+    def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
+        place = ".".join(walked) or "the file"
+        if isinstance(node, SequenceNode) and step.isdecimal() and int(step) < len(node.value):
+            child: Node = node.value[int(step)]
+            return child
+        if not isinstance(node, MappingNode):
+            raise unfit(self.name, key, f"no key {step!r} in {place}", CORRECT_KEY)
+        found: list[Node] = [value for name, value in node.value if isinstance(name, ScalarNode) and name.value == step]
+        if len(found) > 1:
+            raise unfit(self.name, key, f"{step!r} {len(found)} times in {place}", "remove all but one")
+        if not found:
+            names = [str(name.value) for name, _ in node.value if isinstance(name, ScalarNode)]
+            if _MERGE in names:
+                raise unfit(
+                    self.name, key, f"no {step!r} of its own in {place}, which merges (<<) another", "write it out"
+                )
+            has = ", ".join(names[:12]) or "nothing"
+            raise unfit(self.name, key, f"no key {step!r} in {place} (it has {has})", CORRECT_KEY)
+        return found[0]
+
+
+def yaml_document(content: bytes, name: str) -> YamlDocument:
+    """A YAML document from its bytes.
+
+    Raises:
+        ControllerUnfit: they are not UTF-8.
+    """
+    return YamlDocument(name, utf8(content, name, "YAML"))
+
+
+def _composed_1_2(text: str, name: str) -> Node:
+    try:
+        root: Node | None = YAML(typ="safe", pure=True).compose(text)
+    except (YAMLError, ValueError, RecursionError) as error:
+        raise ControllerUnfit(
+            name,
+            found=f"no YAML ({' '.join(str(error).split())[:200]})",
+            expected="one YAML document",
+            remedy="correct the file; nothing was written",
+        ) from error
+    if root is None:
+        raise ControllerUnfit(
+            name,
+            found="an empty file",
+            expected="the controller's parameters",
+            remedy="is this the right file?",
+        )
+    return root
+
+
+def _composed_1_1(text: str, name: str) -> yaml.Node:
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        found = "nothing in it"
+    except yaml.YAMLError as error:
+        root, found = None, " ".join(str(error).split())[:200]
+    if root is None:
+        raise ControllerUnfit(
+            name,
+            found=f"no YAML 1.1 ({found})",
+            expected="one YAML document that readers of both YAML 1.1 and 1.2 understand",
+            remedy="correct the file; nothing was written",
+        )
+    return root
+
+
+def _count_references(node: Node, references: Counter[int]) -> None:
+    """Count from how many places each node is reached: more than once means an alias."""
+    references[id(node)] += 1
+    if references[id(node)] > 1:
+        return
+    if isinstance(node, MappingNode):
+        for name, value in node.value:
+            _count_references(name, references)
+            _count_references(value, references)
+    elif isinstance(node, SequenceNode):
+        for child in node.value:
+            _count_references(child, references)
+
+
+def _leaves(root: Any) -> dict[KeyPath, str]:
+    """Every scalar of a tree by its path, and the size of every list and mapping.
+
+    The two parsers have unrelated node classes whose parts have the same names. A node that an alias repeats is
+    followed once: it is the same text.
+    """
+    leaves: dict[KeyPath, str] = {}
+    seen: set[int] = set()
+    waiting: list[tuple[KeyPath, Any]] = [((), root)]
+    while waiting:
+        path, node = waiting.pop()
+        if id(node) in seen:
+            leaves[path] = "*"
+        elif isinstance(node.value, str):
+            leaves[path] = node.value
+        elif type(node).__name__ == "SequenceNode":
+            leaves[*path, "[]"] = str(len(node.value))
+            waiting.extend(((*path, str(position)), child) for position, child in enumerate(node.value))
+        else:
+            leaves[*path, "{}"] = str(len(node.value))
+            for position, (name, value) in enumerate(node.value):
+                step = name.value if isinstance(name.value, str) else f"? {position}"
+                waiting.append(((*path, step), value))
+        seen.add(id(node))
+    return leaves

@@ -1,0 +1,1 @@
+"""Checks that a calibration must pass before anything is written."""

@@ -1,0 +1,267 @@
+"""Who stands for a calibration: a signature a person in a file beside it, which `minisign -V` checks too."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+from daq.config.yaml_file import MAX_BYTES
+from daq.errors import (
+    CalibrationMissing,
+    ConfigurationInconsistent,
+    OutputExists,
+    OutputFailed,
+    SecretKeyUnfit,
+    SignatureInvalid,
+    UsageError,
+)
+from daq.files import read_regular, replace_file
+from daq.writeback.minisign import (
+    UNTRUSTED,
+    PublicKey,
+    SecretKey,
+    is_encrypted,
+    parse_public_key,
+    parse_secret_key,
+    parse_signature,
+)
+
+SUFFIX = ".minisig"
+_NAME = re.compile(r"[^\W_][\w.-]{0,63}")
+_LARGEST_BYTES = 16_384
+
+
+def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicKey]:
+    """Make a key pair: `<name>.key`, readable by its owner alone, and `<name>.pub` for everybody.
+
+    Args:
+        folder: made where it is missing.
+        name: of the person.
+        password: that opens the secret key; empty for one that only the file's mode protects.
+
+    Returns:
+        the file of the secret key, and the public key: its `line` goes into the cell file.
+
+    Raises:
+        UsageError: not a name for a file.
+        OutputExists: there is a key of this name; it is never replaced.
+        OutputFailed: from the file system.
+    """
+    secret, public = folder / f"{_checked(name)}.key", folder / f"{name}.pub"
+    for path in (secret, public):
+        if path.exists() or path.is_symlink():
+            raise OutputExists(
+                str(path), found="a key", expected="no file", remedy="keys are not replaced: choose another name"
+            )
+    key = SecretKey(os.urandom(8), os.urandom(32))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _write_new(secret, key.text(password, os.urandom(32)), 0o600)
+        _write_new(public, key.public.text, 0o644)
+    except OSError as error:
+        raise OutputFailed.of(Path(error.filename or folder), error) from error
+    return secret, key.public
+
+
+def needs_password(secret_key: Path) -> bool:
+    """Whether a secret key is encrypted. Raises SecretKeyUnfit as `sign`."""
+    try:
+        return is_encrypted(_read_key(secret_key))
+    except ValueError as error:
+        raise _unfit(secret_key, error) from error
+
+
+def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None) -> Path:
+    """Put a signature of the file's bytes beside it; an earlier one of the same name gives way.
+
+    Args:
+        file: a calibration.
+        secret_key: made by `generate` or by `minisign -G`.
+        name: of the person, as cells know it.
+        password: of the secret key.
+        at: time for the trusted comment, aware; None leaves it out.
+
+    Returns:
+        the signature's file, `<file>.<name>.minisig`.
+
+    Raises:
+        UsageError: not a name for a file.
+        SecretKeyUnfit: no secret key, another password, or a plain key that others may read.
+        CalibrationMissing: the file cannot be read.
+        OutputExists: something that is no signature stands where it would go.
+        OutputFailed: from the file system.
+    """
+    path = signature_path(file, _checked(name))
+    key = _secret_key(secret_key, password)
+    content = _read_signed(file)
+    if _is_in_the_way(path):
+        raise OutputExists(
+            str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
+        )
+    when = [] if at is None else [f"timestamp:{int(at.timestamp())}", f"at:{at.isoformat(timespec='seconds')}"]
+    signature = key.sign(content, "\t".join([*when, f"file:{_one_line(file.name)}", f"signer:{name}", "hashed"]))
+    try:
+        replace_file(path, signature.text.encode())
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    return path
+
+
+def signature_path(file: Path, name: str) -> Path:
+    """Where the signature of this person is looked for."""
+    return file.with_name(f"{file.name}.{name}{SUFFIX}")
+
+
+def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = None) -> tuple[str, ...]:
+    """Who of the trusted has signed a file.
+
+    Args:
+        file: a calibration; only its name is used where `content` is given.
+        trusted: public key by name, each its line of base64. Signatures of others are not looked at.
+        content: what was read of the file already, so that what is checked is what is used.
+
+    Returns:
+        the names whose valid signature stands beside the file, in the order of `trusted`.
+
+    Raises:
+        SignatureInvalid: a trusted person's signature is there and does not fit the file: one of the two was changed.
+        ConfigurationInconsistent: a public key is none, or two names share one: they would be one person.
+        CalibrationMissing: the file cannot be read.
+    """
+    keys = public_keys(trusted)
+    content = _read_signed(file) if content is None else content
+    found = []
+    for name, key in keys.items():
+        path = signature_path(file, name)
+        if path.exists() or path.is_symlink():
+            try:
+                key.check(parse_signature(_text_of(path)), content)
+            except (ValueError, OSError) as error:
+                raise SignatureInvalid(
+                    str(path),
+                    found=_spelled(error),
+                    expected=f"the signature of {name} for {file.name} as it is now",
+                    remedy=f"have {name} look at the calibration and sign it again, or remove the signature",
+                ) from error
+            found.append(name)
+    return tuple(found)
+
+
+def public_keys(trusted: Mapping[str, str]) -> dict[str, PublicKey]:
+    """The trusted persons' keys, each checked.
+
+    Raises:
+        ConfigurationInconsistent: see `signers_of`.
+    """
+    keys: dict[str, PublicKey] = {}
+    for name, line in trusted.items():
+        problem = None if _NAME.fullmatch(name) else "a name that cannot be part of a file name"
+        try:
+            key = parse_public_key(line)
+        except ValueError as error:
+            problem = str(error)
+        else:
+            same = [other for other, known in keys.items() if known.key == key.key]
+            problem = f"the key of {same[0]}" if same else problem
+            keys[name] = key
+        if problem is not None:
+            raise ConfigurationInconsistent(
+                f"trusted signer {name!r}",
+                found=problem,
+                expected="a public key of their own, the line that `drivegain sign key` prints",
+                remedy="correct it in the cell file",
+            )
+    return keys
+
+
+def _checked(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise UsageError(
+            "name of the signer",
+            found=repr(name),
+            expected="letters, digits, '.', '_' and '-', at most 64, beginning with a letter or digit",
+            remedy="give another one, as the cell file spells it",
+        )
+    return name
+
+
+def _secret_key(path: Path, password: str) -> SecretKey:
+    text = _read_key(path)
+    try:
+        plain = not is_encrypted(text)
+        key = parse_secret_key(text, password)
+    except (ValueError, MemoryError) as error:
+        raise _unfit(path, error) from error
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if plain and mode & 0o077:
+        raise SecretKeyUnfit(
+            str(path),
+            found=f"a key without a password that others may read (mode {mode:04o})",
+            expected="mode 0600",
+            remedy=f"if nobody else had it: chmod 600 {path}; otherwise make a new key",
+        )
+    return key
+
+
+def _read_key(path: Path) -> str:
+    try:
+        return _text_of(path)
+    except (OSError, ValueError) as error:
+        raise _unfit(path, error) from error
+
+
+def _unfit(path: Path, error: Exception) -> SecretKeyUnfit:
+    return SecretKeyUnfit(
+        str(path),
+        found=_spelled(error),
+        expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",
+        remedy="check the name (the file that ends in .key is the secret one) and the password",
+    )
+
+
+def _spelled(error: Exception) -> str:
+    return (error.strerror or type(error).__name__).lower() if isinstance(error, OSError) else str(error)
+
+
+def _is_in_the_way(path: Path) -> bool:
+    """Whether something stands there that is no earlier signature: a pipe, a folder, a file of another kind."""
+    if not path.exists():
+        return False
+    try:
+        return not _text_of(path).startswith(UNTRUSTED)
+    except (OSError, ValueError):
+        return True
+
+
+def _text_of(path: Path) -> str:
+    return read_regular(path, _LARGEST_BYTES).decode()
+
+
+def _read_signed(file: Path) -> bytes:
+    try:
+        return read_regular(file, MAX_BYTES)
+    except OSError as error:
+        raise CalibrationMissing(
+            str(file),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected="the calibration to be signed or checked",
+            remedy="check the name",
+        ) from error
+
+
+def _write_new(path: Path, text: str, mode: int) -> None:
+    # O_EXCL: whoever makes a key at the same time keeps it. The mode is right before a byte of the secret is in it.
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    with os.fdopen(descriptor, "wb") as stream:
+        os.fchmod(descriptor, mode)
+        stream.write(text.encode())
+        stream.flush()
+        os.fsync(descriptor)
+
+
+def _one_line(text: str) -> str:
+    return "".join(c if c.isprintable() else "?" for c in text)

@@ -1,0 +1,257 @@
+"""Opening a CAN bus by its address, with one kind of error for everything that can go wrong."""
+
+from __future__ import annotations
+
+import re
+import select
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import can
+
+from drivers.errors import BusError
+from drivers.stream.socketcan import open_socketcan
+
+# A client of the socketcand protocol that notices when its server has gone, and handles frames in bursts.
+#
+# Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode). Frames to the bus are
+# ``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of three hexadecimal
+# digits is a base one, of eight an extended one. The protocol has neither remote frames nor CAN FD.
+
+
+CONNECT_TIMEOUT_S = 5.0
+SEND_S = 2.0
+"""How long a server may take nothing; what was sent of a frame by then cannot be taken back."""
+_RECEIVE_BYTES = 1 << 16
+LONGEST_BYTES = 4096
+"""Of what may wait for its end; a frame has some 50. A server that never ends a message is none."""
+_LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16
+"""Hexadecimal digits."""
+_SHOWN = 60
+# Possessive, and never past the next '<': what does not match is given up after one look at each byte.
+_FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa-f]*+)|([^<>]*)) >")
+
+
+def send_line(message: can.Message) -> bytes:
+    """One frame as the protocol's ``send`` command."""
+    if message.is_remote_frame or message.is_fd or message.is_error_frame:
+        raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")
+    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    return f"< send {identifier} {message.dlc:X} {message.data.hex(' ')} >".encode("ascii")
+
+
+class SocketcandBus(can.BusABC):
+    """One end of a bus that a socketcand server keeps.
+
+    Raises:
+        can.CanInitializationError: the server refused the channel.
+        OSError: nobody listens there.
+    """
+
+    def __init__(self, channel: str, host: str, port: int) -> None:
+        self.channel_info = f"socketcand {channel}@{host}:{port}"
+        self._channel = channel
+        self._received: deque[can.Message] = deque()
+        self._buffer = b""
+        self._stuck: str | None = None
+        self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._expect("hi")
+            self._socket.sendall(f"< open {channel} >".encode("ascii"))
+            self._expect("ok")
+            self._socket.sendall(b"< rawmode >")
+            self._expect("ok")
+            self._socket.settimeout(None)
+            self._parse(self._buffer)
+        except BaseException:
+            self._socket.close()
+            raise
+        super().__init__(channel=channel)
+
+    def _expect(self, word: str) -> None:
+        # Only up to the first '>': behind the last answer frames of the bus may follow at once.
+        while b">" not in self._buffer:
+            if len(self._buffer) > LONGEST_BYTES:
+                raise can.CanInitializationError(self._endless(self._buffer))
+            chunk = self._socket.recv(_RECEIVE_BYTES)
+            if not chunk:
+                raise can.CanInitializationError(f"{self.channel_info}: closed during the handshake")
+            self._buffer += chunk
+        answer, _, self._buffer = self._buffer.partition(b">")
+        found = answer.strip(b"< ").decode("ascii", "replace")
+        if found != word:
+            raise can.CanInitializationError(f"{self.channel_info}: expected '{word}', the server said '{found}'")
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.send_burst((msg,))
+
+    def send_burst(self, messages: Sequence[can.Message]) -> None:
+        """Send frames, in one system call where the server takes them."""
+        if self._stuck is not None:
+            raise can.CanOperationError(self._stuck)
+        try:
+            self._send_all(memoryview(b"".join(map(send_line, messages))))
+        except OSError as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+
+    def _send_all(self, data: memoryview) -> None:
+        end_s: float | None = None
+        while data:
+            try:
+                data = data[self._socket.send(data, socket.MSG_DONTWAIT) :]
+            except BlockingIOError:
+                end_s = time.monotonic() + SEND_S if end_s is None else end_s
+                left_s = end_s - time.monotonic()
+                if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
+                    self._stuck = f"{self.channel_info}: the server takes nothing for {SEND_S:g} s"
+                    raise can.CanOperationError(self._stuck) from None
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._received:
+            return self._received.popleft(), False
+        try:
+            if not select.select((self._socket,), (), (), timeout)[0]:
+                return None, False
+            chunk = self._socket.recv(_RECEIVE_BYTES)
+        except (OSError, ValueError) as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+        if not chunk:
+            raise can.CanOperationError(f"{self.channel_info}: the server closed the connection")
+        self._parse(self._buffer + chunk)
+        return (self._received.popleft() if self._received else None), False
+
+    def _parse(self, buffer: bytes) -> None:
+        end = 0
+        for match in _FRAME.finditer(buffer):
+            end = match.end()
+            identifier, seconds, data, other = match.groups()
+            if other is not None:
+                if other.startswith(b"error"):
+                    raise can.CanOperationError(f"{self.channel_info}: {other.decode('ascii', 'replace')}")
+                continue
+            if len(data) % 2 or len(data) > _LONGEST_DATA or len(identifier) > _LONGEST_IDENTIFIER:
+                shown = match.group()[:_SHOWN].decode("ascii")
+                raise can.CanOperationError(
+                    f"{self.channel_info}: a frame of {len(identifier)} digits of identifier and {len(data)} of data: "
+                    f"{shown}"
+                )
+            self._received.append(
+                can.Message(
+                    timestamp=float(seconds),
+                    arbitration_id=int(identifier, 16),
+                    is_extended_id=len(identifier) != 3,
+                    data=bytearray.fromhex(data.decode("ascii")),
+                    channel=self._channel,
+                )
+            )
+        self._buffer = buffer[end:]
+        if len(self._buffer) > LONGEST_BYTES:
+            raise can.CanOperationError(self._endless(self._buffer))
+
+    def _endless(self, buffer: bytes) -> str:
+        return (
+            f"{self.channel_info}: {len(buffer)} bytes without the end of a message, beginning with "
+            f"{buffer[:_SHOWN]!r}: is this a socketcand server?"
+        )
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._socket.close()
+
+
+@dataclass(frozen=True, slots=True)
+class BusAddress:
+    """Where a bus is.
+
+    Attributes:
+        interface: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the
+            name of any other python-can interface.
+        channel: of the interface, e.g. ``can0``.
+        bitrate_bit_s: of the wire; the kernel's and the hub's buses have theirs already.
+        host, port: of the hub (socketcand only).
+    """
+
+    interface: str
+    channel: str
+    bitrate_bit_s: int = 1_000_000
+    host: str = "127.0.0.1"
+    port: int = 29536
+
+    def __str__(self) -> str:
+        where = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
+        return f"{self.interface}:{self.channel}{where}"
+
+
+@contextmanager
+def bus_errors(address: object) -> Iterator[None]:
+    """Turn what python-can and the operating system raise into BusError; the address says of which bus, or buses."""
+    try:
+        yield
+    except (can.CanError, OSError) as error:
+        raise BusError(str(address), str(error) or type(error).__name__) from error
+
+
+def open_bus(address: BusAddress) -> can.BusABC:
+    """Open one end of a bus.
+
+    A ``virtual`` bus keeps every frame that is not read, without bound (a bounded one would block the *sender* for
+    ever): close the ends that nobody reads. No end receives what it sent itself, but for the SYNCs on ``socketcan``,
+    which come back with their time and ``is_rx`` False (drivers/stream/socketcan.py).
+
+    Raises:
+        BusError: the interface is unknown, the device is absent, or the hub does not answer.
+    """
+    with bus_errors(address):
+        if address.interface == "socketcand":
+            # Not python-can's client: to that one a closed hub looks like silence.
+            return SocketcandBus(address.channel, address.host, address.port)
+        if address.interface == "socketcan":
+            # Not python-can's: that one loses frames while this interpreter is busy, and cannot say how many.
+            return open_socketcan(address.channel)
+    return open_answering_bus(address)
+
+
+def open_answering_bus(address: BusAddress) -> can.BusABC:
+    """As `open_bus`, for whoever answers each frame and keeps none: on ``socketcan`` without a process in between.
+
+    Raises:
+        BusError: as `open_bus`.
+    """
+    if address.interface == "socketcand":
+        return open_bus(address)
+    with bus_errors(address):
+        try:
+            # Users' python-can configuration files must not turn the cell's configuration into another one.
+            return can.Bus(
+                interface=address.interface,
+                channel=address.channel,
+                bitrate=address.bitrate_bit_s,
+                receive_own_messages=False,
+                ignore_config=True,
+            )
+        except (ValueError, TypeError, ImportError, NotImplementedError) as error:
+            raise BusError(str(address), str(error)) from error
+
+
+def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
+    """Send several frames; in one go where the bus has a ``send_burst`` of its own."""
+    burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
+    if burst is not None:
+        burst(messages)
+        return
+    for message in messages:
+        bus.send(message)

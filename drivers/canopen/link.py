@@ -1,0 +1,316 @@
+"""The one reader of a bus: sends, receives, and hands every frame that is no PDO to whom it concerns.
+
+There is no receiving thread: whoever waits for something (an SDO answer, a heartbeat, the answers to a SYNC) reads the
+bus while waiting. See docs/decisions/0002-stream-owns-the-bus.md.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+import can
+
+from drivers.canopen.bus import bus_errors, send_burst
+from drivers.canopen.emcy import describe
+from drivers.canopen.sdo import Clock, ObjectAccess, PumpedSdoClient, SdoPolicy
+from drivers.errors import BusError, NmtRefused
+from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
+
+SYNC_COB_ID = 0x080
+_NMT_COB_ID = 0x000
+SDO_REQUEST = 0x600
+_EMCY, _SDO_ANSWER, HEARTBEAT = 0x080, 0x580, 0x700
+_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
+"""What a drive is told (CiA 301, predefined connection set)."""
+PUMP_S = 1.0
+"""Of handling what has come already, however fast more comes."""
+# linux/can/error.h: classes of an error frame, and what its second byte says of the controller.
+_CONTROLLER, _RESTARTED = 0x004, 0x100
+_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
+
+
+class NmtState(IntEnum):
+    """State in a heartbeat (CiA 301)."""
+
+    BOOT_UP = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+    def __str__(self) -> str:
+        return self.name.replace("_", "-")
+
+
+class NmtCommand(IntEnum):
+    """Command of the NMT master (CiA 301)."""
+
+    START = 1
+    STOP = 2
+    ENTER_PRE_OPERATIONAL = 128
+
+
+def nmt_name(state: int | None) -> str:
+    """Name of an NMT state for a person."""
+    if state is None:
+        return "nothing"
+    return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
+
+
+def command_name(identifier: int) -> str:
+    """Name of a frame that only we should send, for a person."""
+    if identifier == SYNC_COB_ID:
+        return "a SYNC (080h)"
+    if identifier == _NMT_COB_ID:
+        return "an NMT command (000h)"
+    if identifier < SDO_REQUEST:
+        return f"a set-point of node {identifier & 0x7F} ({identifier:03X}h)"
+    if identifier >= HEARTBEAT:
+        return f"a heartbeat with the recorder's own node id {identifier - HEARTBEAT} ({identifier:03X}h)"
+    return f"an SDO request to node {identifier - SDO_REQUEST} ({identifier:03X}h)"
+
+
+class Link:
+    """An open bus and what its nodes last said about themselves.
+
+    Attributes:
+        nmt: last NMT state of each node that sent a heartbeat.
+        heard_ns: when it did, by the clock.
+        answered: nodes that sent any SDO answer.
+        silent: nodes that did not answer when they were last asked, and were not heard since.
+        heard: node ids of which any frame came since the bus was opened.
+        foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request, set-point of one of
+            `axis_ids`), or of our own heartbeat, came that we did not send.
+        own_id: node id of our heartbeat, None before one was chosen.
+        axis_ids: nodes that take set-points from nobody but us.
+        sync_producer: who sends SYNC because we told it to (drivers/stream/sync.py); None while only we do.
+    """
+
+    def __init__(
+        self,
+        address: CellAddress,
+        policy: SdoPolicy,
+        clock: Clock,
+        opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
+    ) -> None:
+        self.address = address
+        self.clock = clock
+        self.policy = policy
+        self.nmt: dict[int, int] = {}
+        self.heard_ns: dict[int, int] = {}
+        self.answered: set[int] = set()
+        self.foreign: dict[int, int] = {}
+        self.silent: set[int] = set()
+        self.heard: set[int] = set()
+        self.own_id: int | None = None
+        self.axis_ids: frozenset[int] = frozenset()
+        self.sync_producer: str | None = None
+        self._beat: can.Message | None = None
+        self._beat_period_ns = 0
+        self._next_beat_ns = 0
+        self._opener = opener
+        self._bus: can.BusABC | None = None
+        self._clients: dict[int, list[PumpedSdoClient]] = {}
+        self._access: dict[tuple[int, SdoPolicy], ObjectAccess] = {}
+        self._events: deque[tuple[int, EventKind, int, str]] = deque()
+
+    def open(self) -> None:
+        """Open the bus.
+
+        Raises:
+            BusError: it cannot be opened.
+        """
+        self._bus = self._opener(self.address)
+
+    def close(self) -> None:
+        """Close the bus; nothing happens when it is closed already."""
+        if self._bus is not None:
+            self._bus.shutdown()
+        self._bus = self._beat = None
+
+    @property
+    def bus(self) -> can.BusABC:
+        """The open bus.
+
+        Raises:
+            BusError: it is not open.
+        """
+        if self._bus is None:
+            raise BusError(str(self.address), "is not open; use the network as a context manager")
+        return self._bus
+
+    def send(self, messages: Sequence[can.Message]) -> None:
+        """Send frames in their order.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        with bus_errors(self.address):
+            send_burst(self.bus, messages)
+
+    def pump(self, timeout_s: float) -> None:
+        """Handle one frame, waiting for it at most ``timeout_s``, or with 0 all that have already come, for PUMP_S.
+
+        Raises:
+            BusError: the bus has gone, or is off.
+        """
+        self.beat()
+        with bus_errors(self.address):
+            message = self.bus.recv(timeout_s)
+            end_ns = self.clock() + round(PUMP_S * 1e9) if timeout_s == 0 else 0
+            while message is not None:
+                self.dispatch(message)
+                message = self.bus.recv(0.0) if self.clock() < end_ns else None
+
+    def wait(self, seconds: float) -> None:
+        """Handle frames for a time.
+
+        Raises:
+            BusError: the bus has gone, or is off.
+        """
+        deadline = self.clock() + round(seconds * 1e9)
+        while (left_ns := deadline - self.clock()) > 0:
+            self.pump(left_ns * 1e-9)
+
+    def start_heartbeat(self, node_id: int, period_ms: int) -> None:
+        """Let the nodes hear us from now on, as a node of this id, whenever somebody reads the bus."""
+        self._beat = can.Message(
+            arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
+        )
+        self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
+
+    def stop_heartbeat(self) -> None:
+        """Fall silent again."""
+        self._beat = None
+
+    def beat(self) -> None:
+        """Send our heartbeat if one is due.
+
+        Raises:
+            BusError: the bus has gone.
+        """
+        if self._beat is not None and (now := self.clock()) >= self._next_beat_ns:
+            self._next_beat_ns = now + self._beat_period_ns
+            self.send((self._beat,))
+
+    def dispatch(self, message: can.Message) -> bool:
+        """Take note of a frame; tells whether it was a heartbeat, EMCY, SDO answer or the command of another master.
+
+        Raises:
+            BusError: an error frame says that the controller went off the bus.
+        """
+        if message.is_error_frame:
+            self._note_error_frame(message)
+        if message.is_error_frame or not message.is_rx:
+            return True  # or a SYNC of ours, which comes back for the sake of its time
+        service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
+        if message.is_extended_id or message.is_remote_frame:
+            return False
+        ours = (service in _RPDOS and node_id in self.axis_ids) or (service == HEARTBEAT and node_id == self.own_id)
+        if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
+            if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
+                self.note_foreign(message.arbitration_id)
+            return True
+        if node_id == 0:
+            return False
+        self.heard.add(node_id)
+        self.silent.discard(node_id)
+        if service == HEARTBEAT and message.data:
+            self._note_heartbeat(node_id, message.data[0] & 0x7F)
+        elif service == _EMCY and len(message.data) == 8:
+            self._note_emcy(node_id, message.data)
+        elif service == _SDO_ANSWER:
+            self.answered.add(node_id)
+            for client in self._clients.get(node_id, ()):
+                client.receive(message.data)
+        else:
+            return False
+        return True
+
+    def _note_heartbeat(self, node_id: int, state: int) -> None:
+        previous = self.nmt.get(node_id)
+        self.nmt[node_id] = state
+        self.heard_ns[node_id] = self.clock()
+        if previous != state:
+            text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
+            self._events.append((node_id, EventKind.NMT, state, text))
+
+    def _note_error_frame(self, message: can.Message) -> None:
+        """What the CAN controller says of itself; the kernel tells each change once."""
+        if message.arbitration_id & BUS_OFF:
+            raise BusError(str(self.address), BUS_OFF_REASON)
+        if message.arbitration_id & _RESTARTED:
+            self._events.append((0, EventKind.CONTROLLER, _RESTARTED, "the CAN controller was restarted"))
+        bits = message.data[1] if message.arbitration_id & _CONTROLLER and len(message.data) > 1 else 0
+        if bits & _PASSIVE:
+            text = "the CAN controller is error passive: check termination, wiring and bit rate"
+            self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
+        elif bits:
+            says = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
+            told = ", ".join(text for mask, text in says if bits & mask) or f"says {bits:02X}h"
+            self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {told}"))
+
+    def note_foreign(self, identifier: int) -> None:
+        """Take note of a frame of a master's, or of our own heartbeat, that neither we nor our SYNC producer sent."""
+        self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
+        if self.foreign[identifier] == 1:  # told once: a master would fill the log
+            self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
+
+    def _note_emcy(self, node_id: int, data: bytearray) -> None:
+        code, register = int.from_bytes(data[:2], "little"), data[2]
+        # CiA 301: codes 00xxh say that an error has gone.
+        kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
+        text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data[3:].hex()}"
+        self._events.append((node_id, kind, code, text))
+
+    def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
+        """Events since the last call, in their order; of nodes that are no axes of ours, with axis None."""
+        if not self._events:
+            return ()
+        taken, self._events = self._events, deque()
+        return tuple(
+            CellEvent(
+                time_ns,
+                node_ids.index(node) if node in node_ids else None,
+                kind,
+                code,
+                f"node {node}: {text}" if node else text,
+            )
+            for node, kind, code, text in taken
+        )
+
+    @property
+    def has_events(self) -> bool:
+        """Whether take_events would return something."""
+        return bool(self._events)
+
+    def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
+        """Access to the object dictionary of a node, with the link's policy or another."""
+        policy = policy or self.policy
+        if (node_id, policy) not in self._access:
+            client = PumpedSdoClient(node_id, self.send, self.pump, self.clock, policy)
+            self._clients.setdefault(node_id, []).append(client)
+            self._access[node_id, policy] = ObjectAccess(node_id, client, policy)
+        return self._access[node_id, policy]
+
+    def command_nmt(self, node_id: int, command: NmtCommand) -> int:
+        """Send an NMT command; node 0 means all. Returns when, by the clock [ns]."""
+        now = self.clock()
+        self.send((can.Message(arbitration_id=0, is_extended_id=False, data=bytes((command, node_id))),))
+        return now
+
+    def confirm_nmt(self, node_id: int, state: NmtState, since_ns: int, within_s: float) -> None:
+        """Wait for a heartbeat with this state that was read after ``since_ns``, by the clock.
+
+        Raises:
+            NmtRefused: none came in time; canopen would have believed the command.
+        """
+        deadline = self.clock() + round(within_s * 1e9)
+        while self.heard_ns.get(node_id, since_ns - 1) < since_ns or self.nmt[node_id] != state:
+            left_ns = deadline - self.clock()
+            if left_ns <= 0:
+                found = self.nmt.get(node_id) if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+                raise NmtRefused(node_id, str(state), nmt_name(found), within_s)
+            self.pump(left_ns * 1e-9)

@@ -1,0 +1,214 @@
+"""PDO mapping: packing objects into frames, writing the mapping in the one order that drives accept, and undoing it.
+
+Source: CiA 301, objects 1400h–1BFFh: communication parameters (COB-ID with bit 31 = not valid, transmission type) and
+mapping parameters (count, then index << 16 | subindex << 8 | bits).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from drivers.canopen.sdo import ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX, ObjectAccess
+from drivers.errors import MappingRefused, ObjectAccessError
+from drivers.profiles.profile import Axis, ObjectEntry
+
+PDO_BYTES = 8
+PDOS = 4
+"""The predefined connection set names four PDOs a direction."""
+NOT_VALID = 1 << 31
+_COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
+SYNCHRONOUS = 1
+"""Transmission type: sent, or acted upon, at every SYNC."""
+
+STATUSWORD = ObjectEntry(0x6041, 0, 16, signed=False)
+CONTROLWORD = ObjectEntry(0x6040, 0, 16, signed=False)
+TARGET_POSITION = ObjectEntry(0x607A, 0, 32, signed=True)
+PROFILE_VELOCITY = ObjectEntry(0x6081, 0, 32, signed=False)
+PROFILE_ACCELERATION = ObjectEntry(0x6083, 0, 32, signed=False)
+PROFILE_DECELERATION = ObjectEntry(0x6084, 0, 32, signed=False)
+
+_CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (32, True): "i", (32, False): "I"}
+
+
+class Direction(Enum):
+    """Of a PDO as the drive sees it: (communication index, mapping index, first COB-ID)."""
+
+    TPDO = (0x1800, 0x1A00, 0x180)
+    RPDO = (0x1400, 0x1600, 0x200)
+
+
+@dataclass(frozen=True, slots=True)
+class PdoRecord:
+    """What a drive's dictionary says about one PDO.
+
+    Attributes:
+        direction, number: which PDO; numbers from 0.
+        cob_id: sub 1 as it is, with its flag bits.
+        transmission: type, sub 2.
+        entries: mapped objects, each as the 32-bit word of the mapping parameter.
+    """
+
+    direction: Direction
+    number: int
+    cob_id: int
+    transmission: int
+    entries: tuple[int, ...]
+
+    def __str__(self) -> str:
+        mapped = " ".join(f"{entry:08X}" for entry in self.entries) or "nothing"
+        return f"{self.name}: COB-ID {self.cob_id:08X}h, type {self.transmission}, {mapped}"
+
+    @property
+    def name(self) -> str:
+        """As the manuals call it."""
+        return f"{self.direction.name}{self.number + 1}"
+
+
+def word(entry: ObjectEntry) -> int:
+    """Mapping parameter of an object."""
+    return entry.index << 16 | entry.subindex << 8 | entry.bits
+
+
+def pack(entries: Sequence[ObjectEntry]) -> tuple[tuple[ObjectEntry, ...], ...]:
+    """Distribute objects over PDOs of at most eight bytes, each into the first that has room.
+
+    Raises:
+        ValueError: an object is no integer of 8, 16 or 32 bits, or more than four PDOs are needed.
+    """
+    pdos: list[list[ObjectEntry]] = []
+    for entry in entries:
+        if (entry.bits, entry.signed) not in _CODES:
+            raise ValueError(f"object {entry} has {entry.bits} bits; only 8, 16 and 32 can be decoded")
+        for pdo in pdos:
+            if sum(other.bits for other in pdo) + entry.bits <= 8 * PDO_BYTES:
+                pdo.append(entry)
+                break
+        else:
+            pdos.append([entry])
+    if len(pdos) > PDOS:
+        raise ValueError(f"{len(entries)} objects need {len(pdos)} PDOs, a drive has {PDOS}")
+    return tuple(tuple(pdo) for pdo in pdos)
+
+
+def layout(entries: Sequence[ObjectEntry]) -> struct.Struct:
+    """The payload of a PDO: little endian, at constant offsets."""
+    return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
+
+
+def records(direction: Direction, node_id: int, pdos: Sequence[Sequence[ObjectEntry]]) -> tuple[PdoRecord, ...]:
+    """Synchronous PDOs with the predefined COB-IDs of a node."""
+    return tuple(
+        PdoRecord(direction, number, direction.value[2] + 0x100 * number + node_id, SYNCHRONOUS, tuple(map(word, pdo)))
+        for number, pdo in enumerate(pdos)
+    )
+
+
+def feedback_entries(axis: Axis) -> tuple[ObjectEntry, ...]:
+    """What an axis reports for a Sample: position, current, statusword, in this order."""
+    return (axis.profile.position, axis.profile.current, STATUSWORD)
+
+
+SETPOINT_PDOS = (
+    (CONTROLWORD, TARGET_POSITION),
+    (PROFILE_VELOCITY, PROFILE_ACCELERATION),
+    (PROFILE_DECELERATION,),
+)
+"""What an axis is told. The first alone is sent in the cycle in which all axes start."""
+
+
+def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
+    communication, mapping, _ = direction.value
+    return (
+        ObjectEntry(communication + number, 1, 32, signed=False),
+        ObjectEntry(communication + number, 2, 8, signed=False),
+        ObjectEntry(mapping + number, 0, 8, signed=False),
+    )
+
+
+def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
+    """One PDO as the drive has it, or None when the drive has no such PDO.
+
+    Raises:
+        ObjectAccessError: the drive has it and does not let it be read.
+    """
+    cob_id, transmission, count = _parameters(direction, number)
+    try:
+        identifier = access.read(cob_id)
+    except ObjectAccessError as error:
+        if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
+            return None
+        raise
+    mapped = access.read(count)
+    entries = tuple(access.read(ObjectEntry(count.index, sub, 32, signed=False)) for sub in range(1, mapped + 1))
+    return PdoRecord(direction, number, identifier, access.read(transmission), entries)
+
+
+def write_record(access: ObjectAccess, record: PdoRecord) -> None:
+    """Write one PDO, read it back and compare.
+
+    Drives accept this order alone: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid.
+
+    Raises:
+        MappingRefused: a step was aborted, or it reads back differently.
+    """
+    cob_id, transmission, count = _parameters(record.direction, record.number)
+    steps = [(cob_id, access.read(cob_id) | NOT_VALID), (count, 0)]
+    steps += [
+        (ObjectEntry(count.index, sub, 32, signed=False), entry) for sub, entry in enumerate(record.entries, start=1)
+    ]
+    steps += [(transmission, record.transmission), (count, len(record.entries)), (cob_id, record.cob_id)]
+    for entry, value in steps:
+        try:
+            access.write(entry, value)
+        except ObjectAccessError as error:
+            reason = f"writing {value:#x} to {entry}: {error.reason}"
+            raise MappingRefused(access.node_id, record.name, reason) from error
+    found = read_record(access, record.direction, record.number)
+    if found is None or not _same(found, record):
+        raise MappingRefused(access.node_id, record.name, f"reads back as '{found}', written was '{record}'")
+
+
+def switch_off(access: ObjectAccess, record: PdoRecord) -> None:
+    """Make a PDO not valid and leave its mapping alone.
+
+    Raises:
+        MappingRefused: the drive does not let it be switched off.
+    """
+    _write_cob_id(access, record, record.cob_id | NOT_VALID)
+
+
+def restore(access: ObjectAccess, record: PdoRecord) -> None:
+    """Give a PDO back what it had, with as few writes as that needs.
+
+    Raises:
+        MappingRefused: a step was aborted, or it reads back differently.
+    """
+    found = read_record(access, record.direction, record.number)
+    if found == record:
+        return
+    if found is not None and (found.entries, found.transmission) == (record.entries, record.transmission):
+        _write_cob_id(access, record, record.cob_id)
+    else:
+        write_record(access, record)
+
+
+def _write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
+    cob_id, _, _ = _parameters(record.direction, record.number)
+    try:
+        if not value & NOT_VALID:
+            access.write(cob_id, access.read(cob_id) | NOT_VALID)  # the rest may change only then
+        access.write(cob_id, value)
+        found = access.read(cob_id)
+    except ObjectAccessError as error:
+        reason = f"writing {value:#x} to {cob_id}: {error.reason}"
+        raise MappingRefused(access.node_id, record.name, reason) from error
+    if (found ^ value) & _COB_ID_BITS:
+        raise MappingRefused(access.node_id, record.name, f"{cob_id} reads back as {found:#x}, written was {value:#x}")
+
+
+def _same(one: PdoRecord, other: PdoRecord) -> bool:
+    identical = one.entries == other.entries and one.transmission == other.transmission
+    return identical and (one.cob_id ^ other.cob_id) & _COB_ID_BITS == 0

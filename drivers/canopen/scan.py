@@ -1,0 +1,134 @@
+"""Who is on a bus, found without changing anything there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import can
+
+from drivers.canopen.link import Link
+from drivers.canopen.pdo import STATUSWORD
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import NodeMissing, ObjectAccessError
+from drivers.profiles.cia402 import State, decode
+from drivers.profiles.profile import Identity, ObjectEntry
+
+VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
+PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
+REVISION = ObjectEntry(0x1018, 3, 32, signed=False)
+SERIAL = ObjectEntry(0x1018, 4, 32, signed=False)
+_READ_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+
+
+@dataclass(frozen=True, slots=True)
+class FoundNode:
+    """One node of a bus, as far as it tells.
+
+    Attributes:
+        node_id: of the node.
+        identity: object 1018h, or None when it answers no SDO (it may be stopped).
+        revision: 1018h:03, or None.
+        device_name: 1008h, or None.
+        nmt: NMT state of its last heartbeat, or None when it sends none.
+        statusword: 6041h, or None when it is no CiA 402 drive.
+    """
+
+    node_id: int
+    identity: Identity | None
+    revision: int | None
+    device_name: str | None
+    nmt: int | None
+    statusword: int | None
+
+    @property
+    def state(self) -> State | None:
+        """CiA 402 state, or None when it is no drive."""
+        return None if self.statusword is None else decode(self.statusword)
+
+
+def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
+    """All nodes that answer an SDO request or send a heartbeat within a time.
+
+    Raises:
+        BusError: the bus has gone.
+    """
+    answered = answering(link, node_ids, wait_s)
+    alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
+    return tuple(_describe(link, node_id, node_id in answered) for node_id in alive)
+
+
+def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
+    """Make sure that all these nodes answer SDO requests.
+
+    Raises:
+        NodeMissing: some do not.
+    """
+    answered = answering(link, node_ids, wait_s)
+    missing = tuple(node_id for node_id in node_ids if node_id not in answered)
+    if missing:
+        raise NodeMissing(missing, answered, wait_s)
+
+
+def read_identity(access: ObjectAccess) -> Identity:
+    """Object 1018h; a node that has no serial number there reports None.
+
+    Raises:
+        ObjectAccessError: it does not tell vendor and product.
+    """
+    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
+
+
+def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Nodes that answer an SDO request; all are asked at once, and the bound is for all together.
+
+    Raises:
+        BusError: the bus has gone.
+    """
+    asked = set(node_ids)
+    link.answered.clear()
+    _ask(link, node_ids)
+    deadline = link.clock() + round(wait_s * 1e9)
+    while not asked <= link.answered and (left_ns := deadline - link.clock()) > 0:
+        link.pump(left_ns * 1e-9)
+    return tuple(sorted(asked & link.answered))
+
+
+def unused(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Find node ids of which nothing came since the bus was opened, and no answer to an SDO request within a time.
+
+    Raises:
+        BusError: the bus has gone.
+    """
+    _ask(link, node_ids)
+    link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone
+    return tuple(node_id for node_id in node_ids if node_id not in link.heard)
+
+
+def _ask(link: Link, node_ids: Sequence[int]) -> None:
+    link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])
+
+
+def _describe(link: Link, node_id: int, answers: bool) -> FoundNode:
+    nmt = link.nmt.get(node_id)
+    if not answers:
+        return FoundNode(node_id, None, None, None, nmt, None)
+    access = link.objects(node_id)
+    try:
+        identity = read_identity(access)
+    except ObjectAccessError:
+        identity = None
+    try:
+        name = access.read_text(0x1008)
+    except ObjectAccessError:
+        name = None
+    return FoundNode(node_id, identity, _optional(access, REVISION), name, nmt, _optional(access, STATUSWORD))
+
+
+def _optional(access: ObjectAccess, entry: ObjectEntry) -> int | None:
+    try:
+        return access.read(entry)
+    except ObjectAccessError as error:
+        if error.abort_code is None:
+            raise
+        return None

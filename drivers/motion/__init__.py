@@ -1,0 +1,1 @@
+"""Moves of a cell, and everything that stops them."""

@@ -1,0 +1,342 @@
+"""Walking a list of moves through CiA 402 profile position mode, one Sample after the other.
+
+Source: CiA 402-2, profile position mode: a set-point is taken on the rising edge of controlword bit 4, acknowledged by
+statusword bit 12, and reached at bit 10. Set-points go by synchronous RPDOs, so that all axes start on the same SYNC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+
+import can
+
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.pdo import SETPOINT_PDOS, Direction, layout
+from drivers.errors import WHILE, DataFrozen, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
+from drivers.motion.move import MotionPermission, Move, check_moves
+from drivers.motion.watch import FrozenData
+from drivers.profiles.cia402 import (
+    CONTROL_CHANGE_IMMEDIATELY,
+    CONTROL_NEW_SETPOINT,
+    POWERLESS,
+    STATUS_SETPOINT_ACKNOWLEDGE,
+    STATUS_TARGET_REACHED,
+    Command,
+    Goal,
+    State,
+    decode,
+    next_command,
+)
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+
+_LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
+_ENABLED = Command.ENABLE_OPERATION
+
+
+@dataclass(frozen=True, slots=True)
+class MotionBounds:
+    """How long the drives may take, in the time of the samples [s], and how near a target is.
+
+    Attributes:
+        enable_s: from the first controlword to OPERATION ENABLED.
+        acknowledge_s: from a set-point to bit 12, and from its end to bit 12 cleared.
+        settle_s: added to a move's computed duration.
+        stop_s: from the quick stop to standstill without power.
+        standstill_cycles, standstill_counts: an axis that stays in QUICK STOP ACTIVE stands, and loses its power, when
+            its position has kept within so many counts for so many cycles. An encoder at rest never shows one count
+            for ever: one of 20 bits a turn flickers by several. 16 counts in 20 cycles of 1 ms are at most
+            800 counts/s, 0.3 deg/s of such a motor, which no brake minds.
+        arrival_counts, arrival_fraction: a target that bit 10 calls reached must be as near as this, in counts plus a
+            fraction of the distance: it catches a drive whose bit 10 is still that of the move before.
+    """
+
+    enable_s: float = 3.0
+    acknowledge_s: float = 0.5
+    settle_s: float = 3.0
+    stop_s: float = 3.0
+    standstill_cycles: int = 20
+    standstill_counts: int = 16
+    arrival_counts: int = 2000
+    arrival_fraction: float = 0.05
+
+
+DEFAULT_BOUNDS = MotionBounds()
+
+
+def execute(
+    network: CanopenNetwork,
+    stream: SyncStream,
+    moves: Sequence[Move],
+    permission: MotionPermission | None,
+    bounds: MotionBounds = DEFAULT_BOUNDS,
+) -> Generator[Sample, None, None]:
+    """Enable all axes, make the moves, disable all axes; yields every Sample on the way.
+
+    Whatever ends it, the last word is quick stop, then power off, confirmed as far as the bus allows. Close it
+    (``contextlib.closing``) when the loop around it may be left early; leaving the network stops the axes as well.
+
+    Raises:
+        MotionRefused: no permission, or a move outside of it; nothing has moved.
+        StateRefused: an axis did not become OPERATION ENABLED, or could not be stopped.
+        MotionTimeout: a move did not end in its bound.
+        DataFrozen: an axis is told to move, and its position and current stay what they are.
+        DriveFault, HeartbeatLost, SampleLost, BusError, NodeMisplaced: see the stream.
+    """
+    if permission is None:
+        raise MotionRefused("no permission: nothing moves unless somebody says so (MotionPermission)")
+    first = next(stream)
+    yield first
+    while first.missing:  # where an axis is must be known before it is told where to go
+        first = next(stream)
+        yield first
+    check_moves(first.position_counts, moves, permission, tuple(axis.name for axis in network.axes))
+    if not moves:
+        return
+    walk = _Walk(network, stream, bounds, first)
+    network.guard()
+    try:
+        yield from walk.enable(permission.granted_by)
+        for number, move in enumerate(moves):
+            yield from walk.move(number, move)
+        problems = yield from walk.stop()
+        if not problems:  # amplifiers that were not seen to stand go on watching us
+            network.unguard()
+    except BaseException as error:
+        # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
+        with network.undisturbed():
+            walk.ended_by(error)
+            problems = _drain(walk.stop())
+            if not problems:
+                network.unguard()
+        for problem in problems:
+            error.add_note(f"{WHILE}stopping: {problem}")
+        raise
+    if problems:
+        for problem in problems[1:]:
+            problems[0].add_note(f"{WHILE}stopping: {problem}")
+        raise problems[0]
+    stream.check()  # what happened during the stop
+
+
+def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError]:
+    while True:
+        try:
+            next(stop)
+        except StopIteration as end:
+            problems: list[DriverError] = end.value
+            return problems
+        except BaseException as cut:
+            cut.add_note(f"{WHILE}stopping: the stop was cut short")
+            raise
+
+
+class _Walk:
+    """One run of ``execute``: the stream, the last sample and what each axis was told last."""
+
+    def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
+        self._network = network
+        self._stream = stream
+        self._bounds = bounds
+        self._sample = first
+        self._nodes = network.node_ids
+        self._axes = range(len(network.axes))
+        self._targets = list(first.position_counts)
+        self._told: list[tuple[int, int] | None] = [None] * len(network.axes)
+
+    def _cycles(self, seconds: float) -> int:
+        return max(1, round(seconds * 1e9 / self._stream.pacing.period_ns))
+
+    def _next(self) -> Sample:
+        self._sample = next(self._stream)
+        return self._sample
+
+    def _state(self, axis: int) -> State:
+        return decode(self._sample.statusword[axis])
+
+    def _tell(self, axis: int, controlword: int, repeat: bool = False) -> None:
+        """Controlword and target of one axis, with the next SYNC; said again only when asked."""
+        told = (controlword, self._targets[axis])
+        if repeat or self._told[axis] != told:
+            self._told[axis] = told
+            self._stream.send((_frame(self._nodes[axis], 0, controlword, self._targets[axis]),))
+
+    def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
+        self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
+
+    def enable(self, granted_by: str) -> Iterator[Sample]:
+        """Bring all axes to OPERATION ENABLED, each holding where it is."""
+        self._emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
+        for axis in self._axes:
+            if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                self._refuse(axis)
+        for cycle in range(self._cycles(self._bounds.enable_s)):
+            waiting = [axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED]
+            if not waiting:
+                return
+            for axis in waiting:
+                # A target that is not the position would be a jump on enabling.
+                self._targets[axis] = self._sample.position_counts[axis]
+                self._tell(axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0)
+            yield self._next()
+        for axis in self._axes:
+            if self._state(axis) is not State.OPERATION_ENABLED:
+                self._refuse(axis)
+
+    def _refuse(self, axis: int) -> None:
+        word = self._sample.statusword[axis]
+        raise StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
+
+    def move(self, number: int, move: Move) -> Iterator[Sample]:
+        """One move of all axes that have a way to go, and the dwell after it."""
+        start = tuple(self._targets)
+        moving = [axis for axis in self._axes if move.target_counts[axis] != start[axis]]
+        for axis in moving:
+            # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
+            profile = (move.velocity_counts_s[axis], move.acceleration_counts_s2[axis])
+            self._stream.send((_frame(self._nodes[axis], 1, *profile), _frame(self._nodes[axis], 2, profile[1])))
+            yield self._checked()
+        for axis in moving:
+            self._targets[axis] = move.target_counts[axis]
+            self._tell(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
+        sample = self._checked()
+        self._emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
+        yield sample
+        yield from self._handshake(number, moving)
+        durations = move.duration_s(start)
+        allowed = 2 * max(durations) + self._bounds.settle_s
+        data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
+        for _ in range(self._cycles(allowed)):
+            for axis in data.frozen(self._sample):
+                if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
+                    self._freeze(number, axis)
+            if all(self._arrived(axis, start[axis]) for axis in moving):
+                break
+            yield self._checked()
+        else:
+            late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
+            if late:
+                raise MotionTimeout(number, late, allowed)
+        self._emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
+        for _ in range(move.dwell_cycles):
+            yield self._checked()
+
+    def _freeze(self, number: int, axis: int) -> None:
+        position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
+        error = DataFrozen(number, self._nodes[axis], position, current)
+        self._emit(axis, EventKind.FROZEN, number, str(error))
+        raise error
+
+    def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
+        """New set-point on all axes with the same SYNC, acknowledged, and taken back."""
+        rising = _ENABLED | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
+        bound = self._cycles(self._bounds.acknowledge_s)
+        for wanted, controlword in ((STATUS_SETPOINT_ACKNOWLEDGE, rising), (0, int(_ENABLED))):
+            waiting = list(moving)
+            for _ in range(bound):
+                for axis in waiting:
+                    # Said every cycle until acknowledged: some drives act on the second controlword only.
+                    self._tell(axis, controlword, repeat=True)
+                if not waiting:
+                    break
+                yield self._checked()
+                waiting = [
+                    axis for axis in moving if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE != wanted
+                ]
+            if waiting:
+                raise MotionTimeout(number, tuple(waiting), self._bounds.acknowledge_s)
+
+    def _arrived(self, axis: int, start: int) -> bool:
+        tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(self._targets[axis] - start)
+        near = abs(self._sample.position_counts[axis] - self._targets[axis]) <= tolerance
+        return near and bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)
+
+    def _checked(self) -> Sample:
+        """The next sample, of axes that all still hold."""
+        sample = self._next()
+        for axis in self._axes:
+            if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
+                word = sample.statusword[axis]
+                self._stream.check()  # what the drive itself says of it
+                raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
+        return sample
+
+    def ended_by(self, error: BaseException) -> None:
+        """Say why the moves are not made."""
+        self._emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
+
+    def stop(self) -> Generator[Sample, None, list[DriverError]]:
+        """Quick stop and power off for all axes; returns what could not be confirmed."""
+        self._stream.drop_outgoing()  # a set-point that nobody has seen yet must not start a move now
+        self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        problems: list[DriverError] = []
+        unconfirmed = tuple(self._axes)
+        try:
+            unconfirmed = yield from self._stop_by_pdo()
+            # What the last cycle left is counted before SDO answers are looked for among it.
+            self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
+        except DriverError as error:
+            # It may be one of several buses, or a node in a wrong place: those that can be reached are asked by SDO.
+            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            problems.append(error)
+        try:
+            silent = self._network.find_silent([self._network.axes[axis] for axis in unconfirmed])
+        except DriverError as error:
+            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            return problems or [error]
+        if silent is not None:
+            problems.append(silent)
+        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis] not in silent.node_ids]
+        if heard:
+            self._network.begin_stop([self._network.axes[axis] for axis in heard])
+        for axis in unconfirmed:
+            if axis not in heard:
+                text = f"node {self._nodes[axis]} does not answer: it is not known to stand"
+                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+                continue
+            try:
+                self._network.disable(self._network.axes[axis])
+            except DriverError as error:
+                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                problems.append(error)
+        return problems
+
+    def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
+        """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm it."""
+        still, rest = [0] * len(self._told), list(self._sample.position_counts)
+        silent = 0
+        powered = list(self._axes)
+        for cycle in range(self._cycles(self._bounds.stop_s)):
+            for axis in powered:
+                state = self._state(axis)
+                resting = state is State.QUICK_STOP_ACTIVE and still[axis] >= self._bounds.standstill_cycles
+                goal = Goal.SWITCH_ON_DISABLED if resting else Goal.QUICK_STOP
+                self._tell(axis, next_command(state, goal), repeat=cycle % 10 == 0)
+            self._sample = self._stream.advance()
+            yield self._sample
+            for axis, position in enumerate(self._sample.position_counts):
+                # Against where it came to rest, not against the cycle before: creeping is no standstill.
+                near = abs(position - rest[axis]) <= self._bounds.standstill_counts
+                known = not self._sample.missing >> axis & 1
+                still[axis] = still[axis] + 1 if near and known else 0
+                rest[axis] = rest[axis] if near else position
+            silent = silent + 1 if self._sample.missing else 0
+            powered = [
+                axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
+            ]
+            patience = (
+                0
+                if self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
+                else (self._stream.max_missing_cycles)
+            )
+            if not powered or silent > patience:
+                break
+        return tuple(powered)
+
+
+def _frame(node_id: int, pdo: int, *values: int) -> can.Message:
+    """One RPDO of the set-point mapping."""
+    cob_id = Direction.RPDO.value[2] + 0x100 * pdo + node_id
+    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=_LAYOUTS[pdo].pack(*values))

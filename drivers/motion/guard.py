@@ -1,0 +1,163 @@
+"""Amplifiers that stop by themselves when the recorder falls silent: killed, hung, or cut off.
+
+The recorder sends a heartbeat while axes have power. Each amplifier watches it (CiA 301, consumer heartbeat time 1016h,
+which begins with the first heartbeat) and, when none comes, does what its abort connection option code says (CiA 402-2,
+6007h): quick stop.
+
+A heartbeat does not say who sends it. That of another device with the recorder's node id would keep the axes running
+after the recorder was killed, so the recorder takes an id that no device uses, and a foreign heartbeat with it is a
+fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import ObjectAccessError
+from drivers.profiles.profile import ObjectEntry
+
+CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
+ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
+QUICK_STOP_ON_LOSS = 3
+MOST_CONSUMERS = 127
+"""Entries that 1016h can have (CiA 301)."""
+LOWEST_USUAL_ID = 112
+"""The recorder takes the highest id that is free: this one or a higher one on any usual bus."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """How an amplifier can watch the recorder, and what its objects held before.
+
+    Attributes:
+        consumer: entry of 1016h that is used, None when there is none.
+        consumer_before: its value.
+        option_before: value of 6007h, None when the amplifier has no such object.
+        lack: what it cannot do, for a person; empty when it does all.
+    """
+
+    consumer: ObjectEntry | None
+    consumer_before: int
+    option_before: int | None
+    lack: str = ""
+
+
+Consumers = tuple[tuple[ObjectEntry, int], ...]
+"""Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
+
+
+def producer_of(value: int) -> int:
+    """Node id that an entry of 1016h watches, 0 where it watches none."""
+    return value >> 16 & 0x7F if value & 0xFFFF else 0
+
+
+def is_left_over(value: int, recorder_id: int, silence_ms: int, heard: Collection[int]) -> bool:
+    """Whether an entry of 1016h watches a recorder that was killed.
+
+    Args:
+        value: of the entry.
+        recorder_id: of the recorder now. Another device may have had it use another id then.
+        silence_ms: that it lets the amplifiers bear.
+        heard: node ids of devices that are there: an entry that watches one of them is in use.
+    """
+    producer = producer_of(value)
+    usual = producer >= LOWEST_USUAL_ID and value & 0xFFFF == silence_ms
+    return producer not in {0, *heard} and (producer == recorder_id or usual)
+
+
+def read_consumers(access: ObjectAccess) -> Consumers | None:
+    """Read 1016h, up to the first entry that cannot be read; None where the amplifier has no such object.
+
+    Raises:
+        ObjectAccessError: the node does not answer.
+    """
+    found: list[tuple[ObjectEntry, int]] = []
+    try:
+        for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
+            entry = ObjectEntry(CONSUMERS.index, sub, 32, signed=False)
+            found.append((entry, access.read(entry)))
+    except ObjectAccessError as error:
+        if error.abort_code is None:
+            raise
+        return tuple(found) or None
+    return tuple(found)
+
+
+def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> Guard:
+    """Choose a free entry of 1016h; one that still watches a recorder that was killed is used again.
+
+    Args:
+        access: to the node.
+        consumers: its 1016h.
+        left_over: `is_left_over`, of an entry's value.
+
+    Raises:
+        ObjectAccessError: the node does not answer; an object that it lacks is reported in `Guard.lack`.
+    """
+    if consumers is None:
+        return Guard(None, 0, None, "no 1016h: it does NOT stop by itself when the recorder is killed")
+    for entry, value in consumers:
+        if (ours := left_over(value)) or not value & 0xFFFF:
+            return Guard(entry, 0 if ours else value, *_option(access))
+    return Guard(None, 0, None, "no free 1016h: it does NOT stop by itself when the recorder is killed")
+
+
+def _option(access: ObjectAccess) -> tuple[int | None, str]:
+    try:
+        return access.read(ABORT_CONNECTION), ""
+    except ObjectAccessError as error:
+        if error.abort_code is None:
+            raise
+        return None, "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+
+
+def arm(access: ObjectAccess, guard: Guard, recorder_id: int, silence_ms: int) -> Guard:
+    """Let the amplifier quick stop after so much silence of the recorder; counted from its first heartbeat.
+
+    Returns:
+        the guard as it is in force: an amplifier that refuses one of the writes lacks that, and is no reason not to
+        record.
+
+    Raises:
+        ObjectAccessError: it does not answer.
+    """
+    consumer = guard.consumer
+    if consumer is None:
+        return guard
+    if guard.option_before is not None:
+        refused = _refused(access, ABORT_CONNECTION, QUICK_STOP_ON_LOSS)
+        if refused:
+            lack = f"6007h = {guard.option_before} rules how it stops when the recorder is killed: 3 is {refused}"
+            guard = replace(guard, option_before=None, lack=lack)
+    refused = _refused(access, consumer, recorder_id << 16 | silence_ms)
+    if refused:
+        if guard.option_before is not None:
+            access.write(ABORT_CONNECTION, guard.option_before)
+        lack = f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
+        guard = replace(guard, consumer=None, option_before=None, lack=lack)
+    return guard
+
+
+def _refused(access: ObjectAccess, entry: ObjectEntry, value: int) -> str:
+    try:
+        access.write(entry, value)
+    except ObjectAccessError as error:
+        if error.abort_code is None:
+            raise
+        return error.reason
+    return ""
+
+
+def disarm(access: ObjectAccess, guard: Guard) -> None:
+    """Give back what was there.
+
+    Raises:
+        ObjectAccessError: a write was refused or not answered.
+    """
+    if guard.consumer is None:
+        return
+    access.write(guard.consumer, guard.consumer_before)
+    if guard.option_before is not None:
+        access.write(ABORT_CONNECTION, guard.option_before)

@@ -1,0 +1,219 @@
+"""What an axis is asked to do, and what it may do: moves, limits, permission. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import MotionRefused
+
+# Synchronised trapezoidal point-to-point moves: all axes start and end together.
+
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Trapezoid:
+    """One move of n axes with a trapezoidal velocity profile.
+
+    Every axis accelerates for ``ramp_s``, cruises, and decelerates for ``ramp_s``; because the ramps are shared, any
+    linear combination of axes (a coupled motor) moves on a trapezoid of the same times.
+
+    Attributes:
+        start, end: positions [any unit], shape (n,).
+        duration_s: from start to end [s].
+        ramp_s: of acceleration, and of deceleration [s].
+    """
+
+    start: FloatArray
+    end: FloatArray
+    duration_s: float
+    ramp_s: float
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Signed cruise velocity of each axis [unit/s], shape (n,)."""
+        cruise_s = self.duration_s - self.ramp_s
+        return (self.end - self.start) / cruise_s if cruise_s > 0 else np.zeros_like(self.start)
+
+    @property
+    def acceleration(self) -> FloatArray:
+        """Signed acceleration of the first ramp of each axis [unit/s²], shape (n,)."""
+        return self.velocity / self.ramp_s if self.ramp_s > 0 else np.zeros_like(self.start)
+
+    def at(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Position, velocity and acceleration at the given times, each of shape (len(time_s), n)."""
+        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)[:, None]
+        rising = np.minimum(t, self.ramp_s)
+        falling = np.maximum(t - (self.duration_s - self.ramp_s), 0.0)
+        acceleration, velocity = self.acceleration, self.velocity
+        distance = 0.5 * acceleration * rising**2 + velocity * (t - rising) - 0.5 * acceleration * falling**2
+        speed = acceleration * (rising - falling)
+        inside = (np.asarray(time_s)[:, None] >= 0.0) & (np.asarray(time_s)[:, None] < self.duration_s)
+        phase = np.where(t < self.ramp_s, 1.0, 0.0) - np.where(t > self.duration_s - self.ramp_s, 1.0, 0.0)
+        return self.start + distance, np.where(inside, speed, 0.0), np.where(inside, acceleration * phase, 0.0)
+
+
+def synchronised(
+    start: FloatArray,
+    end: FloatArray,
+    velocity_limit: FloatArray,
+    acceleration_limit: FloatArray,
+) -> Trapezoid:
+    """The fastest trapezoid that keeps every axis within its limits and lets all axes end together.
+
+    Args:
+        start, end: positions, shape (n,).
+        velocity_limit, acceleration_limit: positive limits in the same unit per s and s², shape (n,).
+
+    Raises:
+        ValueError: a limit is not positive.
+    """
+    start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    if np.any(np.asarray(velocity_limit) <= 0) or np.any(np.asarray(acceleration_limit) <= 0):
+        raise ValueError(f"limits must be positive, found {velocity_limit!r} and {acceleration_limit!r}")
+    distance = np.abs(end - start)
+    if not distance.any():
+        return Trapezoid(start, end, 0.0, 0.0)
+    # Normalised to the path 0..1, the slowest axis in each of velocity and acceleration rules all.
+    with np.errstate(divide="ignore"):
+        rate = float(np.min(np.where(distance > 0, velocity_limit / np.maximum(distance, 1e-300), np.inf)))
+        ramp_rate = float(np.min(np.where(distance > 0, acceleration_limit / np.maximum(distance, 1e-300), np.inf)))
+    ramp_s = min(rate / ramp_rate, ramp_rate**-0.5)
+    cruise_s = 1.0 / (ramp_rate * ramp_s)
+    return Trapezoid(start, end, cruise_s + ramp_s, ramp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLimits:
+    """What one motor may do, in its drive's counts.
+
+    Attributes:
+        position_min_counts, position_max_counts: where its targets may be.
+        velocity_counts_s, acceleration_counts_s2: not to be exceeded.
+    """
+
+    position_min_counts: int
+    position_max_counts: int
+    velocity_counts_s: float
+    acceleration_counts_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One synchronised point-to-point move in profile position mode.
+
+    Attributes:
+        target_counts: absolute, of each axis.
+        velocity_counts_s, acceleration_counts_s2: profile of each axis (6081h; 6083h and 6084h); of an axis that stays
+            where it is they are not sent.
+        dwell_cycles: samples to wait at the target.
+    """
+
+    target_counts: tuple[int, ...]
+    velocity_counts_s: tuple[int, ...]
+    acceleration_counts_s2: tuple[int, ...]
+    dwell_cycles: int = 0
+
+    def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
+        """How long each axis moves from these positions, with the profile's whole numbers."""
+        return tuple(
+            trapezoid_duration_s(abs(target - start), velocity, acceleration) if target != start else 0.0
+            for start, target, velocity, acceleration in zip(
+                start_counts, self.target_counts, self.velocity_counts_s, self.acceleration_counts_s2, strict=True
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPermission:
+    """Somebody's word that these axes may move now, and how far; without it nothing moves.
+
+    Attributes:
+        granted_by: the person or the policy that takes the responsibility; it is logged.
+        limits: one for each axis.
+    """
+
+    granted_by: str
+    limits: tuple[AxisLimits, ...]
+
+
+def trapezoid_duration_s(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float) -> float:
+    """Duration of a trapezoid, or of the triangle that it is when the velocity is not reached [s]."""
+    if distance_counts * acceleration_counts_s2 < velocity_counts_s**2:
+        return 2.0 * math.sqrt(distance_counts / acceleration_counts_s2)
+    return distance_counts / velocity_counts_s + velocity_counts_s / acceleration_counts_s2
+
+
+def synchronised_move(
+    start_counts: Sequence[int], target_counts: Sequence[int], limits: Sequence[AxisLimits], dwell_cycles: int = 0
+) -> Move:
+    """The fastest move within the limits in which all axes start and end together.
+
+    The drives take whole numbers. The velocity is rounded up and the acceleration then chosen for the common duration,
+    so only its rounding, on the ramp alone, is left as a difference of the end times.
+
+    Raises:
+        ValueError: a limit is not above 2 counts/s or counts/s².
+    """
+    start, target = np.asarray(start_counts, dtype=np.float64), np.asarray(target_counts, dtype=np.float64)
+    # One count less than allowed leaves room for rounding up.
+    path = synchronised(
+        start,
+        target,
+        np.array([limit.velocity_counts_s - 1.0 for limit in limits]),
+        np.array([limit.acceleration_counts_s2 - 1.0 for limit in limits]),
+    )
+    velocities, accelerations = [], []
+    for distance, speed in zip(np.abs(target - start), np.abs(path.velocity), strict=True):
+        velocity = max(1, math.ceil(speed))
+        ramp_s = path.duration_s - distance / velocity
+        velocities.append(velocity)
+        accelerations.append(max(1, round(velocity / ramp_s)) if distance > 0 else 1)
+    return Move(tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles)
+
+
+def check_moves(
+    start_counts: Sequence[int], moves: Sequence[Move], permission: MotionPermission, names: Sequence[str]
+) -> None:
+    """Refuse everything outside of the permission before anything moves.
+
+    Raises:
+        MotionRefused: names the axis, what was asked for and what is allowed.
+    """
+    if not permission.granted_by.strip():
+        raise MotionRefused("the permission does not say who granted it")
+    if len(permission.limits) != len(names):
+        raise MotionRefused(f"the permission has limits for {len(permission.limits)} axes, the cell has {len(names)}")
+    _check_positions("starts at", start_counts, permission, names)
+    here = tuple(start_counts)
+    for number, move in enumerate(moves):
+        where = f"move {number}"
+        profiles = (move.target_counts, move.velocity_counts_s, move.acceleration_counts_s2)
+        if any(len(column) != len(names) for column in profiles):
+            raise MotionRefused(f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes")
+        if move.dwell_cycles < 0:
+            raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
+        _check_positions(f"{where} goes to", move.target_counts, permission, names)
+        for axis, limit in enumerate(permission.limits):
+            if move.target_counts[axis] == here[axis]:
+                continue
+            for what, value, allowed in (
+                ("velocity", move.velocity_counts_s[axis], limit.velocity_counts_s),
+                ("acceleration", move.acceleration_counts_s2[axis], limit.acceleration_counts_s2),
+            ):
+                if not 0 < value <= allowed:
+                    raise MotionRefused(f"{where}: {names[axis]}: {what} {value}, allowed is above 0 up to {allowed:g}")
+        here = move.target_counts
+
+
+def _check_positions(what: str, positions: Sequence[int], permission: MotionPermission, names: Sequence[str]) -> None:
+    for name, position, limit in zip(names, positions, permission.limits, strict=True):
+        if not limit.position_min_counts <= position <= limit.position_max_counts:
+            allowed = f"{limit.position_min_counts} to {limit.position_max_counts} counts"
+            raise MotionRefused(f"{name}: {what} {position} counts, allowed is {allowed}")

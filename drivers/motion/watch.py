@@ -1,0 +1,260 @@
+"""Watching the drives while a stream runs: what they say becomes events, and some of it faults.
+
+Watching never raises: a fault waits until the sample that shows it has been handed out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+
+from drivers.canopen.link import HEARTBEAT, SDO_REQUEST, NmtState, command_name, nmt_name
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import BusBusy, DataStale, DriveFault, DriverError, HeartbeatLost, LimitActive, RecorderIdTaken
+from drivers.motion.move import Move
+from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
+from drivers.profiles.profile import Axis
+from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
+
+# Frozen data: an axis that is told to move while neither its position nor its current changes by one count, and, where
+# an amplifier has a toggle bit, an amplifier that sends its last values again.
+
+
+FROZEN_S = 0.05
+"""Exactly equal values for so long, in the time of the samples. A loop that fights friction changes its current at
+once, and a current that is measured has noise."""
+FROZEN_COUNTS = 64
+"""Way that the set-point must have gone meanwhile: one that creeps or has just begun proves nothing."""
+
+
+def way_counts(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float, time_s: float) -> float:
+    """Way of a symmetric trapezoid from rest after a time, or of the triangle that it is [counts]."""
+    velocity = min(velocity_counts_s, math.sqrt(distance_counts * acceleration_counts_s2))
+    ramp_s = velocity / acceleration_counts_s2
+    duration_s = distance_counts / velocity + ramp_s
+    time_s = min(max(time_s, 0.0), duration_s)
+    rising, falling = min(time_s, ramp_s), max(time_s - (duration_s - ramp_s), 0.0)
+    return (
+        velocity * time_s
+        - 0.5 * velocity * ramp_s
+        + 0.5 * acceleration_counts_s2 * ((ramp_s - rising) ** 2 - falling**2)
+    )
+
+
+class FrozenData:
+    """Looks at the samples of one move; made when the set-points go out.
+
+    Args:
+        move: that the axes make.
+        start_counts: from where.
+        axes: that have a way to go.
+        period_ns: of the samples.
+    """
+
+    def __init__(self, move: Move, start_counts: Sequence[int], axes: Sequence[int], period_ns: int) -> None:
+        self._profiles = {
+            axis: (
+                float(abs(move.target_counts[axis] - start_counts[axis])),
+                float(move.velocity_counts_s[axis]),
+                float(move.acceleration_counts_s2[axis]),
+            )
+            for axis in axes
+        }
+        self._period_s = period_ns * 1e-9
+        self._begin: int | None = None
+        self._last: dict[int, tuple[int, int, int]] = {}
+
+    def frozen(self, sample: Sample) -> tuple[int, ...]:
+        """Axes whose values have been equal for longer than any that moves can be; give it every sample once."""
+        if self._begin is None:
+            self._begin = sample.cycle
+        found = []
+        for axis, profile in self._profiles.items():
+            values = (sample.position_counts[axis], sample.current_raw[axis])
+            last = self._last.get(axis)
+            if last is None or last[:2] != values or sample.missing >> axis & 1:
+                self._last[axis] = (*values, sample.cycle)
+                continue
+            since_s, now_s = ((cycle - self._begin) * self._period_s for cycle in (last[2], sample.cycle))
+            if now_s - since_s >= FROZEN_S and way_counts(*profile, now_s) - way_counts(*profile, since_s) >= (
+                FROZEN_COUNTS
+            ):
+                found.append(axis)
+        return tuple(found)
+
+
+STALE_PERIODS = 2
+"""Of the amplifier's own, and SYNCs, in which its toggle bit stands: less may be its timer against ours."""
+
+
+class ToggleBits:
+    """Looks at the toggle bits of all axes that have one, in every cycle.
+
+    Args:
+        axes: of the cell.
+    """
+
+    def __init__(self, axes: Sequence[Axis]) -> None:
+        self._bits = tuple(
+            (number, axis.node_id, axis.profile.toggle_bit, STALE_PERIODS * 1000 * axis.profile.update_period_us)
+            for number, axis in enumerate(axes)
+            if axis.profile.toggle_bit is not None
+        )
+        # Of each axis: the bit, when it was first seen so, cycles since, whether that was told.
+        self._last: dict[int, tuple[int, int, int, bool]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._bits)
+
+    def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, DataStale]]:
+        """Axes whose bit has stood for too long, each once until it changes again; to be asked in every cycle.
+
+        Args:
+            time_ns: of the samples.
+            statuswords: of all axes.
+            missing: bit i is set when axis i did not answer; what it sent meanwhile is not known, so it begins anew.
+        """
+        for axis, node_id, bit, allowed_ns in self._bits:
+            if missing >> axis & 1:
+                self._last.pop(axis, None)
+                continue
+            value = statuswords[axis] >> bit & 1
+            before, since_ns, cycles, told = self._last.get(axis, (-1, 0, 0, False))
+            if value != before:
+                self._last[axis] = (value, time_ns, 0, False)
+                continue
+            stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
+            self._last[axis] = (value, since_ns, cycles + 1, told or stale)
+            if stale and not told:
+                yield axis, DataStale(node_id, bit, (time_ns - since_ns) * 1e-9, cycles + 1)
+
+
+HEARTBEAT_PERIODS = 2.0
+"""Silence after which a node is lost."""
+LIMIT_S = 0.5
+"""A current that saturates in a ramp is masked by the fit; a limit that acts longer is no ramp any more."""
+_WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
+
+
+class Watch:
+    """What the drives of a network last said, and the faults that nobody was told yet.
+
+    Attributes:
+        faults: in the order in which they were seen.
+    """
+
+    def __init__(self, network: CanopenNetwork, on_event: EventSink) -> None:
+        self.faults: deque[DriverError] = deque()
+        self._network = network
+        self._link = network.link
+        self._on_event = on_event
+        self._statuswords = (0,) * len(network.axes)
+        self._unheard = (1 << len(network.axes)) - 1
+        self._begun = False
+        self._allowed_silence_ns = round(network.heartbeat_ms * 1e6 * HEARTBEAT_PERIODS)
+        self._next_heartbeat_check_ns = 0
+        self._heard_at: dict[int, tuple[int, int, int]] = {}
+        self._limited_since_ns: dict[int, int] = {}
+        self._toggle_bits = ToggleBits(network.axes)
+
+    def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
+        """See to everything after one cycle.
+
+        Args:
+            time_ns: of the samples.
+            clock_ns: by the clock.
+            statuswords: of all axes.
+            missing: bit i is set when axis i did not answer this cycle.
+        """
+        if self._link.has_events:
+            self.note_events(time_ns)  # first: an EMCY says why, the statusword only that
+        if self._unheard or statuswords != self._statuswords:
+            self._note_statuswords(time_ns, statuswords, missing)
+        if self._limited_since_ns:
+            self._check_limits(time_ns)
+        if self._toggle_bits:
+            for axis, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
+                self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, stale.bit, str(stale)))
+                self.faults.append(stale)
+        if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
+            self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
+            self._check_heartbeats(time_ns, clock_ns)
+        self._begun = True
+
+    def _note_statuswords(self, time_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
+        before, self._statuswords = self._statuswords, statuswords
+        for axis, word in enumerate(statuswords):
+            first = bool(self._unheard >> axis & 1)
+            if first and missing >> axis & 1:
+                continue  # the word is nobody's yet
+            self._unheard &= ~(1 << axis)
+            # Of an axis's first answer everything is news, but a fault from before is not this recording's.
+            changed = _WATCHED_BITS if first else word ^ before[axis]
+            saturation = self._network.axes[axis].profile.saturation_bit
+            if changed & _WATCHED_BITS:
+                state = decode(word)
+                text = f"{self._network.axes[axis].name}: {state}, statusword {word:04X}h"
+                self._on_event(CellEvent(time_ns, axis, EventKind.STATE, word, text))
+                if not first and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+                    self.faults.append(DriveFault(self._network.node_ids[axis], str(state), word))
+                if not first and changed & word & STATUS_FOLLOWING_ERROR:
+                    self._on_event(CellEvent(time_ns, axis, EventKind.FOLLOWING_ERROR, word, text))
+                    self.faults.append(DriveFault(self._network.node_ids[axis], "following error", word))
+            if saturation is not None and (word ^ (0 if first else before[axis])) >> saturation & 1:
+                acts = "a limit acts" if word >> saturation & 1 else "the limit acts no more"
+                text = f"{self._network.axes[axis].name}: {acts}"
+                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                if word >> saturation & 1:
+                    self._limited_since_ns[axis] = time_ns
+                else:
+                    self._limited_since_ns.pop(axis, None)
+
+    def _check_limits(self, time_ns: int) -> None:
+        for axis, since_ns in tuple(self._limited_since_ns.items()):
+            word = self._statuswords[axis]
+            if decode(word) is not State.OPERATION_ENABLED:
+                self._limited_since_ns[axis] = time_ns  # what limits nothing is no reason to stop
+            elif (acted_ns := time_ns - since_ns) > LIMIT_S * 1e9:
+                del self._limited_since_ns[axis]
+                text = f"{self._network.axes[axis].name}: a limit acts for {acted_ns * 1e-9:.3f} s"
+                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                self.faults.append(LimitActive(self._network.node_ids[axis], LIMIT_S, word))
+
+    def note_events(self, time_ns: int) -> None:
+        """What the nodes said of themselves since the last cycle, at a time of the samples."""
+        for event in self._link.take_events(time_ns, self._network.node_ids):
+            self._on_event(event)
+            if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
+                # Whoever only asks a drive something disturbs, and is told; one who commands would move the robot.
+                self.faults.append(BusBusy(str(self._link.address), command_name(event.code)))
+            elif event.kind is EventKind.BUS_BUSY and event.code >= HEARTBEAT:
+                self.faults.append(RecorderIdTaken.by_another(event.code - HEARTBEAT))
+            if event.axis is None:
+                continue
+            node_id = self._network.node_ids[event.axis]
+            if event.kind is EventKind.EMCY and self._begun:
+                reason = event.text.removeprefix(f"node {node_id}: ")
+                self.faults.append(DriveFault(node_id, reason, emcy_code=event.code))
+            elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
+                self.faults.append(DriveFault(node_id, f"left OPERATIONAL, is {nmt_name(event.code)}"))
+
+    def _check_heartbeats(self, time_ns: int, clock_ns: int) -> None:
+        """A node is lost when it is silent by the clock *and* in the time of the samples.
+
+        In lockstep the samples' time runs faster or slower than the clock, and either alone would be a false alarm.
+        """
+        for axis, node_id in enumerate(self._network.node_ids):
+            # Silence counts from the first cycle on: before it nobody read the bus.
+            heard_ns = self._link.heard_ns.get(node_id, 0)
+            known_ns, since_clock_ns, since_time_ns = self._heard_at.get(node_id, (-1, 0, 0))
+            if known_ns != heard_ns:
+                begin_ns = heard_ns if self._begun else clock_ns
+                self._heard_at[node_id] = (heard_ns, begin_ns, time_ns)
+                continue
+            silent_ns = min(clock_ns - since_clock_ns, time_ns - since_time_ns)
+            if silent_ns > self._allowed_silence_ns:
+                text = f"node {node_id}: no heartbeat for {silent_ns * 1e-9:.3f} s"
+                self._on_event(CellEvent(time_ns, axis, EventKind.HEARTBEAT_LOST, node_id, text))
+                self.faults.append(HeartbeatLost(node_id, silent_ns * 1e-9))
+                self._heard_at[node_id] = (heard_ns, clock_ns, time_ns)

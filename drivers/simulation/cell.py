@@ -1,0 +1,436 @@
+"""A whole simulated cell on a CAN bus, or on several: n nodes and one plant that advance in lockstep with SYNC."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from types import TracebackType
+
+import can
+import numpy as np
+
+from drivers.canopen.bus import SocketcandBus
+from drivers.errors import BusError
+from drivers.simulation.amplifier import AmplifierSet, tuned
+from drivers.simulation.drive import ErrorCode, PowerState, Readings, take
+from drivers.simulation.effects import Lag, build_effect
+from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
+from drivers.simulation.node import GAIN, STORE, NmtCommand, Node
+from drivers.simulation.plant import Plant
+from drivers.simulation.spec import CellSpec, SpecInvalid
+from drivers.stream.split_bus import SplitBus
+
+# One plant on several buses: which SYNCs belong to one cycle.
+
+
+PATIENCE = 3
+"""SYNCs that may wait for another bus's: a busy machine hands on some of one bus before those of the other."""
+
+Cycles = tuple[frozenset[int], ...]
+"""Cycles to run now, each by the buses whose nodes take part in it."""
+
+
+class SyncGate:
+    """Pairs the SYNCs of the buses in their order: a cycle begins when every bus has brought one.
+
+    A bus that brings none is left out, when too many of another bus wait for it, or when the cell's own patience ends
+    (``close``). Its next SYNC comes too late for a cycle of its own: its nodes answer it, time does not move, and the
+    bus is waited for again.
+
+    Args:
+        buses: their number.
+    """
+
+    def __init__(self, buses: int) -> None:
+        self._waiting = [0] * buses
+        self._absent: frozenset[int] = frozenset()
+
+    @property
+    def open(self) -> bool:
+        """Whether a cycle waits for SYNCs."""
+        return any(self._waiting)
+
+    def late(self, bus: int) -> bool:
+        """Whether a SYNC on this bus belongs to a cycle that was run without it."""
+        if bus not in self._absent:
+            return False
+        self._absent -= {bus}
+        return True
+
+    def arrive(self, bus: int) -> Cycles:
+        """A SYNC that is not late."""
+        self._waiting[bus] += 1
+        return self.close() if self._waiting[bus] > PATIENCE else self._complete()
+
+    def close(self) -> Cycles:
+        """Wait no longer for the buses that bring no SYNC."""
+        self._absent |= {bus for bus, count in enumerate(self._waiting) if not count}
+        return self._complete()
+
+    def _complete(self) -> Cycles:
+        present = frozenset(range(len(self._waiting))) - self._absent
+        cycles = min((self._waiting[bus] for bus in present), default=0)
+        for bus in present:
+            self._waiting[bus] -= cycles
+        return (present,) * cycles
+
+
+SYNC_ID = 0x080
+NMT_ID = 0x000
+
+IDLE_S = 0.02
+"""Longest sleep while no frame comes; heartbeats by wall time are as punctual as this."""
+
+
+class SimulatedCell:
+    """A cell that answers on a bus until it is closed.
+
+    Each SYNC (COB-ID 80h) moves the plant by one sync period and is answered with the transmit PDOs, so that a run
+    takes as long as its computing takes, and equal frames give equal answers. SDO, NMT and heartbeats need no SYNC.
+    On several buses the plant moves when SYNC has come on all of them, and each node hears its own bus alone.
+
+    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread. What is
+    mounted is part of the description: for another payload make another cell.
+
+    Attributes:
+        plant: its mechanics (read it when the cell is closed, or between answers).
+        nodes: in the order of the axes.
+        cycles: SYNCs since power-on.
+    """
+
+    def __init__(self, spec: CellSpec, bus: can.BusABC, clock: Callable[[], float] = time.monotonic) -> None:
+        """Build the cell; it is powered on when it begins to serve.
+
+        Args:
+            spec: the truth of the cell.
+            bus: any python-can bus that does not receive its own messages, or a split bus of several; it stays the
+                caller's to shut down.
+            clock: seconds, for heartbeats while no SYNC comes.
+
+        Raises:
+            SpecInvalid, EffectUnknown: the description is wrong, or a node is on none of the buses.
+        """
+        ids = [axis.node_id for axis in spec.axes]
+        if len(set(ids)) < len(ids) or not all(1 <= node_id <= 127 for node_id in ids):
+            raise SpecInvalid(f"node ids must differ and lie in 1 to 127, found {ids}")
+        if spec.sync_period_us < 1 or spec.substeps < 1:
+            raise SpecInvalid(
+                f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be at least 1"
+            )
+        _compile(spec)
+        self.plant = Plant(spec)
+        self.cycles = 0
+        lags = tuple(e for e in (build_effect(effect, len(ids)) for effect in spec.effects) if isinstance(e, Lag))
+        self._amplifiers = AmplifierSet(spec, tuned(spec, self.plant), lags)
+        self._amplifiers.prime(self.plant.motor_rad)
+        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
+        self._readings = take(self._amplifiers, self._rated_a)
+        self._enabled = np.zeros(len(ids), dtype=np.int64)
+        self._substeps, self._period_us = spec.substeps, spec.sync_period_us
+        self._bus, self._clock = bus, clock
+        self.nodes = tuple(
+            Node(index, axis, self._amplifiers, self._current_readings, partial(self._send_of, index))
+            for index, axis in enumerate(spec.axes)
+        )
+        self._wires, there = _wires(bus, ids)
+        self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
+        self._gate = SyncGate(len(self._wires))
+        _refuse_unsayable(spec.faults, bus)
+        self._disturbance = Disturbance(spec.faults)
+        for index, node in enumerate(self.nodes):
+            node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
+            if self._disturbance.active(FaultKind.OTHER_SERIAL, index):
+                node.change_serial()
+            if self._disturbance.active(FaultKind.REFUSES_MAPPING, index):
+                node.lock_mapping()
+            if self._disturbance.active(FaultKind.SYNC_PRODUCER, index):
+                node.produce_sync()
+            if self._disturbance.active(FaultKind.NO_GUARD, index):
+                node.lose_guard()
+            if self._disturbance.active(FaultKind.REFUSES_WRITE, index):
+                node.refuse(GAIN)
+            if self._disturbance.active(FaultKind.REFUSES_SAVE, index):
+                node.refuse(STORE)
+        self._by_id = {node.node_id: node for node in self.nodes}
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._failure: Exception | None = None
+
+    def __enter__(self) -> SimulatedCell:
+        self._thread = threading.Thread(target=self._serve_and_keep, name="simulated cell", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        # Where both sides failed, the caller's error is most often only that the cell fell silent.
+        if self._failure is not None:
+            raise self._failure from error
+
+    def check(self) -> None:
+        """Raise what ended the cell's thread, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def stop(self) -> None:
+        """Let ``serve_forever`` return; may be called from any thread."""
+        self._stopping.set()
+
+    def serve_forever(self) -> None:
+        """Power on and answer until ``stop`` is called.
+
+        Raises:
+            can.CanError, BusError: the bus has gone, or all buses have.
+            FrictionUnsolved: the plant could not be advanced.
+        """
+        wall_s = self._clock()
+        for node in self.nodes:
+            node.boot(wall_s)
+        while not self._stopping.is_set():
+            message = self._next_frame()
+            if message is not None and not (
+                message.is_error_frame or message.is_remote_frame or message.is_extended_id
+            ):
+                self._receive(message)
+            elif message is None and self._gate.open:
+                self._run(self._gate.close())
+            wall_s, now_us = self._clock(), self.time_us
+            for node in self.nodes:
+                node.watch(wall_s)
+                node.beat(now_us, wall_s)
+            if message is None and self._disturbance:
+                self._interfere()  # other masters do not wait for our SYNC
+
+    def _next_frame(self) -> can.Message | None:
+        try:
+            return self._bus.recv(IDLE_S)
+        except BusError:
+            if not self._goes_on():
+                raise
+            return None
+
+    def _goes_on(self) -> bool:
+        """Whether amplifiers are left on a bus when another one has failed."""
+        return isinstance(self._bus, SplitBus) and self._bus.alive
+
+    @property
+    def time_us(self) -> int:
+        """Plant time since power-on [us]."""
+        return self.cycles * self._period_us
+
+    def _serve_and_keep(self) -> None:
+        try:
+            self.serve_forever()
+        except Exception as error:  # noqa: BLE001 - kept whole and raised again in the thread that owns the cell
+            self._failure = error
+
+    def _receive(self, message: can.Message) -> None:
+        can_id, data = message.arbitration_id, bytes(message.data)
+        wire = self._wires.index(str(message.channel)) if len(self._wires) > 1 else 0
+        hearing = self._hearing(wire)
+        if can_id == SYNC_ID:
+            self._receive_sync(wire)
+        elif can_id == NMT_ID:
+            if len(data) >= 2:
+                for node in hearing:
+                    if data[1] in (0, node.node_id):
+                        node.command_nmt(data[0], self._clock())
+        elif 0x600 < can_id < 0x680:
+            node_asked = self._by_id.get(can_id - 0x600)
+            if node_asked in hearing:
+                node_asked.request(data)
+        elif 0x700 < can_id < 0x780:
+            for node in hearing:
+                node.hear_heartbeat(can_id - 0x700, self._clock())
+        else:
+            for node in hearing:
+                node.receive_pdo(can_id, data)
+
+    def _hearing(self, wire: int) -> tuple[Node, ...]:
+        """Nodes that a frame on one of the buses reaches."""
+        if not self._disturbance:
+            return self._on_wire[wire]
+        return tuple(
+            node
+            for index, node in enumerate(self.nodes)
+            if node in self._on_wire[wire] and not self._disturbance.cut_off(index)
+        )
+
+    def _receive_sync(self, wire: int) -> None:
+        if self._gate.late(wire):
+            for node in self._on_wire[wire]:
+                node.begin_cycle()
+                node.send_sync(self.time_us)
+            return
+        self._run(self._gate.arrive(wire))
+
+    def _run(self, cycles: Cycles) -> None:
+        for wires in cycles:
+            self._advance(wires)
+
+    def _interfere(self) -> None:
+        """Frames of other masters on this bus."""
+        for index, node in enumerate(self.nodes):
+            if self._disturbance.active(FaultKind.SDO_MASTER, index):
+                self._send(0x600 + node.node_id, FOREIGN_SDO)
+        masters = (FaultKind.SECOND_MASTER, FaultKind.SYNC_PRODUCER)
+        if any(self._disturbance.active(kind, index) for kind in masters for index in range(len(self.nodes))):
+            self._send(SYNC_ID, b"")
+
+    def _begin_faults(self) -> None:
+        """What begins with this cycle, before the plant moves."""
+        for index, node in enumerate(self.nodes):
+            node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
+        for fault in self._disturbance.beginning():
+            for index, node in enumerate(self.nodes):
+                if fault.concerns(index):
+                    self._strike(fault, node)
+            if fault.kind in ERROR_FRAMES:
+                error_class, data = ERROR_FRAMES[fault.kind]
+                self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))
+
+    def _strike(self, fault: FaultSpec, node: Node) -> None:
+        if fault.kind is FaultKind.EMERGENCY:
+            node.fail(fault.value)
+        elif fault.kind is FaultKind.FOLLOWING_ERROR:
+            node.fail(ErrorCode.FOLLOWING_ERROR)
+        elif fault.kind is FaultKind.FALLS_BACK:
+            node.fall_back()
+        elif fault.kind is FaultKind.REBOOTS:
+            node.command_nmt(NmtCommand.RESET_NODE, self._clock())
+        elif fault.kind is FaultKind.LOSES_POWER:
+            node.drive.reset()
+
+    def _advance(self, wires: Collection[int]) -> None:
+        """One cycle, of which the nodes on these buses got a SYNC."""
+        plant, amplifiers = self.plant, self._amplifiers
+        synchronised = [node for wire in sorted(wires) for node in self._on_wire[wire]]
+        for node in synchronised:
+            node.begin_cycle()
+        if self._disturbance:
+            self._disturbance.cycle = self.cycles
+            for frame in self._disturbance.release():
+                self._send(*frame)
+            self._begin_faults()
+            self._interfere()
+        loops = amplifiers.loops
+        loops["limited"] = 0
+        if not np.array_equal(loops["enabled"], self._enabled):
+            self._enabled = loops["enabled"].copy()
+            plant.set_brakes(self._enabled == 0)
+        current_a = loops["current_a"]
+        for _ in range(self._substeps):
+            plant.step(current_a)
+            # The loops read the position at the end of the step: a reported current belongs to its reported position.
+            amplifiers.control(plant.motor_rad)
+        self.cycles += 1
+        amplifiers.report()
+        self._readings = take(amplifiers, self._rated_a)
+        now_us = self.time_us
+        for node in self.nodes:
+            node.end_cycle()
+        for node in synchronised:
+            node.send_sync(now_us)
+
+    def _current_readings(self) -> Readings:
+        return self._readings
+
+    def _send_of(self, index: int, can_id: int, data: bytes) -> None:
+        if not self._disturbance:
+            self._send(can_id, data)
+            return
+        for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):
+            self._send(*frame)
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        try:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        except BusError:
+            if not self._goes_on():
+                raise
+
+
+def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], tuple[frozenset[int], ...]]:
+    """Names of the buses, as received frames have them, and the node ids on each."""
+    if not isinstance(bus, SplitBus):
+        return ("",), (frozenset(node_ids),)
+    there = tuple(part.node_ids for part in bus.address.parts)
+    alone = sorted(set(node_ids).difference(*there))
+    if alone:
+        raise SpecInvalid(f"node {', '.join(map(str, alone))} is on none of the buses {bus.address}")
+    return tuple(map(str, bus.address.parts)), there
+
+
+def _refuse_unsayable(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
+    """An error frame that a bus cannot carry would end the cell in the middle of somebody's run."""
+    hub = (
+        any(part.address.interface == "socketcand" for part in bus.address.parts)
+        if isinstance(bus, SplitBus)
+        else isinstance(bus, SocketcandBus)
+    )
+    unsayable = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
+    if hub and unsayable:
+        raise SpecInvalid(
+            f"the faults {', '.join(unsayable)} are error frames, which the socketcand protocol does not have: "
+            "leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
+        )
+
+
+def _compile(spec: CellSpec) -> None:
+    """Let numba compile on a cell that is thrown away: the first SYNC must not wait for it."""
+    plant = Plant(spec)
+    amplifiers = AmplifierSet(spec, tuned(spec, plant), ())
+    plant.step(np.zeros(len(spec.axes)))
+    amplifiers.control(plant.motor_rad)
+
+
+# A simulated cell whose payload somebody exchanges between two runs: only while no axis has power.
+
+
+POWERED = (
+    PowerState.SWITCHED_ON,
+    PowerState.OPERATION_ENABLED,
+    PowerState.QUICK_STOP_ACTIVE,
+    PowerState.FAULT_REACTION_ACTIVE,
+)
+
+Mounted = Callable[[], CellSpec | None]
+"""The cell as it is mounted now, None where nobody knows better than before."""
+
+
+class MountingCell(SimulatedCell):
+    """As a simulated cell; what is mounted is asked before every frame while all axes are without power.
+
+    So whoever changes it, and then asks the cell anything, finds it changed; and what is changed while an axis has
+    power waits until none has. The loops stay tuned as they were, as those of real drives do.
+    """
+
+    def __init__(
+        self, spec: CellSpec, bus: can.BusABC, mounted: Mounted, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """As a simulated cell.
+
+        Args:
+            spec: the truth of the cell, as it is mounted at power-on.
+            bus: of it.
+            mounted: tells what is mounted; another object is another mounting. It must not take long.
+            clock: seconds.
+        """
+        super().__init__(spec, bus, clock)
+        self._mounted, self._spec = mounted, spec
+
+    def _next_frame(self) -> can.Message | None:
+        message = super()._next_frame()
+        if not any(node.drive.state in POWERED for node in self.nodes):
+            spec = self._mounted()
+            if spec is not None and spec is not self._spec:
+                self._spec = spec
+                self.plant.mount(spec)
+        return message

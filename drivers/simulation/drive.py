@@ -1,0 +1,290 @@
+"""One simulated amplifier as CiA 402 sees it: power state, set-points, statusword, faults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.simulation.amplifier import AmplifierSet, FloatArray, plan
+from drivers.simulation.friction import compiled
+
+# The CiA 402 state machine of one simulated amplifier, pure (the finite state automaton of CiA 402-2).
+
+
+class PowerState(Enum):
+    """States by their bits in statusword 6041h (bits 0-3, 5, 6)."""
+
+    NOT_READY_TO_SWITCH_ON = 0x00
+    SWITCH_ON_DISABLED = 0x40
+    READY_TO_SWITCH_ON = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP_ACTIVE = 0x07
+    FAULT_REACTION_ACTIVE = 0x0F
+    FAULT = 0x08
+
+
+def next_state(state: PowerState, controlword: int, previous: int, stays_in_quick_stop: bool) -> PowerState:
+    """The state after a controlword.
+
+    Args:
+        state: before it.
+        controlword: object 6040h as written.
+        previous: controlword before; fault reset acts on the rising edge of bit 7 alone.
+        stays_in_quick_stop: quick stop option 605Ah is 5 or 6, the only case in which transition 16 exists.
+    """
+    after: PowerState
+    if state is PowerState.FAULT:
+        reset = controlword & 0x80 and not previous & 0x80
+        after = PowerState.SWITCH_ON_DISABLED if reset else state
+    elif state in (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.FAULT_REACTION_ACTIVE):
+        after = state
+    elif not controlword & 0x02:  # disable voltage: transitions 7, 9, 10, 12
+        after = PowerState.SWITCH_ON_DISABLED
+    elif state is PowerState.QUICK_STOP_ACTIVE:
+        again = controlword & 0x0F == 0x0F and stays_in_quick_stop  # 16
+        after = PowerState.OPERATION_ENABLED if again else state
+    elif not controlword & 0x04:  # quick stop: 7, 10, 11
+        running = state is PowerState.OPERATION_ENABLED
+        after = PowerState.QUICK_STOP_ACTIVE if running else PowerState.SWITCH_ON_DISABLED
+    elif not controlword & 0x01:  # shutdown: 2, 6, 8
+        after = PowerState.READY_TO_SWITCH_ON
+    elif state is PowerState.SWITCH_ON_DISABLED:
+        after = state  # switch on needs READY TO SWITCH ON first
+    else:  # switch on (3, 5); enable operation (4, and from READY TO SWITCH ON through SWITCHED ON, which is allowed)
+        after = PowerState.OPERATION_ENABLED if controlword & 0x08 else PowerState.SWITCHED_ON
+    return after
+
+
+# What the amplifiers of a cell tell of themselves, in the units of CiA 402; renewed once a SYNC.
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Integers as they go over the bus, one an axis.
+
+    Attributes:
+        position: 6064h [counts].
+        demand: 6062h [counts].
+        velocity: 606Ch [counts/s].
+        current_demand: 6074h [per mille of rated current].
+        current: 6077h and 6078h [per mille of rated current].
+        reached, limited, following_error: bits 10, 11 and 13 of 6041h as the loops see them.
+    """
+
+    position: list[int]
+    demand: list[int]
+    velocity: list[int]
+    current_demand: list[int]
+    current: list[int]
+    reached: list[int]
+    limited: list[int]
+    following_error: list[int]
+
+
+def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:
+    """Round and wrap what the loops hold.
+
+    Args:
+        amplifiers: after a SYNC period.
+        rated_current_a: shape (n,).
+    """
+    told = np.empty((8, len(rated_current_a)), dtype=np.int64)
+    _tell(amplifiers.loops, amplifiers.reported_a, rated_current_a, told)
+    return Readings(*told.tolist())
+
+
+@compiled
+def _tell(
+    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, told: NDArray[np.int64]
+) -> None:
+    """Fill one row for each field of Readings, in their order, shape (8, n)."""
+    for i in range(len(loops)):
+        axis = loops[i]
+        # int32 as the bus carries it: an endless axis wraps around.
+        told[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
+        told[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
+        told[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
+        per_mille = 1000.0 / rated_current_a[i]
+        told[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
+        told[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
+        told[5, i] = axis["reached"]
+        told[6, i] = axis["limited"]
+        told[7, i] = axis["following_error"]
+
+
+class ErrorCode(IntEnum):
+    """Error codes of CiA 402-2 and CiA 301 (603Fh, EMCY)."""
+
+    NONE = 0x0000
+    COMMUNICATION_LOST = 0x8100
+    PDO_TOO_SHORT = 0x8210
+    HEARTBEAT_LOST = 0x8130
+    FOLLOWING_ERROR = 0x8611
+
+
+class QuickStop(IntEnum):
+    """Option code 605Ah."""
+
+    DISABLE = 0
+    SLOW_DOWN_AND_DISABLE = 1
+    QUICK_STOP_AND_DISABLE = 2
+    SLOW_DOWN_AND_STAY = 5
+    QUICK_STOP_AND_STAY = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Objects that tell a drive how to move; counts, counts/s and counts/s²."""
+
+    mode: int
+    target: int
+    speed: int
+    acceleration: int
+    deceleration: int
+    quick_stop_deceleration: int
+    quick_stop: int
+
+
+class Drive:
+    """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet.
+
+    Attributes:
+        state: of CiA 402.
+        controlword: as written last.
+        error: code of the active fault.
+        limited: a limit acts that the loops know nothing of.
+    """
+
+    def __init__(self, index: int, amplifiers: AmplifierSet) -> None:
+        self._index = index
+        self._amplifiers = amplifiers
+        self.state = PowerState.SWITCH_ON_DISABLED
+        self.controlword = 0
+        self.error: int = ErrorCode.NONE
+        self.limited = False
+        self._acknowledged = False
+        self._waiting: tuple[int, Settings] | None = None
+
+    def reset(self) -> None:
+        """Power-on state; the brake closes."""
+        self._enter(PowerState.SWITCH_ON_DISABLED)
+        self.controlword, self.error = 0, ErrorCode.NONE
+
+    def command(self, controlword: int, settings: Settings, readings: Readings) -> None:
+        """Obey a controlword."""
+        previous, self.controlword = self.controlword, controlword
+        stays = settings.quick_stop >= QuickStop.SLOW_DOWN_AND_STAY
+        state = next_state(self.state, controlword, previous, stays)
+        if state is not self.state:
+            if self.state is PowerState.FAULT:
+                self.error = ErrorCode.NONE
+            self._change(state, settings)
+        if self.state is not PowerState.OPERATION_ENABLED or settings.mode != 1:
+            return
+        if controlword & 0x100 and not previous & 0x100:  # halt
+            self._waiting = None
+            self._amplifiers.stop(self._index, settings.deceleration)
+        if not controlword & 0x10:
+            # The handshake ends when the master takes the request away, unless a set-point still waits.
+            self._acknowledged = self._waiting is not None
+        elif not previous & 0x10 and not controlword & 0x100:
+            self._request(controlword, settings, readings)
+
+    def monitor(self, readings: Readings, settings: Settings) -> ErrorCode:
+        """After each SYNC period: faults, end of a quick stop, the waiting set-point.
+
+        Returns:
+            the code of a new fault, or NONE.
+        """
+        if self.state is PowerState.QUICK_STOP_ACTIVE:
+            if settings.quick_stop < QuickStop.SLOW_DOWN_AND_STAY and not self._amplifiers.moving(self._index):
+                self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
+        elif self._waiting is not None and not self._amplifiers.moving(self._index):
+            target, waiting = self._waiting
+            self._waiting = None
+            self._acknowledged = bool(self.controlword & 0x10)
+            self._start(target, waiting)
+        if readings.following_error[self._index] and self.powered:
+            self.fail(ErrorCode.FOLLOWING_ERROR)
+            return ErrorCode.FOLLOWING_ERROR
+        return ErrorCode.NONE
+
+    def fail(self, code: int) -> None:
+        """Fault reaction: the power stage goes off and the brake closes at once."""
+        self._enter(PowerState.FAULT)
+        self.error = code
+
+    @property
+    def powered(self) -> bool:
+        """Whether the loops hold the axis."""
+        return self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
+
+    def quick_stop(self, settings: Settings) -> None:
+        """As if the master had asked for it."""
+        if self.state is PowerState.OPERATION_ENABLED:
+            self._change(PowerState.QUICK_STOP_ACTIVE, settings)
+
+    def statusword(self, readings: Readings) -> int:
+        """Object 6041h."""
+        word = self.state.value | 0x0210  # voltage present, remote
+        if self.powered:
+            word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
+        if self._acknowledged:
+            word |= 0x1000
+        if self.error is ErrorCode.FOLLOWING_ERROR:
+            word |= 0x2000
+        return word
+
+    def _change(self, state: PowerState, settings: Settings) -> None:
+        if state is PowerState.QUICK_STOP_ACTIVE:
+            if settings.quick_stop == QuickStop.DISABLE:
+                self._enter(PowerState.SWITCH_ON_DISABLED)
+                return
+            slow = settings.quick_stop in (QuickStop.SLOW_DOWN_AND_DISABLE, QuickStop.SLOW_DOWN_AND_STAY)
+            self._waiting, self._acknowledged = None, False
+            self._amplifiers.stop(self._index, settings.deceleration if slow else settings.quick_stop_deceleration)
+            self.state = state
+            return
+        if state is PowerState.OPERATION_ENABLED and self.state is PowerState.QUICK_STOP_ACTIVE:
+            self.state = state  # transition 16: the loops never stopped
+            return
+        self._enter(state)
+
+    def _enter(self, state: PowerState) -> None:
+        self._amplifiers.enable(self._index, state is PowerState.OPERATION_ENABLED)
+        self._waiting, self._acknowledged = None, False
+        self.state = state
+
+    def _request(self, controlword: int, settings: Settings, readings: Readings) -> None:
+        moving = self._amplifiers.moving(self._index)
+        if moving and not controlword & 0x20 and self._waiting is not None:
+            return  # no room: the request stays unacknowledged
+        target = settings.target
+        if controlword & 0x40:
+            target += int(self._amplifiers.loops[self._index]["target"])
+        self._acknowledged = True
+        if moving and not controlword & 0x20:
+            self._waiting = (target, settings)
+            return
+        self._waiting = None
+        self._start(target, settings)
+        # Told at once, so that no one takes the end of the last move for the end of this one.
+        readings.reached[self._index] = 0
+
+    def _start(self, target: int, settings: Settings) -> None:
+        axis = self._amplifiers.loops[self._index]
+        self._amplifiers.move(
+            self._index,
+            plan(
+                float(axis["demand"]),
+                float(axis["demand_velocity"]),
+                float(target),
+                float(settings.speed),
+                float(settings.acceleration),
+                float(settings.deceleration),
+            ),
+        )

@@ -1,0 +1,426 @@
+"""One CiA 402 node on a bus: NMT, heartbeat, SDO, PDO and EMCY around one drive."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+from drivers.simulation.amplifier import AmplifierSet
+from drivers.simulation.drive import Drive, ErrorCode, Readings, Settings
+from drivers.simulation.objects import (
+    LOAD,
+    READ_ONLY,
+    SAVE,
+    WRITE_ONLY,
+    Kind,
+    SdoServer,
+    Value,
+    amplifier_dictionary,
+    current_objects,
+    find,
+    translated,
+)
+from drivers.simulation.pdo import NO_SUCH_OBJECT, Pdo, PdoParameters, TransmitTrigger, default_pdos
+from drivers.simulation.spec import AxisSpec, SdoAbort
+
+Send = Callable[[int, bytes], None]
+
+NOT_STORED = 0x08000020
+NOT_IN_THIS_STATE = 0x08000022
+GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
+
+
+class NmtState(IntEnum):
+    """As a heartbeat tells it."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+class NmtCommand(IntEnum):
+    """First byte of an NMT frame."""
+
+    START = 0x01
+    STOP = 0x02
+    ENTER_PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """What 1010h stores: every value and the parameters of every PDO."""
+
+    values: dict[tuple[int, int], Value]
+    pdos: tuple[PdoParameters, ...]
+
+
+class Node:
+    """A node and its object dictionary; all methods are called from the cell's one thread.
+
+    Attributes:
+        node_id: on the bus.
+        nmt: its state.
+        drive: its CiA 402 part.
+        obeys_nmt: whether it goes to OPERATIONAL when it is told to.
+    """
+
+    def __init__(
+        self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, readings: Callable[[], Readings], send: Send
+    ) -> None:
+        self.node_id = axis.node_id
+        self.nmt = NmtState.INITIALISING
+        self.drive = Drive(index, amplifiers)
+        self._index = index
+        self._axis = axis
+        self._loop = amplifiers.loops[index]
+        self._readings = readings
+        self._send = send
+        self._dictionary = translated(amplifier_dictionary(axis), axis)
+        self._told = {told.key: told.source(amplifiers, index) for told in current_objects(axis)}
+        self._values: dict[tuple[int, int], Value] = {key: entry.default for key, entry in self._dictionary.items()}
+        self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary)
+        self._triggers = tuple(TransmitTrigger(pdo, self._source) for pdo in self._transmit)
+        self._saved = self._stored()
+        self._defaults = self._saved
+        self._pending: dict[int, bytes] = {}
+        self._history: list[int] = []
+        self._kept_settings: Settings | None = None
+        self._sdo = SdoServer(self.read, self.write)
+        self._now_us = 0
+        self._beat_us, self._beat_wall_s = 0, 0.0
+        self._heard_wall_s: float | None = None
+        self._toggle = 0
+        self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
+        self._refused: set[int] = set()
+        self.obeys_nmt = True
+
+    @property
+    def saved(self) -> Stored:
+        """What it will have after the next power-on."""
+        return self._saved
+
+    # -- NMT and error control -------------------------------------------------------------------------------------
+
+    def boot(self, wall_s: float) -> None:
+        """Power-on: tell it, and be PRE-OPERATIONAL."""
+        self._apply_settings()
+        self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
+        self.nmt = NmtState.PRE_OPERATIONAL
+        self._beat_us, self._beat_wall_s = self._now_us, wall_s
+
+    def command_nmt(self, command: int, wall_s: float) -> None:
+        """Obey an NMT command; unknown ones are ignored, as the standard wants."""
+        if command == NmtCommand.START and not self.obeys_nmt:
+            return
+        if command == NmtCommand.START and self.nmt is not NmtState.OPERATIONAL:
+            self.nmt = NmtState.OPERATIONAL
+            self._pending.clear()
+            for trigger in self._triggers:
+                trigger.reset()
+            self.send_events()
+        elif command == NmtCommand.STOP:
+            self._connection_lost()
+            self.nmt = NmtState.STOPPED
+        elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
+            self.nmt = NmtState.PRE_OPERATIONAL
+        elif command == NmtCommand.RESET_NODE:
+            self.drive.reset()
+            self._restore(self._saved, first=0x1000, last=0x9FFF)
+            self._history.clear()
+            self.boot(wall_s)
+        elif command == NmtCommand.RESET_COMMUNICATION:
+            self._connection_lost()
+            self._restore(self._saved, first=0x1000, last=0x1FFF)
+            self.boot(wall_s)
+
+    def hear_heartbeat(self, producer: int, wall_s: float) -> None:
+        """Somebody's heartbeat; that of the node in 1016h is watched from its first one on."""
+        if self._number(0x1016, 1) >> 16 & 0x7F == producer:
+            self._heard_wall_s = wall_s
+
+    def watch(self, wall_s: float) -> None:
+        """Stop by 6007h when the watched node is silent; the time of the plant stands still without its SYNC."""
+        allowed_ms = self._number(0x1016, 1) & 0xFFFF
+        if not allowed_ms:
+            self._heard_wall_s = None
+        elif self._heard_wall_s is not None and (wall_s - self._heard_wall_s) * 1e3 >= allowed_ms:
+            self._heard_wall_s = None
+            self.fall_back()
+
+    def fall_back(self) -> None:
+        """A heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
+        self._emergency(ErrorCode.HEARTBEAT_LOST)
+        self._connection_lost()
+        self.nmt = NmtState.PRE_OPERATIONAL
+
+    def fail(self, code: int) -> None:
+        """A fault of the amplifier, told by EMCY."""
+        self.drive.fail(code)
+        self._emergency(code)
+
+    def change_serial(self) -> None:
+        """Become another amplifier of the same kind."""
+        self._values[0x1018, 4] = self._number(0x1018, 4) + 1
+
+    def produce_sync(self) -> None:
+        """Become an amplifier that was left as the bus's SYNC producer (1005h bit 30); the cell sends for it."""
+        self._values[0x1005, 0] = self._number(0x1005) | 1 << 30
+
+    def lock_mapping(self) -> None:
+        """Become an amplifier whose transmit PDOs are what they are."""
+        for pdo in self._transmit:
+            pdo.locked = True
+
+    def lose_guard(self) -> None:
+        """Become an amplifier without consumer heartbeat."""
+        for key in ((0x1016, 0), (0x1016, 1)):
+            del self._dictionary[key]  # its value stays zero: it watches nobody
+
+    def refuse(self, index: int) -> None:
+        """Become an amplifier that lets nobody write an object, as if it were always busy."""
+        self._refused.add(index)
+
+    def beat(self, now_us: int, wall_s: float) -> None:
+        """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
+        self._now_us = now_us
+        period_ms = self._values[0x1017, 0]
+        if not isinstance(period_ms, int) or period_ms == 0 or self.nmt is NmtState.INITIALISING:
+            return
+        if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
+            self._beat_us, self._beat_wall_s = now_us, wall_s
+            self._send(0x700 + self.node_id, bytes([self.nmt]))
+
+    # -- SYNC and PDO ----------------------------------------------------------------------------------------------
+
+    def receive_pdo(self, can_id: int, data: bytes) -> None:
+        """Take a frame if it is one of this node's receive PDOs: at once if event-driven, else with the next SYNC."""
+        if self.nmt is not NmtState.OPERATIONAL:
+            return
+        for number, pdo in enumerate(self._receive):
+            if pdo.valid and pdo.can_id == can_id:
+                if len(data) < pdo.layout.size:
+                    self._emergency(ErrorCode.PDO_TOO_SHORT)
+                elif pdo.parameters.transmission <= 240:
+                    self._pending[number] = data
+                else:
+                    self._unpack(pdo, data)
+                    self.send_events()
+
+    def begin_cycle(self) -> None:
+        """On SYNC: synchronous receive PDOs take effect."""
+        if self._pending:
+            pending, self._pending = self._pending, {}
+            for number, data in pending.items():
+                self._unpack(self._receive[number], data)
+
+    def end_cycle(self) -> None:
+        """After the plant has moved: see to faults and waiting set-points, and tell that the values are new."""
+        self._toggle ^= self._toggle_mask
+        fault = self.drive.monitor(self._readings(), self._settings())
+        if fault is not ErrorCode.NONE:
+            self._emergency(fault)
+
+    def send_sync(self, now_us: int) -> None:
+        """Send the transmit PDOs of this SYNC."""
+        self._now_us = now_us
+        if self.nmt is NmtState.OPERATIONAL:
+            for trigger in self._triggers:
+                if trigger.pdo.valid:
+                    data = trigger.on_sync(now_us)
+                    if data is not None:
+                        self._send(trigger.pdo.can_id, data)
+
+    def send_events(self) -> None:
+        """Send the event-driven transmit PDOs whose values changed."""
+        if self.nmt is NmtState.OPERATIONAL:
+            for trigger in self._triggers:
+                if trigger.pdo.valid:
+                    data = trigger.on_event(self._now_us)
+                    if data is not None:
+                        self._send(trigger.pdo.can_id, data)
+
+    # -- SDO -------------------------------------------------------------------------------------------------------
+
+    def request(self, data: bytes) -> None:
+        """Answer an SDO request; a stopped node is silent."""
+        if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
+            answer = self._sdo.answer(data)
+            if answer is not None:
+                self._send(0x580 + self.node_id, answer)
+            self.send_events()
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """An entry as it goes over the bus.
+
+        Raises:
+            SdoAbort: it does not exist or cannot be read.
+        """
+        pdo = self._pdo(index)
+        if pdo is not None:
+            return pdo.read_mapping(subindex) if index & 0x200 else pdo.read_communication(subindex)
+        entry = find(self._dictionary, index, subindex)
+        if (index, subindex) == (0x1003, 1) and not self._history:
+            raise SdoAbort(0x08000024)  # no data available
+        if entry.kind is Kind.TEXT:
+            return entry.encode(self._values[index, subindex])
+        return entry.encode(self._source((index, subindex))())
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write an entry.
+
+        Raises:
+            SdoAbort: it does not exist, is read only, or refuses the value.
+        """
+        pdo = self._pdo(index)
+        if pdo is not None:
+            if index & 0x200:
+                pdo.write_mapping(subindex, data)
+            else:
+                pdo.write_communication(subindex, data)
+                for trigger in self._triggers:
+                    if trigger.pdo is pdo:
+                        trigger.reset()
+            return
+        entry = find(self._dictionary, index, subindex)
+        if not entry.writable:
+            raise SdoAbort(READ_ONLY)
+        value = entry.decode(data)
+        # Drives write their memory with the power stage off.
+        if index in self._refused or (index == STORE and self.drive.powered):
+            raise SdoAbort(NOT_IN_THIS_STATE)
+        if index in (STORE, LOAD_DEFAULTS):
+            self._store(index, value)
+        elif index == 0x1003:
+            self._history.clear()
+        else:
+            self._set((index, subindex), value)
+
+    def _store(self, index: int, value: Value) -> None:
+        if value != (SAVE if index == STORE else LOAD):
+            raise SdoAbort(NOT_STORED)
+        # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
+        self._saved = self._stored() if index == STORE else self._defaults
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _pdo(self, index: int) -> Pdo | None:
+        if not 0x1400 <= index <= 0x1BFF:
+            return None
+        side = self._transmit if index >= 0x1800 else self._receive
+        number = index & 0x1FF
+        if number >= len(side):
+            raise SdoAbort(NO_SUCH_OBJECT)
+        return side[number]
+
+    def _source(self, key: tuple[int, int]) -> Callable[[], int]:
+        i, drive, readings = self._index, self.drive, self._readings
+        live: dict[int, Callable[[], int]] = {
+            0x1001: lambda: int(drive.error is not ErrorCode.NONE),
+            0x603F: lambda: int(drive.error),
+            0x6040: lambda: drive.controlword,
+            0x2240: lambda: readings().position[i],
+            0x6041: lambda: drive.statusword(readings()) | self._toggle,
+            0x6061: lambda: self._number(0x6060),
+            0x6062: lambda: readings().demand[i],
+            0x6063: lambda: readings().position[i],
+            0x6064: lambda: readings().position[i],
+            0x606C: lambda: readings().velocity[i],
+            0x6074: lambda: readings().current_demand[i],
+            0x6077: lambda: readings().current[i],
+            0x6078: lambda: readings().current[i],
+            0x60F4: lambda: readings().demand[i] - readings().position[i],
+        }
+        index, subindex = key
+        if index == 0x1003:
+            return lambda: (self._history[0] if self._history else 0) if subindex else len(self._history[:1])
+        return self._told.get(key) or live.get(index, lambda: self._number(index, subindex))
+
+    def _number(self, index: int, subindex: int = 0) -> int:
+        value = self._values[index, subindex]
+        if not isinstance(value, int):
+            raise SdoAbort(WRITE_ONLY)
+        return value
+
+    def _unpack(self, pdo: Pdo, data: bytes) -> None:
+        """Set the values of a receive PDO; a controlword last, so that it acts on its companions."""
+        values = dict(zip(pdo.mapped, pdo.layout.unpack_from(data), strict=True))
+        for key in sorted(values, key=lambda key: key == (0x6040, 0)):
+            entry = self._dictionary[key]
+            value = values[key]
+            if (entry.lowest is None or value >= entry.lowest) and (entry.highest is None or value <= entry.highest):
+                self._set(key, value)
+
+    def _set(self, key: tuple[int, int], value: Value) -> None:
+        self._values[key] = value
+        self._kept_settings = None
+        if key == (0x6040, 0) and isinstance(value, int):
+            fault = self.drive.error
+            self.drive.command(value, self._settings(), self._readings())
+            if fault is not ErrorCode.NONE and self.drive.error is ErrorCode.NONE:
+                self._send(0x80 + self.node_id, struct.pack("<HB5x", ErrorCode.NONE, 0))
+        elif 0x6065 <= key[0] <= 0x6073:
+            self._apply_settings()
+
+    def _settings(self) -> Settings:
+        if self._kept_settings is None:
+            self._kept_settings = self._read_settings()
+        return self._kept_settings
+
+    def _read_settings(self) -> Settings:
+        number = self._number
+        return Settings(
+            mode=number(0x6060),
+            target=number(0x607A),
+            speed=number(0x6081),
+            acceleration=number(0x6083),
+            deceleration=number(0x6084),
+            quick_stop_deceleration=number(0x6085),
+            quick_stop=number(0x605A),
+        )
+
+    def _apply_settings(self) -> None:
+        self._loop["error_window"] = self._number(0x6065)
+        self._loop["error_time_s"] = self._number(0x6066) * 1e-3
+        self._loop["target_window"] = self._number(0x6067)
+        self._loop["target_time_s"] = self._number(0x6068) * 1e-3
+        # A make without 6073h has the limit that it was built with.
+        if (0x6073, 0) in self._dictionary:
+            self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
+
+    def _connection_lost(self) -> None:
+        """Abort connection option code 6007h."""
+        option = self._number(0x6007)
+        if not self.drive.powered or option == 0:
+            return
+        if option == 1:
+            self.drive.fail(ErrorCode.COMMUNICATION_LOST)
+            self._emergency(ErrorCode.COMMUNICATION_LOST)
+        elif option == 2:
+            self.drive.command(0x0000, self._settings(), self._readings())
+        else:
+            self.drive.quick_stop(self._settings())
+
+    def _emergency(self, code: int) -> None:
+        self._history.insert(0, int(code))
+        if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
+            register = int(self.drive.error is not ErrorCode.NONE)
+            self._send(0x80 + self.node_id, struct.pack("<HB5x", code, register))
+
+    def _stored(self) -> Stored:
+        return Stored(dict(self._values), tuple(pdo.parameters for pdo in self._receive + self._transmit))
+
+    def _restore(self, stored: Stored, first: int, last: int) -> None:
+        for key, value in stored.values.items():
+            if first <= key[0] <= last:
+                self._values[key] = value
+        self._kept_settings = None
+        for pdo, parameters in zip(self._receive + self._transmit, stored.pdos, strict=True):
+            pdo.restore(parameters)
+        self._pending.clear()
+        for trigger in self._triggers:
+            trigger.reset()

@@ -1,0 +1,352 @@
+"""The objects of a simulated CiA 402 amplifier: types, access, defaults (CiA 301 §7.5, CiA 402-2)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from drivers.simulation.amplifier import AmplifierSet
+from drivers.simulation.spec import AxisSpec, Dialect, SdoAbort
+
+WRITE_ONLY = 0x06010001
+READ_ONLY = 0x06010002
+NO_OBJECT = 0x06020000
+TOO_LONG = 0x06070012
+TOO_SHORT = 0x06070013
+NO_SUBINDEX = 0x06090011
+INVALID_VALUE = 0x06090030
+
+
+class Kind(Enum):
+    """Data types by their struct code."""
+
+    I8 = "b"
+    U8 = "B"
+    I16 = "h"
+    U16 = "H"
+    I32 = "i"
+    U32 = "I"
+    TEXT = "s"
+
+    @property
+    def bits(self) -> int:
+        """Width; 0 for text, which has none."""
+        return 0 if self is Kind.TEXT else 8 * struct.calcsize("<" + self.value)
+
+
+class Mappable(Enum):
+    """Into which process data object an entry may be mapped."""
+
+    NO = ""
+    TRANSMIT = "t"
+    RECEIVE = "r"
+
+
+Value = int | str
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One entry of the dictionary.
+
+    Attributes:
+        kind: data type.
+        default: at power-on, if the node does not compute it.
+        writable: by SDO.
+        mappable: into PDOs.
+        lowest, highest: range of values that are accepted, inclusive, None for the whole type.
+    """
+
+    kind: Kind
+    default: Value = 0
+    writable: bool = False
+    mappable: Mappable = Mappable.NO
+    lowest: int | None = None
+    highest: int | None = None
+
+    def encode(self, value: Value) -> bytes:
+        """As it goes over the bus."""
+        if isinstance(value, str):
+            return value.encode("ascii")
+        return struct.pack("<" + self.kind.value, value)
+
+    def decode(self, data: bytes) -> Value:
+        """From the bus.
+
+        Raises:
+            SdoAbort: wrong length, or outside the range of values.
+        """
+        if self.kind is Kind.TEXT:
+            return data.decode("ascii", errors="replace")
+        size = self.kind.bits // 8
+        if len(data) != size:
+            raise SdoAbort(TOO_LONG if len(data) > size else TOO_SHORT)
+        (value,) = struct.unpack("<" + self.kind.value, data)
+        if (self.lowest is not None and value < self.lowest) or (self.highest is not None and value > self.highest):
+            raise SdoAbort(INVALID_VALUE)
+        return int(value)
+
+
+Dictionary = dict[tuple[int, int], Entry]
+
+_REAL32, _REAL32_BITS = struct.Struct("<f"), struct.Struct("<I")
+
+SAVE = int.from_bytes(b"save", "little")
+LOAD = int.from_bytes(b"load", "little")
+
+
+def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
+    """All entries of an amplifier, PDO parameters (1400h-1BFFh) excepted: pdo.py answers for those."""
+    counts = axis.counts_per_revolution
+    peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
+    transmit, receive = Mappable.TRANSMIT, Mappable.RECEIVE
+    return {
+        (0x1000, 0): Entry(Kind.U32, 0x00020192),  # servo drive (2) of profile 402
+        (0x1001, 0): Entry(Kind.U8, mappable=transmit),
+        (0x1003, 0): Entry(Kind.U8, writable=True, highest=0),  # writing zero clears the history
+        (0x1003, 1): Entry(Kind.U32),
+        (0x1005, 0): Entry(Kind.U32, 0x80),
+        (0x1008, 0): Entry(Kind.TEXT, "drivegain simulated CiA 402 amplifier"),
+        (0x1009, 0): Entry(Kind.TEXT, "1.0"),
+        (0x100A, 0): Entry(Kind.TEXT, "1.0"),
+        (0x1010, 0): Entry(Kind.U8, 1),
+        (0x1010, 1): Entry(Kind.U32, 1, writable=True),
+        (0x1011, 0): Entry(Kind.U8, 1),
+        (0x1011, 1): Entry(Kind.U32, 1, writable=True),
+        (0x1014, 0): Entry(Kind.U32, 0x80 + axis.node_id),
+        (0x1016, 0): Entry(Kind.U8, 1),
+        (0x1016, 1): Entry(Kind.U32, writable=True),  # whom to watch: node id << 16 | ms
+        (0x1017, 0): Entry(Kind.U16, 100, writable=True),
+        (0x1018, 0): Entry(Kind.U8, 4),
+        (0x1018, 1): Entry(Kind.U32, axis.vendor_id),
+        (0x1018, 2): Entry(Kind.U32, axis.product_code),
+        (0x1018, 3): Entry(Kind.U32, axis.revision),
+        (0x1018, 4): Entry(Kind.U32, axis.serial),
+        (0x1019, 0): Entry(Kind.U8),
+        # The maker's own: the joint drive gain that somebody entered. Nobody reads it but a master.
+        (0x2003, 0): Entry(Kind.U8, 2),
+        (0x2003, 1): Entry(Kind.I32, round(1000 * axis.entered_gain_nm_per_a), writable=True),
+        (0x2003, 2): Entry(Kind.U32, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0], writable=True),
+        (0x6007, 0): Entry(Kind.I16, 1, writable=True, lowest=0, highest=3),
+        (0x603F, 0): Entry(Kind.U16, mappable=transmit),
+        (0x6040, 0): Entry(Kind.U16, writable=True, mappable=receive),
+        (0x6041, 0): Entry(Kind.U16, mappable=transmit),
+        (0x605A, 0): Entry(Kind.I16, 2, writable=True, lowest=0, highest=6),
+        (0x6060, 0): Entry(Kind.I8, 0, writable=True, mappable=receive, lowest=0, highest=1),
+        (0x6061, 0): Entry(Kind.I8, mappable=transmit),
+        (0x6062, 0): Entry(Kind.I32, mappable=transmit),
+        (0x6063, 0): Entry(Kind.I32, mappable=transmit),
+        (0x6064, 0): Entry(Kind.I32, mappable=transmit),
+        (0x6065, 0): Entry(Kind.U32, counts // 2, writable=True),
+        (0x6066, 0): Entry(Kind.U16, 10, writable=True),
+        (0x6067, 0): Entry(Kind.U32, counts // 100, writable=True),
+        (0x6068, 0): Entry(Kind.U16, 10, writable=True),
+        (0x606C, 0): Entry(Kind.I32, mappable=transmit),
+        (0x6073, 0): Entry(Kind.U16, peak_per_mille, writable=True, mappable=receive, highest=peak_per_mille),
+        (0x6074, 0): Entry(Kind.I16, mappable=transmit),
+        (0x6075, 0): Entry(Kind.U32, round(1000 * axis.rated_current_a)),
+        # Zero until someone enters the motor's name plate: the cell must not tell its true torque constant.
+        (0x6076, 0): Entry(Kind.U32, 0, writable=True),
+        (0x6077, 0): Entry(Kind.I16, mappable=transmit),
+        (0x6078, 0): Entry(Kind.I16, mappable=transmit),
+        (0x607A, 0): Entry(Kind.I32, writable=True, mappable=receive),
+        (0x6081, 0): Entry(Kind.U32, 10 * counts, writable=True, mappable=receive, lowest=1),
+        (0x6083, 0): Entry(Kind.U32, 50 * counts, writable=True, mappable=receive, lowest=1),
+        (0x6084, 0): Entry(Kind.U32, 50 * counts, writable=True, mappable=receive, lowest=1),
+        (0x6085, 0): Entry(Kind.U32, 100 * counts, writable=True, mappable=receive, lowest=1),
+        (0x608F, 0): Entry(Kind.U8, 2),
+        (0x608F, 1): Entry(Kind.U32, counts),
+        (0x608F, 2): Entry(Kind.U32, 1),
+        (0x60F4, 0): Entry(Kind.I32, mappable=transmit),
+        (0x6502, 0): Entry(Kind.U32, 1),  # profile position alone
+    }
+
+
+def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
+    """The entry.
+
+    Raises:
+        SdoAbort: it does not exist.
+    """
+    entry = dictionary.get((index, subindex))
+    if entry is not None:
+        return entry
+    raise SdoAbort(NO_SUBINDEX if any(known == index for known, _ in dictionary) else NO_OBJECT)
+
+
+# The SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3), bytes in and bytes out.
+
+
+_HEAD = struct.Struct("<BHB")
+
+TOGGLE_NOT_ALTERNATED = 0x05030000
+UNKNOWN_COMMAND = 0x05040001
+
+
+class SdoServer:
+    """One SDO channel; it keeps the transfer that is under way and nothing else."""
+
+    def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
+        self._read = read
+        self._write = write
+        self._entry = (0, 0)
+        self._upload: bytes | None = None
+        self._download: bytearray | None = None
+        self._toggle = 0
+
+    def answer(self, request: bytes) -> bytes | None:
+        """The response to a request of 8 bytes; None where the standard wants silence (an abort of the client)."""
+        if len(request) < 8:
+            return None
+        command = request[0] >> 5
+        if command == 4:
+            self._upload = self._download = None
+            return None
+        if command in (1, 2):
+            _, index, subindex = _HEAD.unpack_from(request)
+            self._entry = (index, subindex)
+        try:
+            return self._serve(command, request)
+        except SdoAbort as abort:
+            self._upload = self._download = None
+            return _HEAD.pack(0x80, *self._entry) + struct.pack("<I", abort.code)
+
+    def _serve(self, command: int, request: bytes) -> bytes:
+        if command == 0:
+            return self._continue_download(request)
+        if command == 1:
+            return self._start_download(request)
+        if command == 2:
+            return self._start_upload()
+        if command == 3:
+            return self._continue_upload(request[0])
+        raise SdoAbort(UNKNOWN_COMMAND)
+
+    def _start_upload(self) -> bytes:
+        data = self._read(*self._entry)
+        self._upload = self._download = None
+        if len(data) <= 4:
+            return _HEAD.pack(0x43 | (4 - len(data)) << 2, *self._entry) + data.ljust(4, b"\0")
+        self._upload, self._toggle = data, 0
+        return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
+
+    def _continue_upload(self, command: int) -> bytes:
+        if self._upload is None:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        self._check_toggle(command)
+        part, self._upload = self._upload[:7], self._upload[7:]
+        last = not self._upload
+        answer = bytes([self._toggle | (7 - len(part)) << 1 | last]) + part.ljust(7, b"\0")
+        self._toggle ^= 0x10
+        if last:
+            self._upload = None
+        return answer
+
+    def _start_download(self, request: bytes) -> bytes:
+        self._upload = self._download = None
+        if request[0] & 0x02:
+            size = 4 - (request[0] >> 2 & 3) if request[0] & 0x01 else 4
+            self._write(*self._entry, request[4 : 4 + size])
+        else:
+            self._download, self._toggle = bytearray(), 0
+        return _HEAD.pack(0x60, *self._entry) + bytes(4)
+
+    def _continue_download(self, request: bytes) -> bytes:
+        if self._download is None:
+            raise SdoAbort(UNKNOWN_COMMAND)
+        self._check_toggle(request[0])
+        self._download += request[1 : 8 - (request[0] >> 1 & 7)]
+        answer = bytes([0x20 | self._toggle]) + bytes(7)
+        self._toggle ^= 0x10
+        if request[0] & 0x01:
+            data, self._download = bytes(self._download), None
+            self._write(*self._entry, data)
+        return answer
+
+    def _check_toggle(self, command: int) -> None:
+        if command & 0x10 != self._toggle:
+            raise SdoAbort(TOGGLE_NOT_ALTERNATED)
+
+
+# In which objects and units a simulated amplifier tells its current: the standard's, or those of a make.
+#
+# Only what a recording reads differs (current, rated values); states, moves and limits stay those of CiA 402. The
+# units
+# are written down here from the makes' side, not taken from the drive profiles, so that a wrong scale is found out.
+
+
+_LIMITS = {Kind.I16: (-(2**15), 2**15 - 1), Kind.I32: (-(2**31), 2**31 - 1)}
+
+
+class Signal(Enum):
+    """What of the current loop an object tells."""
+
+    REFERENCE = "reference"
+    ACTUAL = "actual"
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentObject:
+    """An object that tells a current in a unit of its own: current / step, rounded, at most what it can hold."""
+
+    key: tuple[int, int]
+    kind: Kind
+    step_a: float
+    signal: Signal
+
+    def source(self, amplifiers: AmplifierSet, index: int) -> Callable[[], int]:
+        """Its value at any time, of the amplifier of that index."""
+        lowest, highest = _LIMITS[self.kind]
+        told_a = amplifiers.reported_a if self.signal is Signal.REFERENCE else amplifiers.actual_a
+
+        def value() -> int:
+            return max(lowest, min(highest, round(float(told_a[index]) / self.step_a)))
+
+        return value
+
+
+def current_objects(axis: AxisSpec) -> tuple[CurrentObject, ...]:
+    """What an amplifier tells of its current beside, or in place of, 6074h, 6077h and 6078h of the standard."""
+    reference, actual = Signal.REFERENCE, Signal.ACTUAL
+    by_dialect: dict[Dialect, tuple[CurrentObject, ...]] = {
+        Dialect.CIA402: (),
+        Dialect.EPOS4: (
+            CurrentObject((0x30D0, 0), Kind.I32, 1e-3, reference),  # mA
+            CurrentObject((0x30D1, 1), Kind.I32, 1e-3, actual),
+            CurrentObject((0x30D1, 2), Kind.I32, 1e-3, actual),
+        ),
+        Dialect.COPLEY: (
+            CurrentObject((0x221D, 0), Kind.I16, 0.01, reference),  # 10 mA
+            CurrentObject((0x221C, 0), Kind.I16, 0.01, actual),
+        ),
+        # 65520 internal units are twice the peak current.
+        Dialect.IPOS: (CurrentObject((0x6077, 0), Kind.I16, 2.0 * axis.peak_current_a / 65520.0, actual),),
+        # 3280 digits are the peak current.
+        Dialect.AX2000: (CurrentObject((0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, reference),),
+    }
+    return by_dialect[axis.dialect]
+
+
+_ABSENT: dict[Dialect, frozenset[int]] = {
+    Dialect.CIA402: frozenset(),
+    Dialect.EPOS4: frozenset({0x6073, 0x6074, 0x6075, 0x6078}),
+    Dialect.COPLEY: frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6078}),
+    Dialect.IPOS: frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6078}),
+    Dialect.AX2000: frozenset({0x6073, 0x6075, 0x6076, 0x6078}),
+}
+
+
+def translated(dictionary: Dictionary, axis: AxisSpec) -> Dictionary:
+    """A dictionary of the standard with the objects of a make in it, and without those that the make lacks."""
+    objects = {key: entry for key, entry in dictionary.items() if key[0] not in _ABSENT[axis.dialect]}
+    for told in current_objects(axis):
+        objects[told.key] = Entry(told.kind, mappable=Mappable.TRANSMIT)
+    if axis.dialect is Dialect.EPOS4:
+        objects[0x3001, 1] = Entry(Kind.U32, round(1000 * axis.rated_current_a), writable=True)
+    if axis.dialect is Dialect.COPLEY:
+        objects[0x2240, 0] = Entry(Kind.I32, mappable=Mappable.TRANSMIT)  # the motor's encoder
+    if axis.dialect is Dialect.AX2000:
+        objects[0x3529, 1] = Entry(Kind.I32, round(1000 * axis.peak_current_a))
+    return objects

@@ -1,0 +1,339 @@
+"""The mechanics of a simulated cell: links, motors behind their gears, friction that sticks, brakes, effects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from drivers.simulation import dynamics, friction
+from drivers.simulation.effects import Backlash, Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.spec import Body, CellSpec, FrictionUnsolved, SpecInvalid
+
+# Which coordinates a plant has, along which of them motors act, and in which directions dry friction acts.
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """n motors, N coordinates, m directions of dry friction.
+
+    Attributes:
+        motor_direction: how each motor turns with the coordinates, shape (n, N).
+        directions: of dry friction, shape (m, N); the first n are the joints.
+        own_row: the direction that carries each motor's own dry friction and brake, shape (n,).
+        lone: coordinate of each direction that has only one, else -1, shape (m,).
+        flexible: drives that part a motor from its joints, in the order of their coordinates.
+    """
+
+    motor_direction: FloatArray
+    directions: FloatArray
+    own_row: NDArray[np.int64]
+    lone: NDArray[np.int64]
+    flexible: tuple[Elasticity | Backlash, ...]
+
+
+def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
+    """Count coordinates and directions, and tell the effects that add some where theirs are.
+
+    Args:
+        rows: r_i of the drive train, shape (n, n).
+        effects: of the plant.
+
+    Raises:
+        SpecInvalid: two flexible drives are given for one motor.
+    """
+    n = len(rows)
+    flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity | Backlash))
+    if len({drive.axis for drive in flexible}) < len(flexible):
+        raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
+    total = n + len(flexible)
+    motor_direction = np.hstack([rows, np.zeros((n, len(flexible)))])
+    for coordinate, drive in enumerate(flexible, start=n):
+        drive.coordinate, drive.row = coordinate, rows[drive.axis]
+        motor_direction[drive.axis] = np.eye(total)[coordinate]
+    directions = list(np.eye(n, total))
+    own_row = np.zeros(n, dtype=np.int64)
+    for motor, row in enumerate(motor_direction):
+        moved = np.flatnonzero(row)
+        if len(moved) == 1 and moved[0] < n:
+            # A motor that turns with one joint alone shares that joint's direction; r_i is 1 there by its making.
+            own_row[motor] = moved[0]
+        else:
+            own_row[motor] = len(directions)
+            directions.append(row)
+    for effect in effects:
+        if isinstance(effect, Coupling):
+            effect.direction = len(directions)
+            shared = np.zeros(total)
+            shared[[effect.axis, effect.other]] = 1.0
+            directions.append(shared)
+    lone = [np.flatnonzero(row)[0] if np.count_nonzero(row) == 1 else -1 for row in directions]
+    return Layout(motor_direction, np.array(directions), own_row, np.array(lone, dtype=np.int64), flexible)
+
+
+# The gears of the simulated cell: how motors, joints and directions of dry friction hang together.
+
+
+def reduction(ratio: FloatArray) -> FloatArray:
+    """N of each motor, shape (n,): its own joint's ratio, or its largest where it does not drive that joint.
+
+    Raises:
+        SpecInvalid: the matrix is not square or not invertible.
+    """
+    if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
+        raise SpecInvalid(f"the drive train must be a square matrix, found shape {ratio.shape}")
+    if not np.isfinite(ratio).all() or np.linalg.matrix_rank(ratio) < len(ratio):
+        raise SpecInvalid(f"the drive train must be invertible, found {ratio.tolist()}")
+    own = np.diag(ratio)
+    largest = ratio[np.arange(len(own)), np.argmax(np.abs(ratio), axis=1)]
+    return np.where(own != 0.0, own, largest)
+
+
+def motor_rows(ratio: FloatArray) -> FloatArray:
+    """r_i = R_i / N_i, shape (n, n): a motor's torque in joint units acts on the joints along r_i (eq. 24)."""
+    return np.asarray(ratio / reduction(ratio)[:, None], dtype=np.float64)
+
+
+FloatArray = NDArray[np.float64]
+
+BRAKE_FACTOR = 2.0
+"""Holding torque of a brake over the peak torque of its motor."""
+
+
+class Plant:
+    """A robot of n joints, revolute or prismatic, and n motors that moves under the currents of its motors.
+
+    Of a prismatic joint all quantities are in N for Nm, m for rad and kg for kg m².
+
+    Coordinates are the joints and, behind them, each motor that a flexible drive parts from its joints; torques of
+    motors are in joint units (τ_joint = Σ r_i g_i i_i, see drive_train.py). Power-on: at rest, brakes closed.
+
+    Attributes:
+        position_rad, velocity_rad_s: of the coordinates, shape (N,).
+        load_torque_nm: what the links asked of the joints in the last step, shape (n,).
+        motor_rad: angle of each rotor [rad], shape (n,); zero at joint position zero.
+        time_s: since power-on.
+    """
+
+    def __init__(self, spec: CellSpec) -> None:
+        """Build the equations of motion.
+
+        Raises:
+            SpecInvalid: URDF, drive train, axes and start position do not fit together.
+            EffectUnknown: an undeclared effect or its parameters do not exist.
+        """
+        model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+        n = len(spec.axes)
+        if model.nv != n or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
+            raise SpecInvalid(
+                f"{n} axes, a URDF of {model.nv} joints, a drive train of shape {spec.ratio.shape} and a start "
+                f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
+            )
+        effects = [build_effect(effect, n) for effect in spec.effects]
+        step_s = spec.sync_period_us * 1e-6 / spec.substeps
+        layout = lay_out(motor_rows(spec.ratio), effects)
+        for drive in layout.flexible:
+            _check_stiffness(drive, spec.axes[drive.axis].motor_inertia_kg_m2, step_s)
+        m, total = layout.directions.shape
+        own_row, added = layout.own_row, [0.0] * len(layout.flexible)
+        axes = spec.axes
+        self.time_s = 0.0
+        self.position_rad = np.concatenate([spec.start_rad, [drive.row @ spec.start_rad for drive in layout.flexible]])
+        self.velocity_rad_s = np.zeros(total)
+        self.load_torque_nm = np.zeros(n)
+        self._model, self._data = model, model.createData()
+        self._step_s = step_s
+        self._acting = tuple(e for e in effects if not isinstance(e, Lag))
+        self._rows = motor_rows(spec.ratio)
+        self._motor_direction = layout.motor_direction
+        self._motor = layout.motor_direction * reduction(spec.ratio)[:, None]
+        self.motor_rad = self._motor @ self.position_rad
+        self._gain = np.array([a.gain_nm_per_a for a in axes])
+        self._motor_inertia = np.array([a.motor_inertia_kg_m2 for a in axes])
+        self._motor_viscous = np.array([a.motor_viscous_nm_s_rad for a in axes])
+        self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + added)
+        # The paper's offset stands on the side of what the motor must give (eq. 1), so it pulls the joint back.
+        self._torque = np.array([-a.offset_nm for a in axes] + added)
+        self._directions = layout.directions
+        self._own_row = own_row
+        self._lone = layout.lone
+        self._free_bound = np.zeros(m)
+        self._free_bound[:n] = [a.coulomb_nm for a in axes]
+        for row, axis in zip(own_row, axes, strict=True):
+            self._free_bound[row] += axis.motor_coulomb_nm
+        self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
+        self._bound = self._free_bound.copy()
+        self._moment = Moment(
+            time_s=0.0,
+            step_s=step_s,
+            position_rad=self.position_rad,
+            velocity_rad_s=self.velocity_rad_s,
+            motor_rad=self.motor_rad,
+            current_a=np.zeros(n),
+            load_torque_nm=self.load_torque_nm,
+            bound_nm=np.zeros(m),
+            viscous_nm_s_rad=np.zeros(total),
+            torque_nm=np.zeros(total),
+            motor_torque_nm=np.zeros(n),
+        )
+        self._mass, self._bias = np.zeros((n, n)), np.zeros(n)
+        self._free_velocity, self._response = np.zeros(total), np.zeros((total, m))
+        self._free_speed, self._delassus = np.zeros(m), np.zeros((m, m))
+        self._impulse, self._impulse_bound = np.zeros(m), np.zeros(m)
+        self.set_brakes(np.ones(n, dtype=np.bool_))
+
+    @property
+    def friction_nm(self) -> FloatArray:
+        """Torque of dry friction and brakes on each coordinate in the last step [Nm], shape (N,)."""
+        return np.asarray(self._directions.T @ self._impulse / self._step_s)
+
+    def set_brakes(self, closed: NDArray[np.bool_]) -> None:
+        """Close or open the brake of each motor, shape (n,)."""
+        self._bound[:] = self._free_bound
+        for row, brake_nm, shut in zip(self._own_row, self._brake_nm, closed, strict=True):
+            if shut:
+                self._bound[row] += brake_nm
+
+    def mount(self, spec: CellSpec) -> None:
+        """Exchange the mounted body for that of another description of the same cell, which then weighs at once.
+
+        Where the joints are, what they are warm from and all else stays.
+        """
+        self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
+        self._data = self._model.createData()
+
+    def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
+        """Positions of each joint that show how its inertia varies, so many a joint.
+
+        Args:
+            start_rad: where the joints are at power-on, shape (n,).
+            count: of a revolute joint these are angles of one revolution from its start, because inertia repeats over
+                it; of a prismatic one, places along its travel.
+        """
+        angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+        lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        return tuple(
+            np.linspace(lower[joint], upper[joint], count) if _is_prismatic(self._model, joint) else start + angles
+            for joint, start in enumerate(start_rad)
+        )
+
+    def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
+        """Inertia that each motor turns while the others stand still, in joint units [kg m²], shape (n,).
+
+        Args:
+            position_rad: of the joints [rad or m], shape (n,).
+        """
+        to_joint = np.linalg.inv(self._rows)
+        links = np.array(pin.crba(self._model, self._data, position_rad))
+        return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._motor_inertia)
+
+    def step(self, current_a: FloatArray) -> None:
+        """Move by one substep.
+
+        Args:
+            current_a: in each motor, shape (n,).
+
+        Raises:
+            FrictionUnsolved: dry friction was not solved to its tolerance.
+        """
+        n, step_s, moment = len(self._gain), self._step_s, self._moment
+        position = self.position_rad[:n]
+        self._mass[...] = pin.crba(self._model, self._data, position)
+        self._bias[...] = pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n])
+        moment.bound_nm[...] = self._bound
+        np.multiply(self._gain, current_a, out=moment.motor_torque_nm)
+        moment.viscous_nm_s_rad[...] = self._viscous
+        moment.torque_nm[...] = self._torque
+        if self._acting:
+            moment.time_s = self.time_s
+            moment.current_a[...] = current_a
+            for effect in self._acting:
+                effect.act(moment)
+        np.multiply(moment.bound_nm, step_s, out=self._impulse_bound)
+        dynamics.free_motion(
+            self._mass,
+            self._bias,
+            self._motor_direction,
+            self._motor_inertia,
+            self._motor_viscous,
+            moment.viscous_nm_s_rad,
+            moment.motor_torque_nm,
+            moment.torque_nm,
+            self.velocity_rad_s,
+            self._directions,
+            step_s,
+            self._free_velocity,
+            self._response,
+            self._free_speed,
+            self._delassus,
+        )
+        residual = friction.solve(
+            self._delassus,
+            self._free_speed,
+            self._impulse_bound,
+            self._impulse,
+            friction.TOLERANCE_RAD_S,
+            friction.MAX_SWEEPS,
+        )
+        if not residual <= friction.TOLERANCE_RAD_S:
+            raise FrictionUnsolved(self.time_s, residual, friction.TOLERANCE_RAD_S)
+        dynamics.finish_step(
+            self._mass,
+            self._bias,
+            self._free_velocity,
+            self._response,
+            self._impulse,
+            self._impulse_bound,
+            self._directions,
+            self._lone,
+            step_s,
+            self._motor,
+            self.position_rad,
+            self.velocity_rad_s,
+            self.load_torque_nm,
+            self.motor_rad,
+        )
+        self.time_s += step_s
+
+
+def _is_prismatic(model: pin.Model, joint: int) -> bool:
+    """Whether a joint, counted from 0, slides: Pinocchio has a kind of joint for every axis it may slide along."""
+    kind = str(model.joints[joint + 1].shortname())
+    return "Prismatic" in kind or kind.startswith("JointModelP")
+
+
+def _check_stiffness(drive: Elasticity | Backlash, motor_inertia_kg_m2: float, step_s: float) -> None:
+    """Springs are explicit in the step: stable below stiffness h² = 4 inertia; a quarter of that is asked."""
+    stiff = (drive.stiffness_nm_per_rad * step_s + drive.damping_nm_s_per_rad) * step_s
+    if stiff > motor_inertia_kg_m2:
+        raise SpecInvalid(
+            f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us and a motor "
+            f"inertia of {motor_inertia_kg_m2:g} kg m²; lower stiffness or damping"
+        )
+
+
+def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None) -> pin.Model:
+    """The links of a URDF, with a payload fixed to the last one.
+
+    Raises:
+        SpecInvalid: the text is no URDF, or a joint is neither revolute nor prismatic with limits.
+    """
+    try:
+        model = pin.buildModelFromXML(urdf)
+    except (ValueError, RuntimeError) as error:
+        raise SpecInvalid(f"the URDF of the plant cannot be read: {error}") from error
+    if model.nq != model.nv or model.nv != model.njoints - 1:
+        raise SpecInvalid(
+            f"the URDF has {model.njoints - 1} joints with {model.nq} coordinates and {model.nv} degrees of freedom; "
+            "expected revolute or prismatic joints alone (a continuous joint is written as revolute with wide limits)"
+        )
+    model.gravity.linear = np.asarray(gravity_m_s2, dtype=np.float64)
+    if payload is not None:
+        xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        body = pin.Inertia(payload.mass_kg, np.asarray(payload.centre_m, dtype=np.float64), inertia)
+        model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
+    return model

@@ -1,0 +1,176 @@
+"""Everything that makes up a simulated cell, frozen: its truth. The identification never reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DriverError
+from drivers.simulation.faults import FaultSpec
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A rigid body in the frame of the last joint.
+
+    Attributes:
+        mass_kg: its mass [kg].
+        centre_m: centre of mass [m], (x, y, z).
+        inertia_kg_m2: about the centre of mass [kg m²], (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
+    """
+
+    mass_kg: float
+    centre_m: tuple[float, float, float]
+    inertia_kg_m2: tuple[float, float, float, float, float, float]
+
+
+class Dialect(Enum):
+    """Whose objects and units an amplifier uses for its current (drivers/simulation/objects.py)."""
+
+    CIA402 = "cia402"
+    EPOS4 = "epos4"
+    COPLEY = "copley"
+    IPOS = "ipos"
+    AX2000 = "ax2000"
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSpec:
+    """One motor, its amplifier, and the joint of the same number.
+
+    Of a prismatic joint, everything that is said at the joint is in N for Nm, m for rad and kg for kg m².
+
+    Attributes:
+        node_id: CANopen node id.
+        vendor_id, product_code, revision, serial: object 1018h.
+        counts_per_revolution: encoder counts a motor revolution.
+        rated_current_a: object 6075h (written there in mA); the current reference 6074h is in per mille of it.
+        peak_current_a: the amplifier's limit; the reference saturates there and statusword bit 11 is set.
+        gain_nm_per_a: the true joint drive gain g = N·Gt·Kt [Nm at the joint per A]; may be negative.
+        motor_inertia_kg_m2: of the rotor, seen at the joint (Ia = N²·J).
+        viscous_nm_s_rad, coulomb_nm: friction on the joint side.
+        motor_viscous_nm_s_rad, motor_coulomb_nm: friction on the motor side, in joint units (divided by N, see eq. 25).
+        offset_nm: constant torque at the joint.
+        current_noise_a: standard deviation of the noise of the current reference [A].
+        noise_correlation_s: correlation time of that noise (first-order); 0 is white.
+        dialect: whose objects tell its current.
+        toggle_bit: of statusword 6041h, which it inverts with every SYNC; None for an amplifier without.
+        entered_gain_nm_per_a: what somebody has entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); it is not used.
+    """
+
+    node_id: int
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial: int
+    counts_per_revolution: int
+    rated_current_a: float
+    peak_current_a: float
+    gain_nm_per_a: float
+    motor_inertia_kg_m2: float
+    viscous_nm_s_rad: float
+    coulomb_nm: float
+    motor_viscous_nm_s_rad: float
+    motor_coulomb_nm: float
+    offset_nm: float
+    current_noise_a: float
+    noise_correlation_s: float
+    dialect: Dialect = Dialect.CIA402
+    toggle_bit: int | None = None
+    entered_gain_nm_per_a: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class UndeclaredEffect:
+    """One thing that the plant does and no configuration declares.
+
+    Attributes:
+        name: of the physics in drivers/simulation/effects.py.
+        axis: index of the joint, from 0.
+        parameters: of that physics, by name, with units in the names.
+    """
+
+    name: str
+    axis: int
+    parameters: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class CellSpec:
+    """A whole simulated cell.
+
+    Attributes:
+        urdf: text of the URDF with the true inertial parameters of the links.
+        gravity_m_s2: in the base frame, (x, y, z).
+        ratio: drive train R, q_motor = R q_joint (eq. 24), shape (n, n); rad/m for a prismatic joint.
+        axes: one for each motor.
+        start_rad: joint positions at power-on [rad or m], shape (n,); encoder counts are zero at joint position zero.
+        payload: mounted body, or None.
+        effects: what the plant does beyond the declared model.
+        sync_period_us: one SYNC advances the plant by this much.
+        substeps: control and integration steps in one SYNC period.
+        seed: of every random number of the cell.
+        faults: what goes wrong, and when.
+    """
+
+    urdf: str
+    gravity_m_s2: tuple[float, float, float]
+    ratio: FloatArray
+    axes: tuple[AxisSpec, ...]
+    start_rad: FloatArray
+    payload: Body | None
+    effects: tuple[UndeclaredEffect, ...]
+    sync_period_us: int
+    substeps: int
+    seed: int
+    faults: tuple[FaultSpec, ...] = ()
+
+
+# What can be wrong with a simulated cell.
+#
+# DriverError
+# └── SimulationError       root of the tree of the simulated cell
+#     ├── SpecInvalid       the cell cannot be built from its description
+#     ├── EffectUnknown     an undeclared effect or a parameter of it does not exist
+#     └── FrictionUnsolved  the dry-friction problem was not solved to its tolerance
+#
+# SdoAbort                  an SDO access that the simulated node refuses: answered on the bus, never raised to a user
+
+
+class SimulationError(DriverError):
+    """Root of the tree of the simulated cell."""
+
+
+class SpecInvalid(SimulationError):
+    """The cell cannot be built from its description."""
+
+
+class EffectUnknown(SimulationError):
+    """An undeclared effect or a parameter of it does not exist."""
+
+
+class FrictionUnsolved(SimulationError):
+    """The dry-friction problem was not solved to its tolerance."""
+
+    def __init__(self, time_s: float, residual_rad_s: float, tolerance_rad_s: float) -> None:
+        super().__init__(
+            f"dry friction at {time_s:.6f} s: residual {residual_rad_s:.3g} rad/s, "
+            f"expected at most {tolerance_rad_s:.3g}; "
+            "check the inertias and friction of the cell for values that differ by many orders of magnitude"
+        )
+        self.time_s = time_s
+        self.residual_rad_s = residual_rad_s
+        self.tolerance_rad_s = tolerance_rad_s
+
+
+class SdoAbort(Exception):
+    """An SDO access that the node refuses, with the abort code of CiA 301."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"SDO abort {code:#010x}")
+        self.code = code

@@ -1,0 +1,246 @@
+"""Watching a cell without touching it: what its axes report, how often, and what the bus carries.
+
+While another master is on the bus, nothing is sent: its SYNC, and the answers that our mapping gives to it, are
+overheard. On a quiet bus the axes are asked by SDO uploads, one open request a node. Nothing is ever written.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from dataclasses import dataclass
+from enum import Enum
+
+import can
+
+from drivers.canopen.bus import bus_errors
+from drivers.canopen.link import SYNC_COB_ID, Link
+from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
+from drivers.profiles.profile import Axis, ObjectEntry
+from drivers.stream.sample import CellEvent
+from drivers.stream.split_bus import SplitAddress
+
+QUIET_S = 2.0
+"""Silence of other masters after which the axes are asked."""
+ANSWER_S = 0.3
+"""That an answer may take; CiA 301 sets no bound, and drives answer within milliseconds."""
+READING_S = 0.1
+"""Between two readings of an axis that is asked: six axes then take some 5 % of a bus of 1 Mbit/s."""
+_UPLOAD = 0x40
+_EXPEDITED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
+"""Bytes of data by the command byte of an expedited upload answer (CiA 301, SDO upload initiate)."""
+
+
+class Source(Enum):
+    """Where the readings come from."""
+
+    OVERHEARD = "overheard"
+    ASKED = "asked"
+
+
+@dataclass(frozen=True, slots=True)
+class AxisReading:
+    """What is known of one axis.
+
+    Attributes:
+        position_counts, current_raw, statusword: last ones, None where none came yet.
+        nmt: state in its last heartbeat, None where none came.
+        rate_hz: of whole readings since the reading before.
+        lost: SYNCs, or requests, that it left without an answer since the monitor began.
+    """
+
+    position_counts: int | None
+    current_raw: int | None
+    statusword: int | None
+    nmt: int | None
+    rate_hz: float
+    lost: int
+
+
+@dataclass(frozen=True, slots=True)
+class CellReading:
+    """What is known of a cell.
+
+    Attributes:
+        source: of the values.
+        seconds: since the reading before.
+        axes: in their order.
+        sync_hz: SYNCs a second.
+        frames: on each bus, number of frames in that time by their length, ours among them, shape (buses, 9).
+        events: EMCY and changes of NMT states in that time.
+    """
+
+    source: Source
+    seconds: float
+    axes: tuple[AxisReading, ...]
+    sync_hz: float
+    frames: tuple[tuple[int, ...], ...]
+    events: tuple[CellEvent, ...]
+
+
+class _AxisWatch:
+    """The last values of one axis, and its frames that are due."""
+
+    def __init__(self, axis: Axis) -> None:
+        self.node_id = axis.node_id
+        self.entries = feedback_entries(axis)
+        pdos = pack(self.entries)
+        self.slots = {
+            record.cob_id: (layout(pdo), tuple(self.entries.index(entry) for entry in pdo))
+            for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True)
+        }
+        self.values: list[int | None] = [None] * len(self.entries)
+        self.seen: set[int] = set()
+        self.followed = False
+        self.readings = self.lost = 0
+        self.asked = -1
+        self.open_until_ns: int | None = None
+        self.due_ns = 0
+
+    def hear(self, cob_id: int, data: bytes) -> None:
+        form, places = self.slots[cob_id]
+        if len(data) != form.size:
+            return  # another master's mapping: not ours to interpret
+        for place, value in zip(places, form.unpack(data), strict=True):
+            self.values[place] = value
+        self.seen.add(cob_id)
+        self.readings += self.seen == self.slots.keys()
+
+    def sync(self) -> None:
+        """The time for the answers to the SYNC before is over; an axis is followed from its first answer on."""
+        self.lost += self.followed and self.seen != self.slots.keys()
+        self.followed = self.followed or self.seen == self.slots.keys()
+        self.seen.clear()
+
+    def answer(self, data: bytes) -> None:
+        entry = self.entries[self.asked]
+        if self.open_until_ns is None or data[1:4] != struct.pack("<HB", entry.index, entry.subindex):
+            return  # an answer to somebody else
+        self.open_until_ns = None
+        length = _EXPEDITED.get(data[0], 0)
+        if 8 * length >= entry.bits:
+            self.values[self.asked] = int.from_bytes(data[4 : 4 + entry.bits // 8], "little", signed=entry.signed)
+            self.readings += self.asked == len(self.entries) - 1
+
+    def next_request(self, now_ns: int) -> ObjectEntry | None:
+        if self.open_until_ns is not None:
+            if now_ns < self.open_until_ns:
+                return None
+            self.lost += 1
+            self.open_until_ns, self.asked = None, -1  # from the first one on: the values of a reading belong together
+        following = (self.asked + 1) % len(self.entries)
+        if following == 0:
+            if now_ns < self.due_ns:
+                return None
+            self.due_ns = now_ns + round(READING_S * 1e9)
+        self.asked = following
+        self.open_until_ns = now_ns + round(ANSWER_S * 1e9)
+        return self.entries[self.asked]
+
+
+class CellMonitor:
+    """Reads a bus and, where nobody else leads it, asks its axes.
+
+    Args:
+        link: open; nobody else may read it meanwhile.
+        axes: of the cell.
+    """
+
+    def __init__(self, link: Link, axes: tuple[Axis, ...]) -> None:
+        self._link = link
+        self._axes = tuple(_AxisWatch(axis) for axis in axes)
+        self._by_cob_id = {cob_id: axis for axis in self._axes for cob_id in axis.slots}
+        self._by_node = {axis.node_id: axis for axis in self._axes}
+        self._split = link.address if isinstance(link.address, SplitAddress) else None
+        self._buses = ("",) if self._split is None else tuple(map(str, self._split.parts))
+        self._frames: Counter[tuple[int, int]] = Counter()
+        self._syncs = 0
+        self._master_ns: int | None = None
+        self._began_ns = self._since_ns = link.clock()
+
+    @property
+    def source(self) -> Source:
+        """Of the values now: until it is known that no other master is there, nothing is sent."""
+        last_ns = self._began_ns if self._master_ns is None else self._master_ns
+        return Source.OVERHEARD if self._link.clock() - last_ns < QUIET_S * 1e9 else Source.ASKED
+
+    def watch(self, seconds: float) -> CellReading:
+        """Read the bus for a time; what came meanwhile.
+
+        Raises:
+            BusError: the bus has gone, or is off.
+        """
+        clock = self._link.clock
+        deadline_ns = clock() + round(seconds * 1e9)
+        with bus_errors(self._link.address):
+            while (left_ns := deadline_ns - clock()) > 0:
+                if self.source is Source.ASKED:
+                    self._ask()
+                message = self._link.bus.recv(min(left_ns * 1e-9, READING_S / 10))
+                if message is not None:
+                    self._hear(message)
+        return self._reading()
+
+    def pause(self) -> None:
+        """Let go of what was asked: somebody else will read the bus for a moment."""
+        for axis in self._axes:
+            axis.open_until_ns, axis.asked = None, -1
+
+    def _ask(self) -> None:
+        now_ns = self._link.clock()
+        for axis in self._axes:
+            entry = axis.next_request(now_ns)
+            if entry is None:
+                continue
+            data = struct.pack("<BHB4x", _UPLOAD, entry.index, entry.subindex)
+            request = can.Message(arbitration_id=0x600 + axis.node_id, is_extended_id=False, data=data)
+            self._link.send((request,))
+            for bus in (0,) if self._split is None else self._split.route(request):
+                self._frames[bus, len(data)] += 1
+
+    def _hear(self, message: can.Message) -> None:
+        bus = 0 if self._split is None else self._buses.index(str(message.channel))
+        self._frames[bus, len(message.data)] += 1
+        if message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+            self._link.dispatch(message)
+            return
+        identifier = message.arbitration_id
+        if identifier == SYNC_COB_ID:
+            self._syncs += 1
+            self._lead()
+            for axis in self._axes:
+                axis.sync()
+        elif identifier == 0 or 0x600 <= identifier < 0x680:
+            self._lead()
+        elif identifier in self._by_cob_id:
+            self._by_cob_id[identifier].hear(identifier, bytes(message.data))
+        elif 0x580 <= identifier < 0x600 and len(message.data) == 8 and identifier - 0x580 in self._by_node:
+            self._by_node[identifier - 0x580].answer(bytes(message.data))
+        else:
+            self._link.dispatch(message)
+
+    def _lead(self) -> None:
+        """Another master speaks."""
+        if self.source is Source.ASKED:
+            self.pause()
+            for axis in self._axes:
+                axis.followed = False
+                axis.seen.clear()
+        self._master_ns = self._link.clock()
+
+    def _reading(self) -> CellReading:
+        now_ns = self._link.clock()
+        seconds = max((now_ns - self._since_ns) * 1e-9, 1e-9)
+        self._since_ns = now_ns
+        axes = []
+        for axis in self._axes:
+            position, current, statusword = axis.values
+            nmt = self._link.nmt.get(axis.node_id)
+            axes.append(AxisReading(position, current, statusword, nmt, axis.readings / seconds, axis.lost))
+            axis.readings = 0
+        frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
+        sync_hz = self._syncs / seconds
+        self._frames.clear()
+        self._syncs = 0
+        events = self._link.take_events(now_ns, tuple(self._by_node))
+        return CellReading(self.source, seconds, tuple(axes), sync_hz, frames, events)

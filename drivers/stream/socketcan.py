@@ -1,0 +1,378 @@
+"""One end of a SocketCAN bus, read by a process of its own (drivers/stream/capture.py); here it is only sent on.
+
+See docs/decisions/0017-capture-in-its-own-process.md.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import can
+
+from drivers.stream import capture
+from drivers.stream.capture import RECORD, Kind
+
+RECEIVE_BUFFER_BYTES = 4 << 20
+"""A kernel buffer of 208 KiB holds 43 ms of a full bus; a busy machine needs more."""
+START_S = 20.0
+"""Until the capture process reads; a loaded machine takes its time to start an interpreter."""
+END_S = 5.0
+SEND_S = 0.1
+"""How long a full transmit queue may stay full: at 10 kbit/s a frame takes 13 ms."""
+RETRY_S = 0.0002
+SO_RCVBUFFORCE, SO_TIMESTAMPNS = 33, 35  # asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
+CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
+ERROR_CLASSES = 0x4 | 0x40 | 0x100
+"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not told:
+a bus without a second node sends thousands a second."""
+_EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+_FRAME = struct.Struct("=IB3x8s")
+_PAIR_BYTES = 1 << 18
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """Frames that came over the wire and were lost in this machine.
+
+    Attributes:
+        kernel: in the socket's receive buffer (SO_RXQ_OVFL).
+        backlog: in the capture process, because nobody took them from it for minutes.
+        interface: before any socket, in the controller or in the kernel's queue behind its driver (the interface's
+            counters, which are looked at five times a second).
+    """
+
+    kernel: int = 0
+    backlog: int = 0
+    interface: int = 0
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.kernel + self.interface + self.backlog
+
+    def since(self, earlier: Losses) -> Losses:
+        """What has been lost since a reading."""
+        return Losses(
+            kernel=self.kernel - earlier.kernel,
+            backlog=self.backlog - earlier.backlog,
+            interface=self.interface - earlier.interface,
+        )
+
+
+NO_LOSSES = Losses()
+
+
+class CapturedMessage(can.Message):
+    """A frame with the kernel's time.
+
+    ``is_rx`` is False on a SYNC that this end sent itself: it comes back for the sake of its time.
+
+    Attributes:
+        kernel_ns: when the kernel received or sent it, by the wall clock [ns since 1970].
+        monotonic_ns: the same moment by the monotonic clock [ns].
+        local: sent by a program of this machine.
+    """
+
+    __slots__ = ("kernel_ns", "local", "monotonic_ns")
+
+    kernel_ns: int
+    monotonic_ns: int
+    local: bool
+
+
+def losses_of(bus: can.BusABC) -> Losses:
+    """What a bus says that this machine lost of its frames; nothing where a bus cannot tell."""
+    found = getattr(bus, "losses", NO_LOSSES)
+    return found if isinstance(found, Losses) else NO_LOSSES
+
+
+def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
+    """What a person should know of how a bus was opened."""
+    return tuple(getattr(bus, "remarks", ()))
+
+
+def open_socketcan(
+    channel: str,
+    receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES,
+    backlog_records: int = capture.BACKLOG_RECORDS,
+) -> SocketcanBus:
+    """Open one end of an interface of the kernel.
+
+    Args:
+        channel: name of the interface.
+        receive_buffer_bytes: to ask the kernel for.
+        backlog_records: frames that may wait in the capture process.
+
+    Raises:
+        OSError: there is no such interface, or it may not be used.
+        can.CanInitializationError: the interface is down, or the capture process did not start.
+    """
+    handle = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    try:
+        remarks = _configure(handle, receive_buffer_bytes)
+        handle.bind((channel,))
+        _require_up(handle)
+    except BaseException:
+        handle.close()
+        raise
+    return SocketcanBus(channel, handle, backlog_records, remarks)
+
+
+class SocketcanBus(can.BusABC):
+    """A socket of classic CAN frames, and the process that reads it.
+
+    Args:
+        channel: name of the interface, for messages.
+        handle: bound socket; the bus closes it.
+        backlog_records: frames that may wait in the capture process.
+        remarks: what a person should know of how it was opened.
+
+    Raises:
+        can.CanError: the capture process did not start; the socket is closed.
+
+    Attributes:
+        losses: as of the frames received so far.
+        remarks: as given.
+        capture_pid: process id of the capture process.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        handle: socket.socket,
+        backlog_records: int = capture.BACKLOG_RECORDS,
+        remarks: tuple[str, ...] = (),
+    ) -> None:
+        self.channel_info = f"socketcan {channel}"
+        self.losses = NO_LOSSES
+        self.remarks = remarks
+        self._channel = channel
+        self._received: deque[can.Message] = deque()
+        self._chunks: deque[bytes] = deque()
+        self._ready = False
+        self._end: str | None = None
+        self._socket = handle
+        self._pair, theirs = socket.socketpair()
+        try:
+            with theirs:
+                self._pair.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _PAIR_BYTES)
+                theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PAIR_BYTES)
+                self._process = _spawn(handle, theirs, channel, backlog_records)
+        except BaseException:
+            self._pair.close()
+            handle.close()
+            raise
+        self.capture_pid = self._process.pid
+        try:
+            self._wait_until_ready()
+            super().__init__(channel=channel)
+        except BaseException:
+            self._close()
+            raise
+
+    def _wait_until_ready(self) -> None:
+        """Before it reads, nobody would hear another master."""
+        deadline = time.monotonic() + START_S
+        while not self._ready:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0:
+                raise can.CanInitializationError(f"the capture process did not start within {START_S:g} s")
+            self._fill(left_s)
+
+    def fileno(self) -> int:
+        return self._pair.fileno()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        frame = _packed(msg)
+        deadline: float | None = None
+        while True:
+            try:
+                self._socket.send(frame, socket.MSG_DONTWAIT)
+            except OSError as error:
+                # A full queue of the interface, and a full buffer of the socket: the kernel would wait for ever.
+                if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+                    raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
+                # The interface's queue holds ten frames by default; a burst of set-points is longer.
+                now = time.monotonic()
+                deadline = now + (SEND_S if timeout is None else timeout) if deadline is None else deadline
+                if now >= deadline:
+                    raise can.CanOperationError(
+                        f"the transmit queue stays full for {SEND_S:g} s: does any node acknowledge frames?"
+                    ) from error
+                time.sleep(RETRY_S)
+            else:
+                return
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._received:
+            self._fill(timeout)
+        return (self._received.popleft() if self._received else None), False
+
+    def _fill(self, timeout_s: float | None) -> None:
+        """Take records from the capture process, waiting for the first of them."""
+        if self._end is not None:
+            raise can.CanOperationError(self._end)
+        try:
+            # What an interrupted call took and did not make frames of comes first.
+            if sum(map(len, self._chunks)) < RECORD.size and not self._take(timeout_s):
+                return
+        except (OSError, ValueError) as error:
+            raise can.CanOperationError(str(error)) from error
+        if not self._chunks[-1]:
+            self._end = f"the capture process ended by itself ({self._wait()}); frames since then are lost"
+            raise can.CanOperationError(self._end)
+        self._parse()
+        if self._end is not None and not self._received:
+            raise can.CanOperationError(self._end)
+
+    def _take(self, timeout_s: float | None) -> bool:
+        """Append what the capture process has sent to the chunks; tells whether there was anything."""
+        # Within one call into C, so that no signal handler's exception comes between receiving and keeping.
+        receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
+        try:
+            # Beside a busy thread each system call may cost the wait for the interpreter: not one too many.
+            self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
+        except BlockingIOError:
+            if timeout_s == 0 or not select.select((self._pair,), (), (), timeout_s)[0]:
+                return False
+            self._chunks.extend(receive((0,)))
+        return True
+
+    def _parse(self) -> None:
+        """Make frames of the chunks; an exception on the way, such as Ctrl-C, leaves them for the next time."""
+        chunk = b"".join(self._chunks)
+        whole = len(chunk) - len(chunk) % RECORD.size
+        rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
+        lost = [self.losses.kernel, self.losses.interface, self.losses.backlog]
+        for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
+            kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
+            if kind == Kind.FRAME:
+                # Of what we sent ourselves only SYNC is of interest: when it really went out.
+                if not own or can_id == 0x080:
+                    received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
+            elif kind == Kind.READY:
+                ready = True
+            elif kind == Kind.END:
+                end = _reason(can_id)
+        losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
+        # Nothing is called from here on: all of it, or none.
+        self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
+
+    def _message(
+        self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool
+    ) -> CapturedMessage:
+        extended, error = bool(can_id & _EXTENDED), bool(can_id & _ERROR)
+        message = CapturedMessage(
+            timestamp=kernel_ns * 1e-9,
+            arbitration_id=can_id & (0x1FFF_FFFF if extended or error else 0x7FF),
+            is_extended_id=extended,
+            is_remote_frame=bool(can_id & _REMOTE),
+            is_error_frame=error,
+            is_rx=not own,
+            channel=self._channel,
+            data=b"" if can_id & _REMOTE else data,
+            dlc=len(data),
+        )
+        message.kernel_ns, message.monotonic_ns, message.local = kernel_ns, monotonic_ns, local
+        return message
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self._close()
+
+    def _close(self) -> None:
+        self._end = self._end or "is closed"
+        # The capture process ends when its parent's end of the pair is closed.
+        self._pair.close()
+        self._wait()
+        self._socket.close()
+
+    def _wait(self) -> int:
+        """For the capture process, which has nobody to work for any more; its exit code."""
+        try:
+            return self._process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self._process.wait()
+
+
+def _spawn(bus: socket.socket, out: socket.socket, channel: str, backlog_records: int) -> subprocess.Popen[bytes]:
+    numbers = (bus.fileno(), out.fileno())
+    program = (str(Path(capture.__file__).resolve()), *map(str, numbers), channel, str(backlog_records))
+    return subprocess.Popen(
+        # Isolated: whatever the user's environment imports has nothing to do there.
+        [sys.executable, "-I", "-S", *program],
+        pass_fds=numbers,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        # A terminal's Ctrl-C goes to a whole group: the axes are stopped first, and that needs the frames.
+        start_new_session=True,
+    )
+
+
+def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, ...]:
+    """Set the options of a CAN_RAW socket; returns remarks for a person."""
+    for level, option, value in (
+        (socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
+        (socket.SOL_SOCKET, capture.SO_RXQ_OVFL, 1),
+        (socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, ERROR_CLASSES),
+        (socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1),
+    ):
+        handle.setsockopt(level, option, value)
+    try:
+        handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
+    except PermissionError:
+        handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    # The kernel doubles what it is asked for, for its own book-keeping, and tells the double.
+    given = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    if given >= receive_buffer_bytes:
+        return ()
+    return (
+        f"the kernel gave {given >> 10} KiB of receive buffer instead of {receive_buffer_bytes >> 10} KiB: "
+        "raise net.core.rmem_max, or let the recorder have CAP_NET_ADMIN",
+    )
+
+
+def _require_up(handle: socket.socket) -> None:
+    number = handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if number:
+        raise can.CanInitializationError(_reason(number))
+
+
+def _packed(message: can.Message) -> bytes:
+    """A frame as struct can_frame."""
+    if message.is_fd:
+        raise can.CanOperationError(f"no CAN FD frames on this bus: {message}")
+    flags = (
+        (_EXTENDED if message.is_extended_id else 0)
+        | (_REMOTE if message.is_remote_frame else 0)
+        | (_ERROR if message.is_error_frame else 0)
+    )
+    return _FRAME.pack(message.arbitration_id | flags, message.dlc, bytes(message.data))
+
+
+def _reason(number: int) -> str:
+    """What an error of the socket means to a person."""
+    name = errno.errorcode.get(number, str(number))
+    if number == errno.ENETDOWN:
+        return f"the interface is down ({name}): ip link set ... up"
+    if number in (errno.ENODEV, errno.ENXIO):
+        return f"the interface has gone ({name}): was the adapter unplugged?"
+    return f"{os.strerror(number)} ({name})"

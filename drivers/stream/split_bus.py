@@ -1,0 +1,318 @@
+"""Several CAN buses that one cell is wired to, read and written as one.
+
+A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven bits of their COB-ID
+(CiA 301, predefined connection set), NMT by its second byte. What concerns everybody goes to all: SYNC, NMT to all, and
+the heartbeat of the recorder, whose id is no node's. Received frames come in the order of their time stamps, which
+every interface takes from clocks of this one computer: monotonic where all have one, else by the wall clock.
+
+A bus that fails is told of once, as a BusError with its name; then the others go on without it, so that the axes on
+them can be stopped and given back. Its own nodes are silent from then on.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from itertools import groupby
+
+import can
+
+from drivers.canopen.bus import BusAddress, open_bus, send_burst
+from drivers.errors import BusError, NodeMisplaced
+from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
+
+ALTERNATION_S = 0.0005
+"""Of waiting at one bus while another may receive, where one of them has no file descriptor to wait at."""
+LARGEST_RUN = 64
+"""Frames of one bus in a row while another has one too: a clock that lags behind must not silence the others."""
+BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
+BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
+_FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
+"""Services that nodes send: EMCY, TPDO1 to 4, SDO answer, heartbeat."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusPart:
+    """One of the buses of a cell.
+
+    Attributes:
+        name: as people call it.
+        address: where it is.
+        node_ids: of the amplifiers on it.
+    """
+
+    name: str
+    address: BusAddress
+    node_ids: frozenset[int]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.address})"
+
+
+@dataclass(frozen=True, slots=True)
+class SplitAddress:
+    """Where the buses of a cell are; a node id is on one of them at most."""
+
+    parts: tuple[BusPart, ...]
+
+    def __str__(self) -> str:
+        return " + ".join(map(str, self.parts))
+
+    def route(self, message: can.Message) -> tuple[int, ...]:
+        """Indices of the parts that a frame concerns: its node's, or all where it is nobody's."""
+        node_id = 0
+        if not (message.is_extended_id or message.is_error_frame):
+            node_id = message.arbitration_id & 0x7F
+            if message.arbitration_id == 0 and len(message.data) > 1:
+                node_id = message.data[1]
+        for index, part in enumerate(self.parts):
+            if node_id in part.node_ids:
+                return (index,)
+        return tuple(range(len(self.parts)))
+
+
+CellAddress = BusAddress | SplitAddress
+"""Of one bus, or of several."""
+
+
+def open_cell_bus(address: CellAddress) -> can.BusABC:
+    """One end of the bus, or of all buses, of a cell.
+
+    Raises:
+        BusError: one cannot be opened (those before it are closed again), or two have a node id in common.
+    """
+    if isinstance(address, BusAddress):
+        return open_bus(address)
+    return open_split_bus(address)
+
+
+def open_split_bus(address: SplitAddress, clock: Callable[[], float] = time.monotonic) -> SplitBus:
+    """An end of every bus of a cell, as one.
+
+    Raises:
+        BusError: as `open_cell_bus`.
+    """
+    homes: dict[int, BusPart] = {}
+    for part in address.parts:
+        for node_id in part.node_ids:
+            if (other := homes.setdefault(node_id, part)) is not part:
+                reason = f"node {node_id} is on {other.name} and on {part.name}; give one of the two another node id"
+                raise BusError(str(address), reason)
+    ends: list[can.BusABC] = []
+    try:
+        for part in address.parts:
+            try:
+                ends.append(open_bus(part.address))
+            except BusError as error:
+                raise BusError(str(part), error.reason) from error
+    except BusError:
+        for end in ends:
+            end.shutdown()
+        raise
+    return SplitBus(address, ends, clock)
+
+
+class SplitBus(can.BusABC):
+    """Ends of several buses as one.
+
+    A received frame says in ``channel`` which of the buses it came from.
+
+    Args:
+        address: of the buses.
+        ends: of them, in their order; they are the split bus's to close.
+        clock: monotonic seconds, for time-outs.
+    """
+
+    def __init__(
+        self, address: SplitAddress, ends: Sequence[can.BusABC], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.address = address
+        self.channel_info = str(address)
+        self._ends = tuple(ends)
+        self._names = tuple(map(str, address.parts))
+        self._homes = {node_id: index for index, part in enumerate(address.parts) for node_id in part.node_ids}
+        self._clock = clock
+        self._waiting: list[can.Message | None] = [None] * len(self._ends)
+        self._failed: set[int] = set()
+        self._misplaced: set[tuple[int, int]] = set()
+        self._last = self._run = self._turn = 0
+        self._handles = tuple(_fileno(end) for end in self._ends)
+        super().__init__(channel=str(address))
+
+    @property
+    def alive(self) -> bool:
+        """Whether one of the buses has not failed."""
+        return len(self._failed) < len(self._ends)
+
+    @property
+    def losses(self) -> Losses:
+        """Of all buses together."""
+        each = [losses_of(end) for end in self._ends]
+        return Losses(**{place.name: sum(getattr(lost, place.name) for lost in each) for place in fields(Losses)})
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a person should know of how each bus was opened."""
+        named = zip(self._names, map(remarks_of, self._ends), strict=True)
+        return tuple(f"{name}: {remark}" for name, remarks in named for remark in remarks)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame to whom it concerns.
+
+        Raises:
+            BusError: one of the buses has just failed, the others got it; or all have failed.
+        """
+        self.send_burst((msg,))
+
+    def send_burst(self, messages: Sequence[can.Message]) -> None:
+        """Send several frames in their order; what follows each other on one bus goes there in one call.
+
+        What concerns all goes to one bus right after the other, when everything before it has been sent: so near
+        together are the SYNCs.
+
+        Raises:
+            BusError: as `send`.
+        """
+        failures: list[BusError] = []
+        for route, run in groupby(messages, self.address.route):
+            together = tuple(run)
+            for burst in (together,) if len(route) == 1 else ((message,) for message in together):
+                for index in route:
+                    self._send_to(index, burst, failures)
+        if failures:
+            raise failures[0]
+        self._require_one()
+
+    def _send_to(self, index: int, messages: Sequence[can.Message], failures: list[BusError]) -> None:
+        if index in self._failed:
+            return
+        try:
+            send_burst(self._ends[index], messages)
+        except (can.CanError, OSError, BusError) as error:
+            failures.append(self._failure(index, error))
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """The oldest frame that waits on any of the buses.
+
+        Raises:
+            BusError: one of the buses has just failed, or went off; or all have failed.
+            NodeMisplaced: a node is heard on another bus than its own; said once, its frames there are left out.
+        """
+        end_s = None if timeout is None else self._clock() + timeout
+        while True:
+            for index, head in enumerate(self._waiting):
+                if head is None and index not in self._failed:
+                    self._waiting[index] = self._take(index, 0.0)
+            oldest = self._oldest()
+            if oldest is not None:
+                message, self._waiting[oldest] = self._waiting[oldest], None
+                if message is not None and not self._is_echo(message, oldest) and self._at_home(message, oldest):
+                    return message
+                continue  # an end may hold more frames, which no file descriptor tells of
+            left_s = None if end_s is None else end_s - self._clock()
+            if left_s is not None and left_s <= 0:
+                return None
+            self._require_one()
+            self._wait(left_s)
+
+    def _take(self, index: int, timeout_s: float) -> can.Message | None:
+        try:
+            message = self._ends[index].recv(timeout_s)
+        except (can.CanError, OSError, BusError) as error:
+            raise self._failure(index, error) from error
+        if message is None:
+            return None
+        if message.is_error_frame and message.arbitration_id & BUS_OFF:
+            raise self._failure(index, BusError(self._names[index], BUS_OFF_REASON))
+        message.channel = self._names[index]
+        return message
+
+    def _oldest(self) -> int | None:
+        """The bus of the oldest of the frames that wait, one a bus; None where there is none."""
+        waiting = [(message, index) for index, message in enumerate(self._waiting) if message is not None]
+        # The wall clock can be set between two frames, and a float of its seconds has steps of 200 ns.
+        heads: list[tuple[float, int]] = [
+            (m.monotonic_ns, index) for m, index in waiting if isinstance(m, CapturedMessage)
+        ]
+        if len(heads) < len(waiting):
+            heads = [(message.timestamp, index) for message, index in waiting]
+        if not heads:
+            return None
+        if len(heads) > 1 and self._run >= LARGEST_RUN:
+            heads = [head for head in heads if head[1] != self._last]
+        _, index = min(heads)
+        self._run = self._run + 1 if index == self._last else 1
+        self._last = index
+        return index
+
+    def _is_echo(self, message: can.Message, index: int) -> bool:
+        """A SYNC of ours that a bus gives back for the sake of its time: one stands for all, that of the first bus."""
+        return not message.is_rx and index != min(set(range(len(self._ends))) - self._failed, default=index)
+
+    def _at_home(self, message: can.Message, index: int) -> bool:
+        """Whether a frame comes from the bus of its node."""
+        if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in _FROM_NODES:
+            return True
+        node_id = message.arbitration_id & 0x7F
+        home = self._homes.get(node_id, index)
+        if home == index:
+            return True
+        if (node_id, index) not in self._misplaced:
+            self._misplaced.add((node_id, index))
+            raise NodeMisplaced(node_id, self._names[home], self._names[index])
+        return False
+
+    def _wait(self, left_s: float | None) -> None:
+        """Until a frame comes on one of the buses, or the time is over."""
+        live = [index for index in range(len(self._ends)) if index not in self._failed]
+        handles = [handle for index in live if (handle := self._handles[index]) is not None]
+        if len(handles) == len(live):
+            select.select(handles, (), (), left_s)
+            return
+        self._turn += 1
+        index = live[self._turn % len(live)]
+        timeout_s = ALTERNATION_S if left_s is None or len(live) > 1 else left_s
+        self._waiting[index] = self._take(index, timeout_s if left_s is None else min(left_s, timeout_s))
+
+    def _failure(self, index: int, error: Exception) -> BusError:
+        """From now on this bus is left out."""
+        self._failed.add(index)
+        failure = BusError(self._names[index], error.reason if isinstance(error, BusError) else _text(error))
+        failure.__cause__ = error
+        return failure
+
+    def _require_one(self) -> None:
+        if not self.alive:
+            raise BusError(self.channel_info, "all of them have failed")
+
+    def shutdown(self) -> None:
+        """Close all ends, whatever one of them does.
+
+        Raises:
+            BusError: the first that could not be closed.
+        """
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        failures = []
+        for index, end in enumerate(self._ends):
+            try:
+                end.shutdown()
+            except (can.CanError, OSError, BusError) as error:
+                failures.append(self._failure(index, error))
+        if failures:
+            raise failures[0]
+
+
+def _text(error: Exception) -> str:
+    return str(error) or type(error).__name__
+
+
+def _fileno(end: can.BusABC) -> int | None:
+    try:
+        handle = end.fileno()
+    except (NotImplementedError, OSError):
+        return None
+    return handle if handle >= 0 else None

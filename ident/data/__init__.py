@@ -1,0 +1,1 @@
+"""Runs in SI units, filtered and differentiated."""

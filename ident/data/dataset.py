@@ -1,0 +1,165 @@
+"""A run with its derivatives: low-passed positions, central differences, and which samples stand still."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.errors import DataUnfit
+from ident.model.bodies import Payload
+from ident.model.kinematics import Motion
+from ident.model.model import DriveTrain
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+LONGEST_MOVE_S = 2.0
+"""Two seconds are several times the residual's correlation (lag one about 0.67 at 50 rows a second)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """A differentiated run; arrays are joint-first, shape (n, k), contiguous in time.
+
+    Attributes:
+        name: of the run.
+        rate_hz: sampling rate.
+        time_s: shape (k,), from the run.
+        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints, low-passed and differentiated.
+        current_a: of the motors, as recorded.
+        moving: joint faster than its standstill speed.
+        motor_moving: motor of that number faster than the same speed, seen at its own joint's ratio.
+        valid: sample may be used.
+        move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
+        payload: what was mounted, None without load.
+        started_s: when the run began, on a clock that the runs of one session share; None where no one knows.
+    """
+
+    name: str
+    rate_hz: float
+    time_s: FloatArray
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+    current_a: FloatArray
+    moving: BoolArray
+    motor_moving: BoolArray
+    valid: BoolArray
+    move: NDArray[np.int64]
+    payload: Payload | None
+    started_s: float | None = None
+
+    def motion(self, part: slice = slice(None)) -> Motion:
+        """Of some of the samples."""
+        return Motion(self.position_rad[:, part], self.velocity_rad_s[:, part], self.acceleration_rad_s2[:, part])
+
+
+def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
+    """Zero-phase low-pass of the positions, then central differences (paper §2.3).
+
+    Args:
+        run: a recording of n joints.
+        drive_train: R, for the speed of coupled motors.
+        conditioning: cut-offs and standstill speeds.
+
+    Raises:
+        DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
+    """
+    _check(run, drive_train, conditioning)
+    rate = run.rate_hz
+    sections = signal.butter(conditioning.position_order, conditioning.position_cutoff_hz, fs=rate, output="sos")
+    smooth = signal.sosfiltfilt(sections, np.ascontiguousarray(run.position_rad.T, dtype=np.float64), axis=1)
+    position = smooth[:, 1:-1]
+    velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate)
+    acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate**2
+    speed_limit = np.asarray(conditioning.standstill_rad_s or (0.0,) * len(velocity))[:, None]
+    moving = np.abs(velocity) >= speed_limit
+    # A motor's speed is told as that of its joint, which need not have its number.
+    motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
+    valid = np.ones_like(moving) if run.valid is None else np.ascontiguousarray(run.valid.T[:, 1:-1])
+    # One move holds all joints: without a log of moves, they part where every joint stands still.
+    move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
+    move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
+    return Dataset(
+        name=run.name,
+        rate_hz=rate,
+        time_s=run.time_s[1:-1],
+        position_rad=np.ascontiguousarray(position),
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
+        current_a=np.ascontiguousarray(run.current_a.T[:, 1:-1], dtype=np.float64),
+        moving=moving,
+        motor_moving=motor_moving,
+        valid=valid,
+        move=move,
+        payload=run.payload,
+        started_s=run.started_s,
+    )
+
+
+def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> Dataset:
+    """A motion that nobody has recorded, for `ident.prediction`: joints, speeds and accelerations as they are given.
+
+    Args:
+        motion: q, q̇ and q̈ of n joints over k samples, shape (n, k) each.
+        rate_hz: sampling rate.
+        payload: what is mounted, None without load.
+    """
+    count, samples = motion.position_rad.shape
+    everywhere = np.ones((count, samples), dtype=np.bool_)
+    return Dataset(
+        name="planned motion",
+        rate_hz=rate_hz,
+        time_s=np.arange(samples) / rate_hz,
+        position_rad=motion.position_rad,
+        velocity_rad_s=motion.velocity_rad_s,
+        acceleration_rad_s2=motion.acceleration_rad_s2,
+        current_a=np.zeros((count, samples)),
+        moving=everywhere,
+        motor_moving=everywhere,
+        valid=everywhere,
+        move=np.zeros(samples, dtype=np.int64),
+        payload=payload,
+    )
+
+
+def _moves(moving: BoolArray) -> NDArray[np.int64]:
+    starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
+    return np.cumsum(starts, dtype=np.int64)
+
+
+def _parted(move: NDArray[np.int64], longest: int) -> NDArray[np.int64]:
+    """Cut long moves: standard errors and folds rest on many moves, and continuous motion would be a single one."""
+    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
+    return np.cumsum((since % longest) == 0, dtype=np.int64) - 1
+
+
+def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> None:
+    count = len(drive_train.ratio)
+    samples = len(run.time_s)
+    for label, array in (("position", run.position_rad), ("current", run.current_a)):
+        if array.shape != (samples, count):
+            raise DataUnfit(run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: a column an axis")
+        bad = np.argwhere(~np.isfinite(array))
+        if len(bad):
+            first = f"the first in sample {bad[0][0]}, axis {bad[0][1] + 1}"
+            raise DataUnfit(run.name, f"{label} holds {len(bad)} non-finite values, {first}")
+    speeds = len(conditioning.standstill_rad_s)
+    if speeds not in (0, count):
+        raise DataUnfit(run.name, f"{speeds} standstill speeds for {count} joints; give one a joint")
+    step = np.diff(run.time_s)
+    if samples < 3 or np.any(step <= 0) or np.ptp(step) > 0.01 * float(np.median(step)):
+        raise DataUnfit(run.name, "the sampling times are not uniform; derivatives need a constant rate without gaps")
+    highest = max(conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz)
+    if run.rate_hz <= 2.5 * highest:
+        needed = f"a cut-off of {highest:g} Hz needs more than {2.5 * highest:g} Hz"
+        raise DataUnfit(run.name, f"sampled at {run.rate_hz:g} Hz; {needed}")
+    if samples < 2.0 * run.rate_hz:
+        long = samples / run.rate_hz
+        raise DataUnfit(run.name, f"only {long:.2g} s long; expected at least 2 s, and about 30 moves for one percent")

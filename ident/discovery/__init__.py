@@ -1,0 +1,1 @@
+"""Find the effects that the residual asks for, and measure the error before and after."""

@@ -1,0 +1,274 @@
+"""What accepted effects change: the error of every motor four times over, and every gain, before and after.
+
+All errors are those of `ident.discovery.current_error`, with one set of weights. They differ in what the model had
+seen:
+
+- in-sample: everything; it cannot rise when an effect joins, so it proves nothing;
+- cross-validated: all moves but those predicted (`ident.equations.linearisation.cut`, one Gauss-Newton step around
+the estimate, gains included); the choice of the effects has seen them all, which makes it kind to what was chosen;
+- left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
+  choice and the settings of the effects have seen it;
+- hold-out: nothing of these runs, neither fit nor choice.
+
+Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
+is the jackknife of the change itself: leaving out move c shifts g by d_c = −(H − G_c)⁻¹ s_c
+(ident/estimators/estimate.py), and
+
+    σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, stats
+
+from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
+from ident.discovery.loop import Evidence, Step
+from ident.discovery.noise_floor import NoiseFloor, noise_floors
+from ident.effects.effect import PlacedEffect
+from ident.equations.linearisation import Folds, cut, linearise
+from ident.equations.observation import Observation
+from ident.estimators.estimate import Estimate, RelativeError
+
+FloatArray = NDArray[np.float64]
+
+FALSE_ALARM = 0.05
+"""That noise alone makes any gain's change significant, over all axes (Bonferroni)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Of one model [%]; the module says what each has seen. None where nobody asked, or nothing was held out."""
+
+    in_sample: RelativeError
+    cross_validated: RelativeError
+    left_out_runs: LeftOutRuns | None
+    holdout: RelativeError | None
+
+
+@dataclass(frozen=True, slots=True)
+class Assessment:
+    """One model on its data.
+
+    Attributes:
+        effects: in it.
+        errors: of it.
+        gains, gains_std: and their σ [Nm at the joint per A], shape (n,).
+        shifts: of the gains when each move is left out, shape (m, n); zero for fixed gains.
+    """
+
+    effects: tuple[PlacedEffect, ...]
+    errors: Errors
+    gains: FloatArray
+    gains_std: FloatArray
+    shifts: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class GainChange:
+    """One gain without and with further effects [Nm at the joint per A].
+
+    Attributes:
+        before, before_std, after, after_std: the estimates with their own σ.
+        change_std: σ of the change, 0 for a fixed gain.
+        significant: whether the change is more than noise, at FALSE_ALARM over all axes.
+    """
+
+    before: float
+    before_std: float
+    after: float
+    after_std: float
+    change_std: float
+    significant: bool
+
+    @property
+    def change_percent(self) -> float:
+        """Of the gain before [%]."""
+        return 100.0 * (self.after / self.before - 1.0)
+
+    @property
+    def change_std_percent(self) -> float:
+        """σ of the change [% of the gain before]."""
+        return 100.0 * self.change_std / abs(self.before)
+
+
+@dataclass(frozen=True, slots=True)
+class BeforeAfter:
+    """Two models of the same data.
+
+    Attributes:
+        added, removed: effects that only the second one has, and only the first one.
+        before, after: the errors of either.
+        gains: one a motor.
+    """
+
+    added: tuple[PlacedEffect, ...]
+    removed: tuple[PlacedEffect, ...]
+    before: Errors
+    after: Errors
+    gains: tuple[GainChange, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Account:
+    """What a whole closing of the loop changed.
+
+    Attributes:
+        floors: noise of each motor at standstill, None where it rested too little.
+        floor: what that noise alone would leave of the rows of the fit [%]; NaN where it is not known.
+        holdout_floor: the same of the rows held out, None without any.
+        turns: of each turn of the loop, None where it added nothing.
+        total: the declared model and the last one.
+    """
+
+    floors: tuple[NoiseFloor | None, ...]
+    floor: RelativeError
+    holdout_floor: RelativeError | None
+    turns: tuple[BeforeAfter | None, ...]
+    total: BeforeAfter
+
+
+def account(
+    start: Evidence,
+    steps: Sequence[Step],
+    *,
+    leave_out_runs: bool = False,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Account:
+    """Before and after every turn of `ident.discovery.loop.close_the_loop`, and in total.
+
+    Args:
+        start: without effects, identified by ``ml``; its gains weigh the errors of all.
+        steps: from there.
+        leave_out_runs: refit without each run in turn; takes as many fits as there are runs.
+        progress: told what is being done, in words.
+
+    Raises:
+        TooFewMoves: to leave some out.
+    """
+    weights_nm_a = start.estimate.gains
+
+    def assessed(evidence: Evidence) -> Assessment:
+        progress(f"errors with {len(evidence.effects)} effects in the model")
+        return assess(evidence, weights_nm_a, left_out_runs(evidence, weights_nm_a) if leave_out_runs else None)
+
+    first = last = assessed(start)
+    turns: list[BeforeAfter | None] = []
+    for step in steps:
+        if step.after.effects == last.effects:
+            turns.append(None)
+            continue
+        before, last = last, assessed(step.after)
+        turns.append(before_after(before, last))
+    floors = noise_floors(start.trained, start.conditioning)
+    return Account(
+        floors=floors,
+        floor=floor_on(start.training, floors).relative(weights_nm_a),
+        holdout_floor=None if start.holdout is None else floor_on(start.holdout, floors).relative(weights_nm_a),
+        turns=tuple(turns),
+        total=before_after(first, last),
+    )
+
+
+def declared(evidence: Evidence, estimate: Estimate) -> Evidence:
+    """The same data under the declared model alone.
+
+    Args:
+        evidence: with effects or without.
+        estimate: of the declared model, by ``ml``.
+    """
+    unseen = evidence.bare.run >= len(evidence.datasets) - evidence.held_out
+    return replace(
+        evidence,
+        training=evidence.bare.only(~unseen),
+        holdout=evidence.bare.only(unseen) if evidence.held_out else None,
+        effects=(),
+        estimate=estimate,
+    )
+
+
+def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns | None = None) -> Assessment:
+    """The errors and gains of one model.
+
+    Args:
+        evidence: identified by ``ml``.
+        weights_nm_a: of the whole error, shape (n,).
+        left_out: by `left_out_runs`.
+
+    Raises:
+        TooFewMoves: to leave some out.
+    """
+    estimate = evidence.estimate
+    folds = cut(
+        linearise(
+            evidence.training,
+            estimate.gains,
+            estimate.parameters,
+            estimate.axis_noise,
+            gains_fixed=estimate.gains_fixed,
+        )
+    )
+    held = evidence.holdout
+    return Assessment(
+        effects=evidence.effects,
+        errors=Errors(
+            in_sample=error_on(evidence.training, estimate).relative(weights_nm_a),
+            cross_validated=error_left_out(folds).relative(weights_nm_a),
+            left_out_runs=left_out,
+            holdout=None if held is None else error_on(held, estimate).relative(weights_nm_a),
+        ),
+        gains=estimate.gains,
+        gains_std=estimate.gains_std,
+        shifts=_gain_shifts(folds, estimate),
+    )
+
+
+def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
+    """Two models of the same rows."""
+    moves, count = before.shifts.shape
+    shifts = after.shifts - before.shifts
+    change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    limit = float(stats.norm.isf(FALSE_ALARM / (2 * count)))
+    return BeforeAfter(
+        added=tuple(placed for placed in after.effects if placed not in before.effects),
+        removed=tuple(placed for placed in before.effects if placed not in after.effects),
+        before=before.errors,
+        after=after.errors,
+        gains=tuple(
+            GainChange(
+                before=float(before.gains[motor]),
+                before_std=float(before.gains_std[motor]),
+                after=float(after.gains[motor]),
+                after_std=float(after.gains_std[motor]),
+                change_std=float(change_std[motor]),
+                significant=bool(abs(after.gains[motor] - before.gains[motor]) > limit * change_std[motor]),
+            )
+            for motor in range(count)
+        ),
+    )
+
+
+def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> CurrentError:
+    """What the noise at standstill would leave of some rows; NaN for a motor of which it is not known."""
+    use = observation.motor_use
+    noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
+    return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)
+
+
+def _gain_shifts(folds: Folds, estimate: Estimate) -> FloatArray:
+    """d_c of the gains, shape (m, n)."""
+    count = len(estimate.gains)
+    shifts = np.zeros((folds.problem.moves, count))
+    if estimate.gains_fixed:
+        return shifts
+    hessian = folds.move_hessian.sum(axis=0)
+    # A direction that only the move left out has seen stays where the whole data put it.
+    kept = np.diag(1e-10 * np.diag(hessian))
+    for move, (gram, score) in enumerate(zip(folds.move_hessian, folds.move_score, strict=True)):
+        step = linalg.cho_solve(linalg.cho_factor(hessian - gram + kept, lower=True), score)
+        shifts[move] = -(step * folds.problem.scale)[:count]
+    return shifts

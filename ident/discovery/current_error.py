@@ -1,0 +1,165 @@
+"""One error for every model and every data set: what a model leaves of each motor's current.
+
+Of motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i and T from the drive train,
+
+    e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
+
+The current is what was measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6)
+grows and shrinks with the gains that a model finds. The weights w turn currents of different motors into torques at the
+joint, so that a robot without coupled axes has the ε of Table 6. They are one set of gains for all that is compared.
+Whitened by σ_i instead, ε would have a yardstick that an accepted effect moves. A robot with prismatic and revolute
+axes adds Nm to N in ε, as Table 6 would; its ε_i stand for themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.discovery.loop import Evidence, with_effects
+from ident.equations.linearisation import Folds
+from ident.equations.observation import Observation
+from ident.errors import IdentificationError
+from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.maximum_likelihood import ml
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CurrentError:
+    """Sums over rows, so that parts of the data can be put together.
+
+    Attributes:
+        size: ‖v_i‖² of each motor [A²], shape (n,).
+        left: ‖e_i‖² [A²], same shape.
+    """
+
+    size: FloatArray
+    left: FloatArray
+
+    def __add__(self, other: CurrentError) -> CurrentError:
+        """Of the rows of both."""
+        return CurrentError(self.size + other.size, self.left + other.left)
+
+    def relative(self, weights_nm_a: FloatArray) -> RelativeError:
+        """ε_i and ε [%]; NaN for a motor without a row.
+
+        Args:
+            weights_nm_a: w, one set of gains for all that is compared, shape (n,).
+        """
+        return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
+
+
+def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
+    """Of an estimate on rows, those of its fit or others with the same columns."""
+    use, measured = observation.motor_use, observation.current
+    asked = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
+    residual = measured - asked / estimate.gains[:, None]
+    return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
+
+
+def error_left_out(folds: Folds) -> CurrentError:
+    """Of each fold's rows, predicted by a fit that has not seen their moves."""
+    problem = folds.problem
+    size, left = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
+    np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
+    np.add.at(left, problem.motor, (folds.residual * problem.noise[problem.motor]) ** 2)
+    return CurrentError(size, left)
+
+
+# Each run of a fit left out in turn: everything refitted without it, and the run predicted.
+
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutRun:
+    """One run of the fit, predicted by the others; `error` is None where they cannot, and `reason` says why."""
+
+    run: str
+    error: RelativeError | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutRuns:
+    """Each run of the fit left out in turn.
+
+    Attributes:
+        runs: in the order of the fit.
+        together: over the rows of all that could be predicted; None without any.
+    """
+
+    runs: tuple[LeftOutRun, ...]
+    together: RelativeError | None
+
+
+def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
+    """Refit everything without each run of the fit in turn, and predict that run.
+
+    A run that alone carries the known payload, or alone goes without, cannot be spared: it is told with the reason.
+
+    Args:
+        evidence: identified by ``ml``.
+        weights_nm_a: of the whole error, shape (n,).
+    """
+    runs: list[LeftOutRun] = []
+    errors: list[CurrentError] = []
+    for index, data in enumerate(evidence.trained):
+        try:
+            errors.append(_error_without(evidence, index))
+        except IdentificationError as error:
+            runs.append(LeftOutRun(data.name, None, str(error)))
+        else:
+            runs.append(LeftOutRun(data.name, errors[-1].relative(weights_nm_a)))
+    return LeftOutRuns(tuple(runs), reduce(add, errors).relative(weights_nm_a) if errors else None)
+
+
+def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
+    """Of one run of the fit, the model refitted without it."""
+    order = [index for index in range(len(evidence.trained)) if index != left_out] + [left_out]
+    whole = _in_order(evidence.bare, order)
+    last = whole.run == len(order) - 1
+    training, held = whole.only(~last), whole.only(last)
+    fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    bare = replace(
+        evidence,
+        datasets=tuple(evidence.datasets[index] for index in order),
+        held_out=1,
+        bare=whole,
+        training=training,
+        holdout=held,
+        effects=(),
+        estimate=ml(training.system(), fixed),
+    )
+    if not evidence.effects:
+        return error_on(held, bare.estimate)
+    refitted = with_effects(bare, evidence.effects)
+    return error_on(refitted.holdout or held, refitted.estimate)
+
+
+def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
+    """The rows of some runs, run by run in this order."""
+    rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
+    number = np.zeros(len(bare.runs), dtype=np.int64)
+    number[list(order)] = np.arange(len(order))
+    return replace(
+        bare,
+        current=bare.current[:, rows],
+        robot=bare.robot[:, :, rows],
+        flange=bare.flange[:, :, rows],
+        use=bare.use[:, rows],
+        motor_use=bare.motor_use[:, rows],
+        time_s=bare.time_s[rows],
+        run=number[bare.run[rows]],
+        move=bare.move[rows],
+        mounting=bare.mounting[rows],
+        runs=tuple(bare.runs[run] for run in order),
+    )

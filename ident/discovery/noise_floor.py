@@ -1,0 +1,121 @@
+"""How small a model's error could be: the noise of each motor's current, seen where nothing moves.
+
+While a joint stands still no model of motion has anything to explain: friction holds it within ±Fs, the amplifier's
+integrator creeps, and what the current does faster than that is noise of measurement and control. So each standstill
+of a motor is filtered and decimated like every row (windows wholly inside), a parabola in time is taken out of it,
+and the rest gives an estimate of σ² from each dwell d,
+
+    s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
+
+with H_d the projection on (1, t, t²) and P_d the correlation that the filter itself gives to rows of white noise, so
+that a short dwell, of which the detrending takes a large part, is counted as what is left of it. s_d² is nearly
+σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP) (Satterthwaite 1946); divided by the median of χ²_ν/ν every dwell is as likely above
+σ² as below, and σ² is their median, weighted by ν. The median, because an axis slips or rings in some of its dwells and
+in most it does not.
+
+Limits. It is a lower bound: a motor that turns has ripple, commutation error and an encoder's noise differentiated,
+which standstill does not show; noise slower than a dwell goes with the parabola. It is too high where an axis hunts
+about its target in most of its dwells. Dwells in which the drive tells one constant number (power stage off, brake on)
+are no measurement and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ident.data.conditioning import Conditioning, Decimator
+from ident.data.dataset import Dataset
+from ident.equations.rows import row_filter
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+FEWEST_DWELLS = 8
+FEWEST_FREEDOM = 20.0
+"""σ is then known to 20 %."""
+_TREND = 3
+"""Coefficients of the parabola: a straight line leaves the bend of a controller that settles."""
+_MEDIAN_EFFICIENCY = 2.0 / np.pi
+"""Of a median of many, against their mean (van der Vaart 1998, §21.2)."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFloor:
+    """Of one motor.
+
+    Attributes:
+        noise_a: σ of the current in the observation's rows [A].
+        dwells: standstills that it rests on.
+        freedom: degrees of freedom that they leave, ν summed.
+    """
+
+    noise_a: float
+    dwells: int
+    freedom: float
+
+    @property
+    def std_percent(self) -> float:
+        """Relative standard deviation of noise_a itself, for Gaussian noise [%]."""
+        return 100.0 / float(np.sqrt(2.0 * _MEDIAN_EFFICIENCY * self.freedom))
+
+
+def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tuple[NoiseFloor | None, ...]:
+    """The noise of each motor's current in rows, None where it rested too seldom or too shortly to tell.
+
+    Args:
+        datasets: of the fit.
+        conditioning: the filters, and below which speed a joint stands still.
+
+    Raises:
+        DataUnfit: a run is too short for the filter.
+    """
+    return tuple(_floor(datasets, conditioning, motor) for motor in range(len(datasets[0].current_a)))
+
+
+def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> NoiseFloor | None:
+    dwells = [
+        _variance(row_filter(data, conditioning), data.current_a[motor, part])
+        for data in datasets
+        for part in _standstills(~data.motor_moving[motor] & data.valid[motor])
+        if row_filter(data, conditioning).rows(part.stop - part.start) > _TREND
+        and np.ptp(data.current_a[motor, part]) > 0.0
+    ]
+    if len(dwells) < FEWEST_DWELLS:
+        return None
+    variance, freedom = np.array(dwells).T
+    if freedom.sum() < FEWEST_FREEDOM:
+        return None
+    likely = variance * freedom / stats.chi2.median(freedom)
+    order = np.argsort(likely)
+    share = np.cumsum(freedom[order]) / freedom.sum()
+    middle = likely[order][int(np.searchsorted(share, 0.5))]
+    return NoiseFloor(float(np.sqrt(middle)), len(dwells), float(freedom.sum()))
+
+
+def _variance(filter_: Decimator, current: FloatArray) -> tuple[float, float]:
+    """s_d² [A²] and ν of one dwell."""
+    seen = filter_(current)
+    trend, _ = np.linalg.qr(np.vander(np.arange(len(seen), dtype=np.float64), _TREND))
+    rest = np.eye(len(seen)) - trend @ trend.T
+    spread = rest @ _correlation(filter_, len(seen)) @ rest
+    expected = float(np.trace(spread))
+    return float(np.sum((rest @ seen) ** 2)) / expected, expected**2 / float(np.sum(spread**2))
+
+
+def _standstills(still: BoolArray) -> Iterator[slice]:
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        yield slice(int(start), int(stop))
+
+
+def _correlation(filter_: Decimator, rows: int) -> FloatArray:
+    """P: of rows of white noise, shape (rows, rows)."""
+    taps = filter_.taps
+    lags = filter_.factor * np.arange(rows)
+    of_lag = np.array([float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags])
+    return np.asarray(of_lag[np.abs(np.subtract.outer(np.arange(rows), np.arange(rows)))] / of_lag[0])

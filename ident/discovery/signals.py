@@ -1,0 +1,167 @@
+"""What an effect may depend on: motion, predicted load and predicted current, at full rate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.equations.observation import Observation
+from ident.estimators.estimate import Estimate
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.kinematics import Motion
+from ident.model.model import Model
+
+FloatArray = NDArray[np.float64]
+
+CHUNK_SAMPLES = 4096
+POSTURE_SAMPLES = 20
+"""Between two postures in which the inertia of a joint is computed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """One run as an effect sees it; arrays are axis-first, shape (n, k).
+
+    Torques and currents are the model's predictions, never measurements: a measured current in a regressor would put
+    its noise on both sides of the equation.
+
+    Attributes:
+        rate_hz: sampling rate.
+        time_s: since the start of the run, shape (k,).
+        session_s: since the first run of the session began, shape (k,); as time_s where no clock tells.
+        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
+        motor_position_rad: of the motors, R q.
+        inertia_kg_m2: torque at joint i per unit of acceleration of joint j, of links and payload, with the
+            rotor's where it cannot be told from theirs (Ia regrouped), shape (n, n, k).
+        load_torque_nm: what links and payload ask of each joint, friction and drive chain left out.
+        geared_torque_nm: what goes through the gear of each joint: its load and its friction.
+        motor_torque_nm: what each motor must give, in joint units (g v), friction included, effects left out.
+        current_a: the same in the unit of the current reference.
+    """
+
+    rate_hz: float
+    time_s: FloatArray
+    session_s: FloatArray
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+    motor_position_rad: FloatArray
+    inertia_kg_m2: FloatArray
+    load_torque_nm: FloatArray
+    geared_torque_nm: FloatArray
+    motor_torque_nm: FloatArray
+    current_a: FloatArray
+
+
+def signals(
+    model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
+) -> Signals:
+    """Predict a run's torques with the declared part of an estimate.
+
+    Args:
+        model: the declared model.
+        data: the run.
+        observation: whose base parameters the estimate speaks of.
+        estimate: gains and parameters; columns of effects, behind the base parameters, are left out.
+        session_began_s: of the first run, by the clock of `Dataset.started_s`; None where the runs do not tell.
+    """
+    standard = np.zeros(len(model.columns))
+    independent = list(observation.base.independent)
+    standard[independent] = estimate.parameters[: len(independent)]
+    standard[model.flange] += inertia(data.payload, _identified(data.payload, observation, estimate))
+    return declared_signals(model, data, standard, estimate.gains, session_began_s)
+
+
+def declared_signals(
+    model: Model, data: Dataset, standard: FloatArray, gains: FloatArray, session_began_s: float | None = None
+) -> Signals:
+    """Predict a run's torques with standard parameters.
+
+    Args:
+        model: the declared model.
+        data: the run.
+        standard: χ_st with the payload on the flange; base parameters at their leading columns, zero elsewhere,
+            are as good as the true standard ones (paper §2.1). Shape (c,).
+        gains: g of each motor [Nm at the joint per A], shape (n,).
+        session_began_s: of the first run, by the clock of `Dataset.started_s`.
+    """
+    names = tuple(column.name for column in model.columns)
+    # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
+    inertial = np.array([not name.startswith(("Ia", "fv", "fs", "off")) for name in names])
+    friction = np.array([name.startswith(("fv", "fs")) and not name.startswith(("fvm", "fsm")) for name in names])
+    load, total, geared = [], [], []
+    for first in range(0, len(data.time_s), CHUNK_SAMPLES):
+        columns = model.regressor(data.motion(slice(first, first + CHUNK_SAMPLES)))
+        torques = np.matmul(np.stack((inertial, np.ones_like(inertial), inertial | friction)) * standard, columns)
+        load.append(torques[:, 0])
+        total.append(torques[:, 1])
+        geared.append(torques[:, 2])
+    motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
+    return Signals(
+        rate_hz=data.rate_hz,
+        time_s=data.time_s - data.time_s[0],
+        session_s=data.time_s - data.time_s[0] + _into_the_session_s(data, session_began_s),
+        position_rad=data.position_rad,
+        velocity_rad_s=data.velocity_rad_s,
+        acceleration_rad_s2=data.acceleration_rad_s2,
+        motor_position_rad=model.drive_train.ratio @ data.position_rad,
+        inertia_kg_m2=_inertia_of_joints(model, data, standard * inertial),
+        load_torque_nm=np.concatenate(load, axis=1),
+        geared_torque_nm=np.concatenate(geared, axis=1),
+        motor_torque_nm=motor,
+        current_a=motor / gains[:, None],
+    )
+
+
+def session_began_s(datasets: Sequence[Dataset]) -> float | None:
+    """When the first of some runs began, or None where one of them does not tell."""
+    told = [data.started_s for data in datasets if data.started_s is not None]
+    return min(told) if told and len(told) == len(datasets) else None
+
+
+def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:
+    """When a run began, in its session; a clock's reading alone tells nothing."""
+    if data.started_s is None or session_began_s is None:
+        return 0.0
+    return max(0.0, data.started_s - session_began_s)
+
+
+def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
+    """Mass matrix of links and payload, shape (n, n, k), drawn between few postures because it changes slowly."""
+    samples, count = len(data.time_s), len(data.position_rad)
+    postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
+    position = np.ascontiguousarray(data.position_rad[:, postures])
+    still = np.zeros_like(position)
+    weight = load @ model.regressor(Motion(position, still, still))
+    mass = np.empty((count, count, samples))
+    for joint, unit in enumerate(np.eye(count)):
+        moved = Motion(position, still, np.repeat(unit[:, None], len(postures), axis=1))
+        column = load @ model.regressor(moved) - weight
+        for row, along in enumerate(column):
+            mass[row, joint] = np.interp(np.arange(samples), postures, along)
+    return mass
+
+
+def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
+    """χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without load.
+
+    Args:
+        payload: what was mounted.
+        identified: its unknown parameters by name; those that the data of the fit did not see are left out and zero.
+    """
+    values = {} if payload is None else {**payload.known, **identified}
+    return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])
+
+
+def _identified(payload: Payload | None, observation: Observation, estimate: Estimate) -> dict[str, float]:
+    first = len(observation.columns)
+    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
+        values = estimate.parameters[first : first + len(indices)]
+        if payload is not None and other.mounting == payload.mounting:
+            return {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
+        first += len(indices)
+    return {}

@@ -1,0 +1,1 @@
+"""Changes of gains between calibrations: single changes, drift and alarms."""

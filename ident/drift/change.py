@@ -1,0 +1,241 @@
+"""Whether gains have changed: one change against its noise, a recalibration as a whole, and a slow drift over many.
+
+Recordings of different days are independent, so σ of a difference is the root of the sum of squares. But σ of a single
+fit knows only what one session shows: repeated sessions scatter more (friction warms up, magnets too). Every function
+here therefore takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions`
+estimates it from a history.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2, norm
+
+FloatArray = NDArray[np.float64]
+
+DISPERSION = 1.05
+"""Before a history says otherwise: repeated fits of simulated cells scatter 5 % more than their σ."""
+FALSE_ALARM = 0.01
+"""Share of recalibrations without any change in which `decide` finds one."""
+
+_POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
+"""How many successive differences the prior is worth, and the pooled estimate beside an axis' own."""
+_FEWEST_DIFFERENCES = 4
+_CUT = 1.5
+"""Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
+_FARTHEST = 1e100
+"""Differences over their σ; farther ones are all the same, and their squares still numbers."""
+_MEAN_OF_CUT = float(1.0 - 2.0 * norm.sf(_CUT) - 2.0 * _CUT * norm.pdf(_CUT) + 2.0 * _CUT**2 * norm.sf(_CUT))
+"""E min(Z², c²) of a standard normal Z."""
+_MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
+_STEPS = 20
+"""Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One gain, then and now.
+
+    Attributes:
+        percent: of the old value's magnitude [%], inf from zero; negative where the gain has lost.
+        sigmas: the change over its σ, signed as `percent`.
+        probability: of so large a change by noise alone, two-sided.
+    """
+
+    percent: float
+    sigmas: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeDecision:
+    """Whether a recalibration says anything new.
+
+    Attributes:
+        differs: at least one gain has changed by more than noise.
+        axes: names, as they were given.
+        changes: one an axis.
+        adjusted: probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
+        words: the same in one sentence.
+    """
+
+    differs: bool
+    axes: tuple[str, ...]
+    changes: tuple[Change, ...]
+    adjusted: tuple[float, ...]
+    words: str
+
+
+def change_significance(
+    old: float, old_std: float, new: float, new_std: float, *, dispersion: float = DISPERSION
+) -> Change:
+    """How significant one change is; of independent recordings, with normal errors.
+
+    Args:
+        old, old_std, new, new_std: gains and their σ in one unit; σ is 0 for what is known exactly.
+        dispersion: scatter of repeated calibrations over their σ.
+
+    Raises:
+        ValueError: a number is not finite, or a σ or the dispersion negative.
+    """
+    numbers = np.array([old, old_std, new, new_std, dispersion])
+    if not np.isfinite(numbers).all() or (numbers[[1, 3, 4]] < 0).any():
+        raise ValueError(
+            f"expected finite gains, σ ≥ 0 and dispersion ≥ 0, found {old} ± {old_std}, {new} ± {new_std} "
+            f"and dispersion {dispersion}"
+        )
+    change = (new - old) * (np.sign(old) or 1.0)
+    std = dispersion * np.hypot(old_std, new_std)
+    sigmas = _ratio(float(change), float(std))
+    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, float(2.0 * norm.sf(abs(sigmas))))
+
+
+def decide(
+    axes: tuple[str, ...],
+    old: ArrayLike,
+    old_std: ArrayLike,
+    new: ArrayLike,
+    new_std: ArrayLike,
+    *,
+    dispersion: ArrayLike = DISPERSION,
+    false_alarm: float = FALSE_ALARM,
+) -> ChangeDecision:
+    """Whether a recalibration changes anything, over all axes together.
+
+    Each axis is looked at by itself, with the probabilities corrected for there being several, however their errors
+    depend on each other. A fixed per cent is nowhere asked for.
+
+    Args:
+        axes: n names.
+        old, old_std, new, new_std: gains in force and found, with their σ, shape (n,) each, in one unit an axis.
+        dispersion: scatter of repeated calibrations over their σ, a number or shape (n,).
+        false_alarm: share of recalibrations without change in which one is found, at most.
+
+    Raises:
+        ValueError: shapes do not fit, a number is not finite, or a σ or a dispersion is negative.
+    """
+    n = len(axes)
+    columns = [np.broadcast_to(np.asarray(c, float), (n,)) for c in (old, old_std, new, new_std, dispersion)]
+    changes = tuple(
+        change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
+    )
+    adjusted = _holm(np.array([change.probability for change in changes]))
+    differs = bool(adjusted.min(initial=1.0) <= false_alarm)
+    words = _words(axes, changes, adjusted, false_alarm)
+    return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
+
+
+def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
+    """How much more repeated calibrations scatter than their σ says, for each axis; never less than 1.
+
+    From differences of successive calibrations, so that a slow drift adds little; each counts up to 1.5 of their σ
+    (Huber 1964, proposal 2), so that a sudden change adds little too. All axes together tell more than one does: the
+    estimate of an axis is drawn towards theirs, and that towards DISPERSION, by weights in numbers of differences (as a
+    scaled inverse-χ² prior).
+
+    Args:
+        values, stds: shape (..., axes, n), oldest first; leading dimensions are histories of their own.
+
+    Returns:
+        shape (..., axes).
+    """
+    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    count = values.shape[-1] - 1
+    if count < _FEWEST_DIFFERENCES:
+        return np.full(values.shape[:-1], DISPERSION)
+    # Not about their own centre, which of few differences is too near to them.
+    with np.errstate(over="ignore"):
+        away = 2.0 * (np.abs(np.diff(values / 2.0)) / np.hypot(stds[..., 1:], stds[..., :-1]))
+    squares = np.minimum(away, _FARTHEST) ** 2
+    own = _variance(squares)
+    all_axes = _variance(squares.reshape(*squares.shape[:-2], -1))
+    total = count * values.shape[-2]
+    pooled = (_POOLED_WEIGHT * DISPERSION**2 + total * all_axes) / (_POOLED_WEIGHT + total)
+    drawn = (_AXIS_WEIGHT * pooled[..., None] + count * own) / (_AXIS_WEIGHT + count)
+    return np.asarray(np.sqrt(np.maximum(drawn, 1.0)))
+
+
+def _variance(squares: FloatArray) -> FloatArray:
+    """s with mean(min(x², c² s)) = s E min(Z², c²) along the last axis, from the median on."""
+    found = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
+    for _ in range(_STEPS):
+        found = np.minimum(squares, _CUT**2 * found[..., None]).mean(axis=-1) / _MEAN_OF_CUT
+    return np.asarray(found)
+
+
+def _ratio(part: float, whole: float) -> float:
+    """Infinite where something changed that cannot, 0 where nothing did."""
+    if whole:
+        return part / whole
+    return math.copysign(math.inf, part) if part else 0.0
+
+
+def _holm(probabilities: FloatArray) -> FloatArray:
+    """Adjusted for several tests: the smallest times their number, the next times one less, never falling."""
+    order = np.argsort(probabilities)
+    count = len(probabilities)
+    adjusted = np.empty(count)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(count, 0, -1)))
+    return adjusted
+
+
+def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:
+    if not axes:
+        return "no gain to compare"
+    told = [
+        f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {len(axes)})"
+        for axis, change, p in zip(axes, changes, adjusted, strict=True)
+    ]
+    changed = [text for text, p in zip(told, adjusted, strict=True) if p <= level]
+    if changed:
+        return f"changed by more than noise: {', '.join(changed)}"
+    largest = told[int(np.argmax([abs(change.sigmas) for change in changes]))]
+    return f"no gain has changed by more than noise: the largest change is {largest}"
+
+
+def _short(sigmas: float) -> str:
+    """A number of a few digits, however many σ it is."""
+    return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"
+
+
+# Which gains have changed together: by one common factor, one alone, or several each by its own amount.
+
+
+_UNLIKE = 0.01
+"""Changes that noise makes so different in fewer cases than this are not one common factor."""
+_COMMON_SIGMAS = 4.0
+
+
+class Pattern(Enum):
+    """What the changes of all gains look like."""
+
+    NONE = "none"
+    ONE = "one axis"
+    COMMON = "all axes by the same factor"
+    SEVERAL = "several axes"
+
+
+def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
+    """What the changes of all gains look like together.
+
+    All by the same factor where at least two raise an alarm, the weighted mean c̄ of all changes is significant, and
+    Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom makes plausible.
+
+    Args:
+        change_percent, std_percent: of each axis since its baseline, with σ > 0 [%], shape (n,).
+        alarmed: which of them raise an alarm, shape (n,).
+    """
+    changes, stds = np.asarray(change_percent, float), np.asarray(std_percent, float)
+    count = int(np.count_nonzero(alarmed))
+    if count < 2:
+        return Pattern.ONE if count else Pattern.NONE
+    weights = 1.0 / stds**2
+    common = float(weights @ changes / weights.sum())
+    spread = float(weights @ (changes - common) ** 2)
+    alike = chi2.sf(spread, len(changes) - 1) > _UNLIKE
+    return Pattern.COMMON if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS else Pattern.SEVERAL

@@ -1,0 +1,51 @@
+"""The dictionary of effects beyond rigid links, viscous and dry friction and offset."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident.effects.effect import Abscissa, Effect
+from ident.effects.electrical import Cogging, Saturation
+from ident.effects.friction import (
+    AsymmetricViscous,
+    Coupling,
+    LoadFriction,
+    NonlinearViscous,
+    PositionFriction,
+    Presliding,
+    Stribeck,
+    WarmUp,
+)
+from ident.effects.position import Compensator, Hinge, Spring
+from ident.effects.timing import Lag, TimeSkew
+from ident.effects.transmission import Backlash, Elasticity, InertialCoupling
+from ident.effects.unnamed import Periodic, Smooth
+
+ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+PAIRED = range(2, 13)
+"""The higher number of a pair of joints; those that a robot does not have are left out of its search."""
+
+EFFECTS: tuple[tuple[Effect, ...], ...] = (
+    tuple(Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
+    tuple(NonlinearViscous(exponent) for exponent in (1 / 3, 0.5, 2.0, 3.0)),
+    (AsymmetricViscous(),),
+    tuple(LoadFriction(speed_exponent) for speed_exponent in (0, 1)),
+    (Spring(),),
+    (PositionFriction(),),
+    tuple(Cogging(order) for order in ORDERS),
+    (Saturation(),),
+    (Lag(),),
+    (TimeSkew(),),
+    tuple(WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)),
+    tuple(Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
+    tuple(Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
+    (Elasticity(),),
+    tuple(Coupling(other, sense) for other in PAIRED for sense in (1, -1)),
+    tuple(InertialCoupling(other) for other in PAIRED),
+    tuple(Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
+    tuple(Compensator(order) for order in (1, 2)),
+)
+"""A family a row; within it, the candidates of its searched parameters. Adding an effect is a file and a line here."""
+
+UNNAMED: tuple[Effect, ...] = (Periodic(), *(Smooth(variable) for variable in Abscissa))
+"""Terms that fit anything: what a calibration holds where structure was found that no name explains."""

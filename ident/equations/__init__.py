@@ -1,0 +1,1 @@
+"""The global system of paper eq. (17): rows, triangles, linearisation."""

@@ -1,0 +1,312 @@
+"""Runs, one after the other, reduced to triangles: the observation matrix is never held whole (TSQR).
+
+Rows are reduced in the standard columns [V | W_st], apart for each payload mounting: whatever is chosen afterwards, the
+base parameters or which payload parameters are known, is a choice among these columns, because a payload's columns are
+those of the last link in the rows in which it was mounted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.equations.rows import CHUNK_ROWS, Rows, rows_of
+from ident.equations.system import System
+from ident.equations.triangles import Triangles, qr_update, triangle
+from ident.errors import DataUnfit
+from ident.model.base import BaseParameters, base_parameters
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from ident.model.model import Column, Model
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+MOST_CLUSTERS = 256
+"""Moves of very long data are joined with their neighbours: 256 clusters say as much of a scatter as 3000."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """The motor rows of one move, or of several that follow each other in runs of one mounting.
+
+    Attributes:
+        mounting: index into the payloads, −1 without load.
+        factors: for each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns
+            that the motor's equation can hold (``Layout.motor``).
+    """
+
+    mounting: int
+    factors: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Which of the columns [v_1 … v_n | W_st] a joint's or a motor's equation holds.
+
+    Attributes:
+        joint: for each joint, indices into [V | W_st], ascending.
+        motor: for each motor, indices of W_st; its own current stands before them.
+    """
+
+    joint: tuple[IntArray, ...]
+    motor: tuple[IntArray, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Reduction:
+    """Triangles of several runs in standard columns.
+
+    Attributes:
+        model: the declared model.
+        conditioning: the filters that the rows went through.
+        payloads: one for each mounting.
+        runs: names of the runs.
+        joints: for each mounting, −1 (without load) first, the triangle of each joint's rows.
+        joint_rows, motor_rows: equations of each axis, shape (n,).
+        clusters: in the order of the runs.
+    """
+
+    model: Model
+    conditioning: Conditioning
+    payloads: tuple[Payload, ...]
+    runs: tuple[str, ...]
+    joints: tuple[tuple[FloatArray, ...], ...]
+    joint_rows: IntArray
+    motor_rows: IntArray
+    clusters: tuple[Cluster, ...]
+
+    def base(self) -> BaseParameters:
+        """The base parameters that these rows show.
+
+        Raises:
+            DataUnfit: a joint never moves.
+        """
+        for joint, rows in enumerate(self.joint_rows):
+            if not rows:
+                reason = f"joint {joint + 1} never moves faster than its standstill speed in any run"
+                raise DataUnfit(", ".join(self.runs), reason)
+        names = tuple(column.name for column in self.model.columns)
+        return base_parameters(np.concatenate([self._standard(index) for index in range(len(self.joints))]), names)
+
+    def _standard(self, index: int) -> FloatArray:
+        """W_st of all joints' triangles of a mounting (0: without load), columns spread out."""
+        count, columns = self.model.robot.joint_count, layout(self.model).joint
+        return np.concatenate(
+            [_widened(f, c, count + len(self.model.columns)) for f, c in zip(self.joints[index], columns, strict=True)]
+        )[:, count:]
+
+    def payload_columns(self) -> tuple[tuple[int, ...], ...]:
+        """For each mounting, its unknown parameters that these rows see, as indices of LINK_PARAMETERS."""
+        chosen: list[tuple[int, ...]] = []
+        for index, payload in enumerate(self.payloads):
+            flange = self._standard(index + 1)[:, self.model.flange]
+            unknown = tuple(i for i, name in enumerate(LINK_PARAMETERS) if name not in payload.known)
+            names = tuple(LINK_PARAMETERS[i] for i in unknown)
+            seen = base_parameters(flange[:, list(unknown)], names).independent if unknown else ()
+            chosen.append(tuple(unknown[i] for i in seen))
+        return tuple(chosen)
+
+    def system(self, base: BaseParameters, payload_columns: tuple[tuple[int, ...], ...]) -> System:
+        """Eq. (17) with these base parameters and unknown payload parameters."""
+        plan, count, standard = layout(self.model), self.model.robot.joint_count, len(self.model.columns)
+        choice = _Choice(self.model, base, self.payloads, payload_columns)
+        joints = []
+        for joint in range(count):
+            parts = []
+            for index, factors in enumerate(self.joints):
+                spread = _widened(factors[joint], plan.joint[joint], count + standard)
+                parts.append(np.concatenate((spread[:, :count], -choice.columns(spread[:, count:], index - 1)), axis=1))
+            joints.append(triangle(parts, count + choice.width))
+        moves = tuple(
+            tuple(
+                np.concatenate((factor[:, :1], choice.columns(_widened(factor[:, 1:], held, standard), c.mounting)), 1)
+                for factor, held in zip(c.factors, plan.motor, strict=True)
+            )
+            for c in self.clusters
+        )
+        motors = tuple(triangle((move[motor] for move in moves), 1 + choice.width) for motor in range(count))
+        named = zip(base.names, base.independent, strict=True)
+        return System(
+            drive_train=self.model.drive_train,
+            base=base,
+            columns=tuple(Column(name, self.model.columns[index].unit) for name, index in named),
+            payloads=self.payloads,
+            payload_columns=payload_columns,
+            runs=self.runs,
+            joints=Triangles(tuple(joints), self.joint_rows),
+            motors=Triangles(motors, self.motor_rows),
+            moves=moves,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """[W | W_uL | W_kL χ_kL] among the standard columns, for rows of one mounting."""
+
+    model: Model
+    base: BaseParameters
+    payloads: tuple[Payload, ...]
+    payload_columns: tuple[tuple[int, ...], ...]
+
+    @property
+    def width(self) -> int:
+        return len(self.base.independent) + sum(map(len, self.payload_columns)) + 1
+
+    def columns(self, standard: FloatArray, mounting: int) -> FloatArray:
+        out = np.zeros((len(standard), self.width))
+        first = len(self.base.independent)
+        out[:, :first] = standard[:, list(self.base.independent)]
+        flange = standard[:, self.model.flange]
+        for index, indices in enumerate(self.payload_columns):
+            if index == mounting:
+                out[:, first : first + len(indices)] = flange[:, list(indices)]
+                out[:, -1] = flange @ self.payloads[index].known_parameters
+            first += len(indices)
+        return out
+
+
+def layout(model: Model) -> Layout:
+    """Which columns each joint's and each motor's equation can hold (Model.support through T)."""
+    support, train = model.support, model.drive_train
+    current = train.direction.T != 0.0
+    mixed = (np.abs(train.to_motor) > 0.0).astype(np.int64) @ support.astype(np.int64) > 0
+    return Layout(
+        joint=tuple(np.flatnonzero(np.concatenate((v, w))) for v, w in zip(current, support, strict=True)),
+        motor=tuple(np.flatnonzero(row) for row in mixed),
+    )
+
+
+def reduce_runs(
+    model: Model,
+    runs: Iterable[Run],
+    conditioning: Conditioning,
+    *,
+    payloads: Sequence[Payload] = (),
+    chunk_rows: int = CHUNK_ROWS,
+) -> Reduction:
+    """Reduce runs one after the other; no more than one of them is held.
+
+    Args:
+        model: the declared model.
+        runs: read while they are reduced; a mounting that several share has one set of unknowns.
+        conditioning: the filters.
+        payloads: known beforehand; others are added as runs bring them.
+        chunk_rows: rows built at once; the result does not depend on it.
+
+    Raises:
+        DataUnfit: a run is unfit, leaves no usable row, or contradicts another about a mounting.
+    """
+    count, plan = model.robot.joint_count, layout(model)
+    width = tuple(len(columns) for columns in plan.joint)
+    met = list(payloads)
+    joints = [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1)]
+    joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    names: list[str] = []
+    clusters: list[Cluster] = []
+    for run in runs:
+        mounting = place_of(run.payload, met, run.name)
+        joints += [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1 - len(joints))]
+        data = differentiate(run, model.drive_train, conditioning)
+        moves: dict[int, list[list[FloatArray]]] = {}
+        for rows in rows_of(model, data, conditioning, chunk_rows):
+            for joint, used in enumerate(rows.use):
+                columns = _joint_columns(model, rows, joint, used, plan.joint[joint])
+                joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
+            joint_rows += rows.use.sum(axis=1)
+            motor_rows += rows.motor_use.sum(axis=1)
+            for move, parts in _motor_rows(model, rows, plan).items():
+                moves.setdefault(move, []).append(parts)
+        for pieces in moves.values():
+            clusters.append(_cluster(mounting, pieces))
+            if len(clusters) > 2 * MOST_CLUSTERS:
+                clusters = _joined(clusters)
+        names.append(run.name)
+    if len(clusters) > MOST_CLUSTERS:
+        clusters = _joined(clusters)
+    return Reduction(
+        model=model,
+        conditioning=conditioning,
+        payloads=tuple(met),
+        runs=tuple(names),
+        joints=tuple(tuple(factors) for factors in joints),
+        joint_rows=joint_rows,
+        motor_rows=motor_rows,
+        clusters=tuple(clusters),
+    )
+
+
+def place_of(payload: Payload | None, payloads: list[Payload], run: str) -> int:
+    """Index of a payload among those met so far, to which a new one is added; −1 without load.
+
+    Raises:
+        DataUnfit: its mounting carries something else here than in another run.
+    """
+    if payload is None:
+        return -1
+    for index, known in enumerate(payloads):
+        if known.mounting == payload.mounting:
+            if known != payload:
+                raise DataUnfit(
+                    run,
+                    f"mounting {payload.mounting!r} carries {payload} here and {known} in another run; "
+                    "give each way of mounting a name of its own",
+                )
+            return index
+    payloads.append(payload)
+    return len(payloads) - 1
+
+
+def _joint_columns(model: Model, rows: Rows, joint: int, used: BoolArray, columns: IntArray) -> FloatArray:
+    count = len(rows.current)
+    own = columns[columns < count]
+    current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
+    standard = rows.standard[joint][columns[columns >= count] - count][:, used]
+    return np.concatenate((current, standard))
+
+
+def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatArray]]:
+    """Rows [v_i | (T W_st)_i] of each motor, parted by move."""
+    to_motor = model.drive_train.to_motor
+    whole = []
+    for motor, held in enumerate(plan.motor):
+        joints = np.flatnonzero(to_motor[motor])
+        mixed = sum(to_motor[motor, joint] * rows.standard[joint][held] for joint in joints)
+        whole.append(np.concatenate((rows.current[motor][None], np.asarray(mixed))))
+    parts: dict[int, list[FloatArray]] = {}
+    for move in np.unique(rows.move):
+        here = rows.motor_use & (rows.move == move)
+        if here.any():
+            parts[int(move)] = [columns[:, used].T for columns, used in zip(whole, here, strict=True)]
+    return parts
+
+
+def _cluster(mounting: int, pieces: list[list[FloatArray]]) -> Cluster:
+    return Cluster(mounting, tuple(triangle(parts, parts[0].shape[1]) for parts in zip(*pieces, strict=True)))
+
+
+def _joined(clusters: list[Cluster]) -> list[Cluster]:
+    """Neighbours of one mounting joined in pairs."""
+    joined: list[Cluster] = []
+    index = 0
+    while index < len(clusters):
+        pair = clusters[index : index + 2]
+        if len(pair) == 2 and pair[0].mounting == pair[1].mounting:
+            joined.append(_cluster(pair[0].mounting, [list(cluster.factors) for cluster in pair]))
+            index += 2
+        else:
+            joined.append(pair[0])
+            index += 1
+    return joined
+
+
+def _widened(factor: FloatArray, columns: IntArray, width: int) -> FloatArray:
+    out = np.zeros((len(factor), width))
+    out[:, columns] = factor
+    return out

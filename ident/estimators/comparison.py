@@ -1,0 +1,224 @@
+"""Every estimator on the same data, and how much its gains hang on what nobody can know: scaling and filters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.equations.reduction import reduce_runs
+from ident.equations.system import System
+from ident.errors import IdentificationError
+from ident.estimators.estimate import Estimate
+from ident.estimators.least_squares import Scaling, ls, tls, wls
+from ident.estimators.maximum_likelihood import ml
+from ident.model.model import Model
+
+FloatArray = NDArray[np.float64]
+
+CUTOFF_FACTORS = (0.5, 1.0, 2.0)
+"""Of both cut-offs: an estimator that is told by data, not by filters, gives the same gains over two octaves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimator:
+    """One way from a system to an estimate, with the scaling that it needs said."""
+
+    name: str
+    run: Callable[[System], Estimate]
+
+
+ESTIMATORS = (
+    Estimator("ls", ls),
+    Estimator("wls", wls),
+    Estimator("tls, unscaled", lambda system: tls(system, Scaling.NONE)),
+    Estimator("tls, rows (paper)", lambda system: tls(system, Scaling.ROWS)),
+    Estimator("tls, columns", lambda system: tls(system, Scaling.COLUMNS)),
+    Estimator("tls, both", lambda system: tls(system, Scaling.BOTH)),
+    Estimator("ml", ml),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One estimator under one filter.
+
+    Attributes:
+        estimator: its name.
+        position_cutoff_hz, decimation_cutoff_hz: of the filters.
+        gains: Nm/A, shape (n,); None where it found none.
+        std: of the gains, same shape.
+        relative_error_percent: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter.
+        reason: why there are no gains.
+    """
+
+    estimator: str
+    position_cutoff_hz: float
+    decimation_cutoff_hz: float
+    gains: FloatArray | None
+    std: FloatArray | None
+    relative_error_percent: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All trials, those of the declared filters first."""
+
+    trials: tuple[Trial, ...]
+
+    @property
+    def declared(self) -> tuple[Trial, ...]:
+        """Under the declared filters."""
+        return self.trials[: len(ESTIMATORS)]
+
+    def spread_percent(self, estimator: str) -> FloatArray | None:
+        """Largest less smallest gain over the filters, in per cent of their mean, shape (n,); None with a failure."""
+        gains = [trial.gains for trial in self.trials if trial.estimator == estimator]
+        if any(gain is None for gain in gains):
+            return None
+        values = np.stack([gain for gain in gains if gain is not None])
+        return np.asarray(100.0 * np.ptp(values, axis=0) / np.abs(values.mean(axis=0)))
+
+
+def compare(
+    model: Model,
+    runs: Callable[[], Iterable[Run]],
+    conditioning: Conditioning,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Comparison:
+    """Run every estimator under the declared filters, and under half and twice their cut-offs.
+
+    Args:
+        model: the declared model.
+        runs: gives the runs of the fit, anew at each call.
+        conditioning: the declared filters.
+        progress: told what is being done.
+
+    Raises:
+        DataUnfit: the runs cannot be used under the declared filters.
+    """
+    trials: list[Trial] = []
+    for factor in sorted(CUTOFF_FACTORS, key=lambda factor: factor != 1.0):
+        filters = replace(
+            conditioning,
+            position_cutoff_hz=factor * conditioning.position_cutoff_hz,
+            decimation_cutoff_hz=factor * conditioning.decimation_cutoff_hz,
+        )
+        progress(f"estimators under {filters.position_cutoff_hz:g} Hz / {filters.decimation_cutoff_hz:g} Hz")
+        try:
+            reduction = reduce_runs(model, runs(), filters)
+            system = reduction.system(reduction.base(), reduction.payload_columns())
+        except IdentificationError as error:
+            if factor == 1.0:
+                raise
+            trials += [_failed(estimator.name, filters, error) for estimator in ESTIMATORS]
+            continue
+        trials += [_tried(estimator, system, filters) for estimator in ESTIMATORS]
+    return Comparison(tuple(trials))
+
+
+def _tried(estimator: Estimator, system: System, filters: Conditioning) -> Trial:
+    try:
+        estimate = estimator.run(system)
+    except IdentificationError as error:
+        return _failed(estimator.name, filters, error)
+    return Trial(
+        estimator=estimator.name,
+        position_cutoff_hz=filters.position_cutoff_hz,
+        decimation_cutoff_hz=filters.decimation_cutoff_hz,
+        gains=estimate.gains,
+        std=estimate.gains_std,
+        relative_error_percent=estimate.relative_error(system).total,
+    )
+
+
+def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> Trial:
+    return Trial(
+        estimator, filters.position_cutoff_hz, filters.decimation_cutoff_hz, None, None, None, reason=str(error)
+    )
+
+
+# Essential parameters: the few base parameters that these data need (paper §4.2).
+
+
+RATIO = 20.0
+"""r_σ; the paper finds 10 to 30 right, depending on the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """A base parameter that was taken out, and its relative standard deviation at that step (eq. 11) [%]."""
+
+    name: str
+    std_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class Essential:
+    """What is left, and what was taken out.
+
+    Attributes:
+        system: without the columns that were taken out.
+        estimate: of that system.
+        removed: in the order in which they went.
+        whole: the same estimate among all unknowns; a parameter that was taken out is zero and certain.
+    """
+
+    system: System
+    estimate: Estimate
+    removed: tuple[Removal, ...]
+    whole: Estimate
+
+
+def essential(system: System, estimator: Callable[[System], Estimate], ratio: float = RATIO) -> Essential:
+    """Take out the base parameter with the largest relative σ, estimate again, until max/min of them is below r_σ.
+
+    Gains, columns of effects and the payload's parameters are no base parameters of the robot: they stay.
+
+    Args:
+        system: with all base parameters.
+        estimator: any; its own σ decide.
+        ratio: r_σ.
+
+    Raises:
+        ValueError: a ratio of one or less leaves nothing.
+        IdentificationError: the estimator refuses.
+    """
+    if not ratio > 1.0:
+        raise ValueError(f"r_σ is {ratio:g}; it compares a largest with a smallest, so it must be above 1")
+    kept = list(range(len(system.columns)))
+    removed: list[Removal] = []
+    current, estimate = system, estimator(system)
+    while True:
+        candidates = sum(index < len(system.base.independent) for index in kept)
+        relative = relative_std_percent(estimate.parameters, estimate.parameters_std)[:candidates]
+        if candidates < 2 or float(np.max(relative)) < ratio * float(np.min(relative)):
+            break
+        worst = int(np.argmax(relative))
+        removed.append(Removal(system.columns[kept[worst]].name, float(relative[worst])))
+        current = current.holding({worst: 0.0})
+        del kept[worst]
+        estimate = estimator(current)
+    return Essential(current, estimate, tuple(removed), _among_all(estimate, system, kept))
+
+
+def relative_std_percent(values: FloatArray, std: FloatArray) -> FloatArray:
+    """100 σ/|χ| (eq. 11) [%]; infinite for a value of zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(100.0 * std / np.abs(values), nan=np.inf, posinf=np.inf)
+
+
+def _among_all(estimate: Estimate, system: System, kept: list[int]) -> Estimate:
+    count, every = system.joint_count, len(system.unknowns)
+    places = [*kept, *range(len(system.columns), every)]
+    parameters = np.zeros(every)
+    parameters[places] = estimate.parameters
+    within = [*range(count), *(count + place for place in places)]
+    covariance = np.zeros((count + every,) * 2)
+    covariance[np.ix_(within, within)] = estimate.covariance
+    return replace(estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance)

@@ -1,0 +1,141 @@
+"""From runs to an estimate: all gains and all parameters in one global step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.run import Run
+from ident.equations.reduction import reduce_runs
+from ident.equations.system import System, require_distinct
+from ident.errors import DataUnfit, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
+from ident.estimators.estimate import Estimate, Method, RelativeError
+from ident.estimators.least_squares import ls, tls, wls
+from ident.estimators.maximum_likelihood import ml
+from ident.model.bodies import Payload
+from ident.model.model import Column, Model
+
+FloatArray = NDArray[np.float64]
+
+LARGEST_STD = 0.1
+"""Of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """An estimate with the equations it rests on, and those that it has not seen.
+
+    Attributes:
+        model: the declared model.
+        conditioning: the filters.
+        system: of the fit.
+        holdout: of the runs that were held out, with the unknowns of the fit; None without any.
+        estimate: from ``system`` alone.
+    """
+
+    model: Model
+    conditioning: Conditioning
+    system: System
+    holdout: System | None
+    estimate: Estimate
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Of W: base parameters, then effects."""
+        return self.system.columns
+
+    @property
+    def training_error(self) -> RelativeError:
+        """On the rows of the fit [%]."""
+        return self.estimate.relative_error(self.system)
+
+    @property
+    def holdout_error(self) -> RelativeError | None:
+        """On the rows that the fit has not seen [%]."""
+        return None if self.holdout is None else self.estimate.relative_error(self.holdout)
+
+
+def identify(
+    model: Model,
+    runs: Iterable[Run],
+    conditioning: Conditioning,
+    *,
+    holdout: Iterable[Run] = (),
+    method: Method = Method.ML,
+    fixed_gains: FloatArray | None = None,
+) -> Identification:
+    """One global step. Runs are read one after the other and none is kept.
+
+    Args:
+        model: the declared model.
+        runs: of the fit: without load, and with a weighed payload where the gains are free.
+        conditioning: the filters.
+        holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
+        method: estimator.
+        fixed_gains: known gains, shape (n,).
+
+    Raises:
+        DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
+    """
+    reduction = reduce_runs(model, runs, conditioning)
+    system = reduction.system(reduction.base(), reduction.payload_columns())
+    require_distinct(system, gains=fixed_gains is None)
+    estimate = estimate_with(method, system, fixed_gains)
+    if fixed_gains is None:
+        require_seen_payload(estimate if method is Method.ML else _ml_or(estimate, system), system)
+    rest = reduce_runs(model, _mounted_among(holdout, system.payloads), conditioning, payloads=system.payloads)
+    unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
+    return Identification(model, conditioning, system, unseen, estimate)
+
+
+def _ml_or(estimate: Estimate, system: System) -> Estimate:
+    """``ml``'s estimate where it has one: the deviations of the linear ones are those of independent rows (eqs. 10, 23)
+    and do not see that moves contradict each other."""
+    try:
+        return ml(system)
+    except (DataUnfit, NotConverged, RankDeficient, TooFewMoves):
+        return estimate
+
+
+def require_seen_payload(estimate: Estimate, system: System) -> None:
+    """Refuse gains whose common scale nothing sets.
+
+    The weight of the payload is what sets it. Where a run declared loaded went without it, or the other way round,
+    moves contradict each other about the scale, and leaving them out in turn scatters all gains together.
+
+    Raises:
+        PayloadUnseen: every gain is uncertain by more than LARGEST_STD.
+    """
+    relative = estimate.gains_std / np.abs(estimate.gains)
+    if float(np.min(relative)) > LARGEST_STD:
+        raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
+
+
+def _mounted_among(runs: Iterable[Run], payloads: tuple[Payload, ...]) -> Iterator[Run]:
+    known = {payload.mounting for payload in payloads}
+    for run in runs:
+        if run.payload is not None and run.payload.mounting not in known:
+            mounting = f"mounting {run.payload.mounting!r}"
+            raise DataUnfit(run.name, f"held out with {mounting}, which no run of the fit carries: it stays unknown")
+        yield run
+
+
+def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None = None) -> Estimate:
+    """Run one estimator by its name.
+
+    Raises:
+        DataUnfit: ``tls`` with fixed gains: it has nothing to correct then.
+    """
+    if method is Method.LS:
+        return ls(system, fixed_gains)
+    if method is Method.WLS:
+        return wls(system, fixed_gains)
+    if method is Method.ML:
+        return ml(system, fixed_gains)
+    if fixed_gains is not None:
+        raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
+    return tls(system)

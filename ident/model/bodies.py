@@ -1,0 +1,113 @@
+"""A body fixed to the last link: what is known of it, and what is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The ten inertial parameters of a link, in the paper's order; a payload is a link too (paper §2.2).
+
+
+LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
+"""Inertia about the link frame's origin, first moments, mass."""
+
+LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
+"""Of the same."""
+
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """A weighed body as it was mounted; each mounting has its own unknowns.
+
+    Attributes:
+        name: of the body.
+        mounting: names one way of mounting it; runs that share it share their unknown parameters.
+        known: known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame
+            (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
+    """
+
+    name: str
+    mounting: str
+    known: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def known_parameters(self) -> FloatArray:
+        """χ_kL in the order of LINK_PARAMETERS, zero where unknown, shape (10,)."""
+        return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])
+
+
+# The pseudo-inertia matrix of a body: positive definite for every distribution of positive mass, and only then.
+#
+# With the inertia tensor I and the first moment h about the link frame's origin, and the mass m,
+#
+#     P = [ Σ   h ]        Σ = ½ tr(I)·1 − I = ∫ r rᵀ dm,
+#         [ hᵀ  m ],
+#
+# so P ≻ 0 says at once m > 0, I about the centre of mass ≻ 0 and the triangle inequality of its principal moments
+# (Wensing, Kim, Slotine: Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification,
+# 2018).
+# P is linear in the ten parameters: a linear matrix inequality.
+
+
+_ROWS, _COLUMNS = np.triu_indices(3)
+
+
+def pseudo_inertia(link: FloatArray) -> FloatArray:
+    """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m, kg]."""
+    inertia = _symmetric(link[:6])
+    out = np.empty((4, 4))
+    out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    out[:3, 3] = out[3, :3] = link[6:9]
+    out[3, 3] = link[9]
+    return out
+
+
+def link_parameters(pseudo: FloatArray) -> FloatArray:
+    """The inverse of `pseudo_inertia`, shape (4, 4) → (10,); a matrix that is not symmetric counts as its mean."""
+    even = 0.5 * (pseudo + pseudo.T)
+    inertia = np.trace(even[:3, :3]) * np.eye(3) - even[:3, :3]
+    return np.concatenate((inertia[_ROWS, _COLUMNS], even[:3, 3], even[3:, 3]))
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A link as a URDF says it.
+
+    Attributes:
+        mass_kg: of the link.
+        centre_m: centre of mass in the link frame, shape (3,).
+        inertia_kg_m2: tensor about the centre of mass, axes of the link frame, shape (3, 3).
+    """
+
+    mass_kg: float
+    centre_m: FloatArray
+    inertia_kg_m2: FloatArray
+
+    @property
+    def parameters(self) -> FloatArray:
+        """About the link frame's origin (Huygens-Steiner), in the order of LINK_PARAMETERS, shape (10,)."""
+        c = self.centre_m
+        inertia = self.inertia_kg_m2 + self.mass_kg * (c @ c * np.eye(3) - np.outer(c, c))
+        return np.concatenate((inertia[_ROWS, _COLUMNS], self.mass_kg * c, (self.mass_kg,)))
+
+
+def body_of(link: FloatArray) -> Body:
+    """The body that ten parameters describe.
+
+    Args:
+        link: in the order of LINK_PARAMETERS, with a positive mass, shape (10,).
+    """
+    mass = float(link[9])
+    c = link[6:9] / mass
+    return Body(mass, c, _symmetric(link[:6]) - mass * (c @ c * np.eye(3) - np.outer(c, c)))
+
+
+def _symmetric(upper: FloatArray) -> FloatArray:
+    out = np.zeros((3, 3))
+    out[_ROWS, _COLUMNS] = upper
+    return out + np.triu(out, 1).T

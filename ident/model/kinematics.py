@@ -1,0 +1,74 @@
+"""Where the links are: poses of all joint frames for many samples at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.model.robot import JointKind, Robot
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i.
+
+    Attributes:
+        rotation: shape (n + 1, k, 3, 3).
+        origin_m: shape (n + 1, k, 3).
+    """
+
+    rotation: FloatArray
+    origin_m: FloatArray
+
+
+def poses(robot: Robot, position: FloatArray) -> Poses:
+    """Forward kinematics.
+
+    Args:
+        robot: n joints.
+        position: of the joints [rad or m], shape (n, k).
+    """
+    count, samples = position.shape
+    rotation = np.empty((count + 1, samples, 3, 3))
+    origin = np.empty((count + 1, samples, 3))
+    rotation[0], origin[0] = np.eye(3), 0.0
+    for index, joint in enumerate(robot.joints):
+        parent = rotation[joint.parent + 1]
+        offset = np.broadcast_to(joint.translation_m, (samples, 3))
+        turn = np.broadcast_to(joint.rotation, (samples, 3, 3))
+        if joint.kind is JointKind.PRISMATIC:
+            offset = offset + position[index][:, None] * (joint.rotation @ joint.axis)
+        else:
+            turn = joint.rotation @ _turns(joint.axis, position[index])
+        origin[index + 1] = origin[joint.parent + 1] + np.einsum("kij,kj->ki", parent, offset)
+        rotation[index + 1] = parent @ turn
+    return Poses(rotation, origin)
+
+
+def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
+    """Rotations about a unit axis (Rodrigues' formula), shape (k, 3, 3)."""
+    x, y, z = axis
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cosine, sine = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
+    outer = np.outer(axis, axis)
+    return np.asarray(outer + cosine * (np.eye(3) - outer) + sine * skew)
+
+
+# How the joints move: what a regressor needs to know.
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A piece of motion of n joints over k samples, joint-first, shape (n, k) [rad, or m for a prismatic joint].
+
+    Attributes:
+        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray

@@ -1,0 +1,160 @@
+"""The declared model: rigid links, rotors, friction and offsets, each a column (paper eqs. 1 and 25)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.errors import ModelError
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
+from ident.model.kinematics import Motion
+from ident.model.regressor import fill_rigid
+from ident.model.robot import JointKind, Robot
+
+# The gears between motors and joints, as one matrix.
+
+
+@dataclass(frozen=True, slots=True)
+class DriveTrain:
+    """q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
+
+    Attributes:
+        ratio: R, shape (n, n), invertible; row i belongs to motor i.
+    """
+
+    ratio: FloatArray
+
+    def __post_init__(self) -> None:
+        ratio = self.ratio
+        if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
+            raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}")
+        condition = float(np.linalg.cond(ratio))
+        if not np.isfinite(condition) or condition > 1e8:
+            raise ModelError(f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}")
+
+    @property
+    def joints(self) -> tuple[int, ...]:
+        """The joint that each motor is told by: its own, or that of its largest ratio where it does not drive that."""
+        return tuple(i if row[i] != 0.0 else int(np.argmax(np.abs(row))) for i, row in enumerate(self.ratio))
+
+    @property
+    def reduction(self) -> FloatArray:
+        """N of each motor, shape (n,): its ratio to the joint that it is told by."""
+        return np.asarray(self.ratio[np.arange(len(self.ratio)), list(self.joints)], dtype=np.float64)
+
+    @property
+    def direction(self) -> FloatArray:
+        """Rows r_i = R_i / N_i, shape (n, n): τ_joint = Σ_i r_iᵀ g_i v_i with the joint drive gains g_i."""
+        return self.ratio / self.reduction[:, None]
+
+    @property
+    def to_motor(self) -> FloatArray:
+        """T with g_i v_i = (T τ_joint)_i, the inverse of the transposed directions, shape (n, n)."""
+        return np.asarray(np.linalg.inv(self.direction.T), dtype=np.float64)
+
+    @property
+    def coupled(self) -> tuple[int, ...]:
+        """Motors that turn with more than one joint: their rotor inertia and friction need columns of their own."""
+        return tuple(i for i, row in enumerate(self.ratio) if np.count_nonzero(row) > 1)
+
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
+"""Of what acts along a joint, of its speed, and of a rotor's inertia seen there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One standard parameter."""
+
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A robot and its drive train, with the standard parameters χ_st in the paper's order.
+
+    A joint has fourteen: ten of its link (LINK_PARAMETERS), then Ia, fv, fs, off. A motor that turns with several
+    joints adds three (eq. 25): Iam, fvm, fsm. Its rotor inertia and viscous friction act on the joints through
+    r rᵀ; the diagonal of that is already in Ia and fv, so Iam and fvm carry the off-diagonal part, as in the paper.
+    """
+
+    robot: Robot
+    drive_train: DriveTrain
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Names and units of the standard parameters."""
+        columns: list[Column] = []
+        for number, joint in enumerate(self.robot.joints, start=1):
+            force, rate, inertia = DRIVE_UNITS[joint.kind]
+            columns += [Column(f"{name}{number}", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)]
+            columns += [
+                Column(f"Ia{number}", inertia),
+                Column(f"fv{number}", f"{force}/({rate})"),
+                Column(f"fs{number}", force),
+                Column(f"off{number}", force),
+            ]
+        for motor in self.drive_train.coupled:
+            force, rate, inertia = DRIVE_UNITS[self.robot.joints[self.drive_train.joints[motor]].kind]
+            columns += [
+                Column(f"Iam{motor + 1}", inertia),
+                Column(f"fvm{motor + 1}", f"{force}/({rate})"),
+                Column(f"fsm{motor + 1}", force),
+            ]
+        return tuple(columns)
+
+    @property
+    def flange(self) -> slice:
+        """The ten columns of the last link; a payload on it has the same."""
+        first = 14 * (self.robot.joint_count - 1)
+        return slice(first, first + 10)
+
+    @property
+    def support(self) -> BoolArray:
+        """Which standard parameters can load which joint, shape (n, c); all other entries of the regressor are zero."""
+        count = self.robot.joint_count
+        out = np.zeros((count, len(self.columns)), dtype=np.bool_)
+        for link in range(count):
+            first = 14 * link
+            out[link, first + 10 : first + 14] = True
+            joint = link
+            while joint >= 0:  # a link loads its own joint and those before it
+                out[joint, first : first + 10] = True
+                joint = self.robot.joints[joint].parent
+        for index, motor in enumerate(self.drive_train.coupled):
+            first = 14 * count + 3 * index
+            out[:, first : first + 3] = (self.drive_train.direction[motor] != 0.0)[:, None]
+        return out
+
+    def regressor(self, motion: Motion) -> FloatArray:
+        """Joint torque per unit of every standard parameter.
+
+        Returns:
+            shape (n, c, k) [Nm or N per unit], time last.
+        """
+        position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        count, samples = position.shape
+        sign = np.sign(velocity)
+        out = np.zeros((count, len(self.columns), samples))
+        by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
+        fill_rigid(self.robot, position, velocity, acceleration, by_link[:, :, :10])
+        for joint in range(count):
+            own = by_link[joint, joint]
+            own[10], own[11], own[12], own[13] = acceleration[joint], velocity[joint], sign[joint], 1.0
+        direction = self.drive_train.direction
+        motor_speed = direction @ velocity
+        for index, motor in enumerate(self.drive_train.coupled):
+            first = 14 * count + 3 * index
+            r = direction[motor]
+            cross = np.outer(r, r) - np.diag(r**2)
+            out[:, first] = cross @ acceleration
+            out[:, first + 1] = cross @ velocity
+            out[:, first + 2] = r[:, None] * np.sign(motor_speed[motor])
+        return out

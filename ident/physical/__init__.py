@@ -1,0 +1,1 @@
+"""Physically consistent inertias from base parameters."""

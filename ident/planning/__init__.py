@@ -1,0 +1,1 @@
+"""Predict how well an experiment identifies each gain, and keep the arm clear of obstacles."""

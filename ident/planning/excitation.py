@@ -1,0 +1,370 @@
+"""What an experiment that has not been made yet would tell of the drive gains (paper §2.3; optimal design).
+
+With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i, e_i of standard
+deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its rows, differentiated by the unknowns and
+divided by σ_i, are
+
+    ∂/∂χ = γ_i (T W)_i / σ_i,      ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,      ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
+
+with τ the whole torque that is expected. The information about all unknowns is the sum of JᵀJ over the rows, and the
+covariance of ln g the inverse of its Schur complement: what is left of the gains' columns beside all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
+from ident.equations.rows import row_filter, row_masks
+from ident.model.base import BaseParameters, base_parameters
+from ident.model.bodies import LINK_PARAMETERS, Body, Payload
+from ident.model.kinematics import Motion
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import Robot, read_urdf
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
+
+UNSEEN = 1e-9
+"""Share of a column that counts as nothing when the others are taken from it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedPayload:
+    """A mounting as it is expected to be.
+
+    Attributes:
+        known: names of LINK_PARAMETERS that are known of it; the others are unknowns of the fit.
+        parameters: all ten, guessed or estimated where they are not known, shape (10,).
+    """
+
+    known: frozenset[str]
+    parameters: FloatArray
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Indices into LINK_PARAMETERS."""
+        return tuple(index for index, name in enumerate(LINK_PARAMETERS) if name not in self.known)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """What is believed of a robot: nominal before a fit, estimated after it.
+
+    Attributes:
+        model: the declared model.
+        gains: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,).
+        parameters: of the model's standard columns, shape (c,); an estimate of base parameters goes to the places of
+            its leading columns, with zeros elsewhere.
+        payloads: the mountings.
+        noise_a: standard deviation of one row of each motor in the unit of its current reference, correlation
+            included (``effective_noise``), shape (n,).
+    """
+
+    model: Model
+    gains: FloatArray
+    parameters: FloatArray
+    payloads: tuple[ExpectedPayload, ...]
+    noise_a: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excitation:
+    """Rows that a motion gives, whatever is mounted.
+
+    Attributes:
+        motion: of the n joints at the centres of k rows.
+        use: rows of each motor that count, shape (n, k); standstill does not (see ident/equations/rows.py).
+    """
+
+    motion: Motion
+    use: BoolArray
+
+
+def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
+    """The rows of a recorded run: its motion where they are centred, and which of them the fit uses."""
+    centres = row_filter(data, conditioning).centres(len(data.time_s))
+    motion = Motion(
+        data.position_rad[:, centres], data.velocity_rad_s[:, centres], data.acceleration_rad_s2[:, centres]
+    )
+    return Excitation(motion, row_masks(drive_train, data, conditioning)[1])
+
+
+def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
+    """Standard deviation of independent rows that say as much as these, whose residual is correlated.
+
+    Slow signals suffer most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance that independent
+    rows would give it (first-order autoregression). Faster motion suffers less, so this is on the safe side.
+
+    Args:
+        noise_a: of one row.
+        lag_one: correlation ρ of a row's residual with the next, from 0 up to below 1.
+    """
+    return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
+
+
+def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> FloatArray:
+    """Standard columns over a piece of motion, rows of a joint divided by its noise, shape (n k, c).
+
+    Args:
+        model: the declared model.
+        motion: k samples.
+        noise_nm: standard deviation expected at each joint [Nm], shape (n,).
+    """
+    columns = model.regressor(motion) / noise_nm[:, None, None]
+    # A joint at rest says nothing that can be used: its dry friction is undetermined (see the standstill mask).
+    columns *= (motion.velocity_rad_s != 0.0)[:, None, :]
+    return np.asarray(columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
+
+
+def visible(model: Model, motion: Motion) -> BaseParameters:
+    """Base parameters that a motion shows."""
+    columns = weighted_columns(model, motion, np.ones(model.robot.joint_count))
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    return base_parameters(triangle, tuple(column.name for column in model.columns))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """The unknowns of an experiment, and the information that excitations give about them.
+
+    The order of the unknowns is base parameters, unknown parameters of each mounting, ln of the gains.
+
+    Attributes:
+        expectation: of the robot.
+        base: its base parameters.
+    """
+
+    expectation: Expectation
+    base: BaseParameters
+
+    @property
+    def others(self) -> int:
+        """Number of unknowns that are not gains."""
+        return len(self.base.independent) + sum(len(payload.unknown) for payload in self.expectation.payloads)
+
+    @property
+    def size(self) -> int:
+        """Number of all unknowns."""
+        return self.others + len(self.expectation.gains)
+
+    def whitened(self, excitation: Excitation) -> FloatArray:
+        """γ_i (T W)_i / σ_i of the base columns and the ten of a payload, zero where a row does not count.
+
+        Returns:
+            shape (n, b + 10, k).
+        """
+        return self.whitened_from(excitation, self.expectation.model.regressor(excitation.motion))
+
+    def whitened_from(self, excitation: Excitation, regressor: FloatArray) -> FloatArray:
+        """The same from a regressor that is there already, shape (n, c, k)."""
+        expected = self.expectation
+        flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
+        columns = regressor[:, np.concatenate((self.base.independent, flange)).astype(np.intp)]
+        motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
+        motors *= excitation.use[:, None, :] / (expected.gains * expected.noise_a)[:, None, None]
+        return np.asarray(motors)
+
+    def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
+        """Of one motion that is made several times, once with each of these payloads, shape (p, p)."""
+        return self.information_of(self.whitened(excitation), payloads)
+
+    def information_of(
+        self, whitened: FloatArray, payloads: Sequence[int | None], blind: int | None = None
+    ) -> FloatArray:
+        """The same from ``whitened`` columns.
+
+        Args:
+            whitened: shape (n, b + 10, k).
+            payloads: what is mounted, each time.
+            blind: motor whose own gain column is made without the known part of the payload's torque: what is left is
+                seen by coupling with the other axes alone.
+        """
+        grams = whitened @ whitened.transpose(0, 2, 1)
+        summed = grams.sum(axis=0)
+        out = np.zeros((self.size, self.size))
+        gains = np.arange(self.others, self.size)
+        for payload in payloads:
+            place, source = self._columns(payload)
+            out[np.ix_(place, place)] += summed[np.ix_(source, source)]
+            torque = np.tile(self.expected(payload), (len(grams), 1))
+            if blind is not None and payload is not None:
+                torque[blind] -= self.known(payload)
+            seen = np.einsum("nab,nb->na", grams, torque)
+            out[np.ix_(place, gains)] -= seen[:, source].T
+            out[gains, gains] += np.einsum("na,na->n", seen, torque)
+        out[self.others :, : self.others] = out[: self.others, self.others :].T
+        return out
+
+    def others_of(self, whitened: FloatArray, payload: int | None) -> FloatArray:
+        """Columns of J that are not of gains, by motor, shape (n, k, others)."""
+        place, source = self._columns(payload)
+        out = np.zeros((len(whitened), whitened.shape[2], self.others))
+        out[:, :, place] = whitened[:, source].transpose(0, 2, 1)
+        return out
+
+    def expected(self, payload: int | None) -> FloatArray:
+        """Parameters with which the columns of ``whitened`` give the whole torque, shape (b + 10,)."""
+        base = self.base.grouping @ self.expectation.parameters
+        mounted = np.zeros(10) if payload is None else self.expectation.payloads[payload].parameters
+        return np.concatenate((base, mounted))
+
+    def known(self, payload: int) -> FloatArray:
+        """The part of ``expected`` that is known of a payload, shape (b + 10,)."""
+        mounted = self.expectation.payloads[payload].parameters.copy()
+        mounted[list(self.expectation.payloads[payload].unknown)] = 0.0
+        return np.concatenate((np.zeros(len(self.base.independent)), mounted))
+
+    def _columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
+        """Which unknowns a run has, and the columns of ``whitened`` that they belong to."""
+        base = len(self.base.independent)
+        place, source = list(range(base)), list(range(base))
+        if payload is not None:
+            unknown = self.expectation.payloads[payload].unknown
+            before = sum(len(other.unknown) for other in self.expectation.payloads[:payload])
+            place += range(base + before, base + before + len(unknown))
+            source += [base + index for index in unknown]
+        return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
+
+    def condition(self, information: FloatArray) -> float:
+        """Condition number of the observation matrix W, rows weighted by their noise; inf when a column is not seen."""
+        base = len(self.base.independent)
+        values = np.linalg.eigvalsh(information[:base, :base])
+        return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
+
+    def std_percent(self, information: FloatArray) -> FloatArray:
+        """Standard deviation predicted for each gain, shape (n,) [% of it]; inf where nothing is said of it."""
+        scale = np.sqrt(np.diag(information))
+        scale[scale == 0.0] = 1.0
+        scaled = information / np.outer(scale, scale)
+        gains = slice(self.others, self.size)
+        try:
+            factor = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            return self._std_of_singular(scaled) / scale[gains]
+        last = factor[gains, gains]
+        if float(np.diag(factor).min()) < 1e-5:  # so near to singular that rounding decides
+            return self._std_of_singular(scaled) / scale[gains]
+        inverse = np.linalg.inv(last)
+        return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale[gains])
+
+    def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
+        """Of a system in which some unknowns are not seen: theirs drop out, and gains that hang on them are inf."""
+        others, gains = slice(None, self.others), slice(self.others, None)
+        values, vectors = np.linalg.eigh(scaled[others, others])
+        kept = values > UNSEEN * values[-1]
+        onto = vectors[:, kept].T @ scaled[others, gains]
+        rest = scaled[gains, gains] - onto.T @ (onto / values[kept, None])
+        left, directions = np.linalg.eigh(rest)
+        seen = left > UNSEEN
+        variance = (directions[:, seen] ** 2) @ (1.0 / left[seen])
+        variance[(directions[:, ~seen] ** 2).sum(axis=1) > 1e-6] = np.inf
+        return np.asarray(100.0 * np.sqrt(variance))
+
+
+# A robot as it may be expected to be before anything is identified: only to choose moves by, never to fit with.
+
+
+LINK_MASS_KG = 5.0
+"""Of each link where the URDF has no inertias, as a slender rod to the next joint."""
+ROD_RADIUS_M = 0.05
+STEEL_KG_M3 = 7850.0
+DRY_FRICTION = 0.05
+VISCOUS_FRICTION = 0.10
+ROTOR = 0.03
+"""Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit.
+Of the size that geared arms have (paper, Table 3)."""
+TORQUE_RESERVE = 3.0
+"""Torque limit over the largest rigid-body torque, where the URDF gives none."""
+
+
+def nominal_links(robot: Robot, urdf: str) -> tuple[FloatArray, bool]:
+    """Inertial parameters of the links, shape (n, 10), and whether the URDF gave them.
+
+    Args:
+        robot: of this URDF.
+        urdf: its text; where no link in it has a mass, rods of LINK_MASS_KG are assumed.
+    """
+    bodies = read_urdf(urdf).bodies
+    if any(body.mass_kg > 0.0 for body in bodies):
+        return np.array([body.parameters for body in bodies]), True
+    links = []
+    for index in range(robot.joint_count):
+        ways = [joint.translation_m for joint in robot.joints if joint.parent == index]
+        way = ways[0] if ways else 0.1 * robot.joints[index].axis
+        slender = LINK_MASS_KG / 12.0 * (way @ way * np.eye(3) - np.outer(way, way))
+        thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
+        links.append(Body(LINK_MASS_KG, 0.5 * way, slender + thick).parameters)
+    return np.array(links), False
+
+
+def side_of_cube(mass_kg: float) -> float:
+    """Of steel [m]."""
+    return float((mass_kg / STEEL_KG_M3) ** (1.0 / 3.0))
+
+
+def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
+    """A steel cube of the weighed mass, a side from the last joint's frame in every direction; what is known is kept.
+
+    A body off the last axis is what a technician is asked to mount: on it, no gravity would act about that axis.
+    """
+    mass = payload.known.get("m", LINK_MASS_KG)
+    side = side_of_cube(mass)
+    axis = robot.joints[-1].axis
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    centre = side * (axis + 0.7 * across + 0.7 * np.cross(axis, across))
+    cube = Body(mass, centre, mass * side**2 / 6.0 * np.eye(3))
+    guess = dict(zip(LINK_PARAMETERS, cube.parameters, strict=True))
+    parameters = np.array([payload.known.get(name, guess[name]) for name in LINK_PARAMETERS])
+    return ExpectedPayload(frozenset(payload.known), parameters)
+
+
+def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, lively: Motion) -> FloatArray:
+    """Of each joint [Nm or N], shape (n,): the URDF's effort limit, else TORQUE_RESERVE times what rigid links need.
+
+    Args:
+        model: the declared model.
+        urdf: its text.
+        links: inertial parameters with the payload on the last one, shape (n, 10).
+        lively: motion as fast as the limits allow.
+    """
+    columns = model.regressor(lively)
+    rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
+    largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
+    declared = read_urdf(urdf).effort_limit
+    usable = (declared > 0.0) & (declared < 1e6)  # some exporters write 0, others 1e9 for "not known"
+    return np.where(usable, declared, TORQUE_RESERVE * np.maximum(largest, 1e-3))
+
+
+def nominal_parameters(
+    model: Model,
+    links: FloatArray,
+    torque_limit: FloatArray,
+    velocity_limit: FloatArray,
+    acceleration_limit: FloatArray,
+) -> FloatArray:
+    """Standard parameters of links and drives, shape (c,).
+
+    Args:
+        model: the declared model.
+        links: shape (n, 10).
+        torque_limit, velocity_limit, acceleration_limit: of the joints, shape (n,).
+    """
+    parameters = np.zeros(len(model.columns))
+    for index, link in enumerate(links):
+        first = 14 * index
+        parameters[first : first + 10] = link
+        parameters[first + 10] = ROTOR * torque_limit[index] / acceleration_limit[index]
+        parameters[first + 11] = VISCOUS_FRICTION * torque_limit[index] / velocity_limit[index]
+        parameters[first + 12] = DRY_FRICTION * torque_limit[index]
+    for number, motor in enumerate(model.drive_train.coupled):
+        first = 14 * len(links) + 3 * number
+        parameters[first : first + 3] = parameters[14 * motor + 10 : 14 * motor + 13]
+    return parameters

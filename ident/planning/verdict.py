@@ -1,0 +1,205 @@
+"""How well each gain is seen, by what, and which moves would show it better: measured, not guessed.
+
+A gain can be seen in three ways, and each is judged by what it would give alone:
+
+- gravity: the known payload's static torque in the motor's own rows, beside all that is unknown there;
+- inertia: the rest of the known payload's torque in the motor's own rows;
+- coupling: parameters that its rows share with those of other axes, whose gains are known by their own means.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident.model.kinematics import Motion
+from ident.planning.excitation import Design, Excitation
+
+FloatArray = NDArray[np.float64]
+
+GOOD_PERCENT = 1.0
+"""Standard deviation up to which a gain is well seen: drives are sold with gains known to some percent."""
+UNSEEN_PERCENT = 10.0
+"""Above it the nameplate is the better source."""
+SHARE_OF_BEST = 3.0
+"""A way of seeing counts when it alone gives at most so many times the deviation of the best one."""
+
+
+class Source(Enum):
+    """By what a gain is seen."""
+
+    GRAVITY = "gravity"
+    INERTIA = "inertia"
+    COUPLING = "coupling with other axes"
+
+
+class Verdict(Enum):
+    """How well a gain is seen."""
+
+    GOOD = "good"
+    WEAK = "weak"
+    UNSEEN = "unseen"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtraMoves:
+    """Moves that could be added to an experiment, made once without load and once with each payload.
+
+    Attributes:
+        words: what they are, to follow "add": ``fast moves of J1 with the arm stretched``.
+        seconds: how long they take, once.
+        excitation: their rows.
+    """
+
+    words: str
+    seconds: float
+    excitation: Excitation
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """The extra moves that help a gain most, and its deviation with them [%]."""
+
+    words: str
+    seconds: float
+    std_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class GainVerdict:
+    """Of one gain.
+
+    Attributes:
+        axis: index from 0.
+        std_percent: predicted standard deviation [% of the gain]; inf where nothing tells it.
+        alone_percent: what each way of seeing would give alone [%].
+        gravity_acts: on this axis, whatever the last link carries; without it all that is seen is inertia.
+        verdict: good, weak or unseen.
+        advice: for a gain that is not good; None where no extra moves were offered or none helps.
+    """
+
+    axis: int
+    std_percent: float
+    alone_percent: dict[Source, float]
+    gravity_acts: bool
+    verdict: Verdict
+    advice: Advice | None
+
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """By what it is seen, the best first; empty for a gain that nothing tells."""
+        best = min(self.alone_percent.values())
+        order = sorted(self.alone_percent.items(), key=lambda item: item[1])
+        return tuple(source for source, alone in order if np.isfinite(alone) and alone <= SHARE_OF_BEST * best)
+
+    def words(self, axis_name: str) -> str:
+        """For a report: ``J1 is seen by inertia only: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
+        if not self.sources or not np.isfinite(self.std_percent):
+            text = f"{axis_name} is not seen at all"
+        else:
+            text = f"{axis_name} is seen by {self._seen_by()}: σ {self.std_percent:.2g} %"
+        if self.advice is None:
+            return text
+        return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {self.advice.std_percent:.2g} %)"
+
+    def _seen_by(self) -> str:
+        if not self.gravity_acts:
+            shared = Source.COUPLING in self.sources
+            return "inertia only" + (", partly through parameters shared with other axes" if shared else "")
+        return " and ".join(source.value for source in self.sources) + (" only" if len(self.sources) == 1 else "")
+
+
+Runs = Sequence[tuple[Excitation, Sequence[int | None]]]
+"""Motions, each with what was mounted every time it was made: an index into ``Expectation.payloads``, or None."""
+
+
+def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> tuple[GainVerdict, ...]:
+    """Judge every gain of an experiment, one that is planned or one that was made.
+
+    Args:
+        design: unknowns, expected parameters and gains, noise. After a fit: its gains, parameters and residuals.
+        runs: of the experiment. For a plan ``[(excitation, (None, 0))]``: its moves without and with the payload;
+            for recorded runs one pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
+        extras: moves that could be added; for each gain that is not good they are tried and the best is named.
+
+    Returns:
+        one verdict an axis, in their order.
+    """
+    whitened = [(design.whitened(excitation), payloads) for excitation, payloads in runs]
+    information = np.sum([design.information_of(w, payloads) for w, payloads in whitened], axis=0)
+    found = design.std_percent(information)
+    own = _own_rows(design, runs, whitened)
+    everything: tuple[int | None, ...] = (None, *range(len(design.expectation.payloads)))
+    added = [(extra, information + design.information(extra.excitation, everything)) for extra in extras]
+    with_extras = [(extra, design.std_percent(sum_)) for extra, sum_ in added]
+    judged = []
+    for axis, std in enumerate(found.tolist()):
+        blind = np.sum([design.information_of(w, payloads, axis) for w, payloads in whitened], axis=0)
+        gravity, inertia, acts = own[axis]
+        alone = {
+            Source.GRAVITY: gravity,
+            Source.INERTIA: inertia,
+            Source.COUPLING: float(design.std_percent(blind)[axis]),
+        }
+        verdict = _verdict(std)
+        advice = None if verdict is Verdict.GOOD else _advice(axis, std, with_extras)
+        judged.append(GainVerdict(axis, std, alone, acts, verdict, advice))
+    return tuple(judged)
+
+
+def _verdict(std_percent: float) -> Verdict:
+    if std_percent <= GOOD_PERCENT:
+        return Verdict.GOOD
+    return Verdict.WEAK if std_percent <= UNSEEN_PERCENT else Verdict.UNSEEN
+
+
+def _advice(axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, FloatArray]]) -> Advice | None:
+    better = [(float(found[axis]), index) for index, (_, found) in enumerate(tried) if found[axis] < std_percent]
+    if not better:
+        return None
+    found_, index = min(better)
+    return Advice(tried[index][0].words, tried[index][0].seconds, found_)
+
+
+def _own_rows(
+    design: Design, runs: Runs, whitened: Sequence[tuple[FloatArray, Sequence[int | None]]]
+) -> list[tuple[float, float, bool]]:
+    """For each motor what gravity and inertia of the known payload give alone in its own rows [%], and whether gravity
+    of anything on the last link acts there."""
+    count = len(design.expectation.gains)
+    others: list[list[FloatArray]] = [[] for _ in range(count)]
+    known: list[list[FloatArray]] = [[] for _ in range(count)]
+    weights, wholes = np.zeros(count), np.zeros(count)
+    for (excitation, _), (columns, payloads) in zip(runs, whitened, strict=True):
+        motion = excitation.motion
+        still = np.zeros_like(motion.position_rad)
+        static = design.whitened(Excitation(Motion(motion.position_rad, still, still), excitation.use))
+        weights += np.einsum("nck,nck->n", static[:, -10:], static[:, -10:])
+        wholes += np.einsum("nck,nck->n", columns[:, -10:], columns[:, -10:])
+        for payload in payloads:
+            rest = design.others_of(columns, payload)
+            mounted = np.zeros(columns.shape[1]) if payload is None else design.known(payload)
+            gravity = np.einsum("nck,c->nk", static, mounted)
+            inertia = np.einsum("nck,c->nk", columns, mounted) - gravity
+            for motor in range(count):
+                others[motor].append(rest[motor])
+                known[motor].append(np.stack((gravity[motor], inertia[motor]), axis=1))
+    acts = (weights > 1e-12 * wholes).tolist()
+    alone = [_beside(np.concatenate(o), np.concatenate(k)) for o, k in zip(others, known, strict=True)]
+    return [(gravity, inertia, act) for (gravity, inertia), act in zip(alone, acts, strict=True)]
+
+
+def _beside(others: FloatArray, known: FloatArray) -> tuple[float, float]:
+    """100 over the norm of what is left of each of two columns beside others; inf where nothing is left."""
+    norms = np.linalg.norm(others, axis=0)
+    used = others[:, norms > 0.0] / norms[norms > 0.0]
+    left = known - used @ np.linalg.lstsq(used, known, rcond=1e-9)[0] if used.shape[1] else known
+    before, after = np.linalg.norm(known, axis=0), np.linalg.norm(left, axis=0)
+    seen = after > 1e-6 * np.maximum(before.max(), 1e-300)
+    with np.errstate(divide="ignore"):
+        gravity, inertia = np.where(seen, 100.0 / after, np.inf).tolist()
+    return gravity, inertia

@@ -1,0 +1,560 @@
+"""`drivegain apply` and `drivegain rollback`, as a person uses them, on a copy of the demo cell."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shlex
+import shutil
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.cli.apply import entered_masses, tightened
+from daq.config.cell_file import load_cell
+from daq.config.policy import ApplyPolicy
+from daq.environment import login
+from daq.errors import ExitCode, UsageError
+from daq.files import sha256
+from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger.judgement import Known
+from daq.ledger.store import HistoryStore
+from daq.report.proposal import significant
+from daq.workflow.calibration_file import decode, save
+from daq.writeback.gates.target import GainChange
+from ident.drift.change import DISPERSION
+from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A cell of one's own, and a calibration of it that was recorded just now."""
+
+    cell: Path
+    controller: Path
+    calibration: Path
+
+    @property
+    def audit(self) -> Path:
+        """Of the cell."""
+        return self.cell.with_name("cell.audit.jsonl")
+
+    def apply(self, *options: str) -> int:
+        """The command."""
+        return main(["apply", str(self.calibration), "--cell", str(self.cell), *options])
+
+    def rollback(self, *options: str) -> int:
+        """The command."""
+        return main(["rollback", "--cell", str(self.cell), *options])
+
+    def actions(self) -> list[AuditAction]:
+        """What was written down; the chain holds."""
+        verdict = verify(self.audit)
+        assert verdict.holds
+        assert verdict.open_writes == ()
+        return [entry.action for entry in verdict.entries]
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    """In folders with blanks in their names."""
+    cells, controllers = tmp_path / "the cells", tmp_path / "controllers"
+    cells.mkdir()
+    controllers.mkdir()
+    text = (CONFIGS / "cells" / "demo.yaml").read_text().replace("../robots", str(CONFIGS / "robots"))
+    cell = cells / "cell.yaml"
+    cell.write_text(text)
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
+    calibration = recorded(demo_calibration(), datetime.now(UTC))
+    save(replace(calibration, configuration_sha256=load_cell(cell).digest), tmp_path / "calibration.yaml")
+    return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
+
+
+def test_a_dry_run_is_a_table_a_diff_and_no_trace(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply() == ExitCode.OK
+    shown = capsys.readouterr().out
+    fourth = next(line for line in shown.splitlines() if line.startswith("J4"))
+    # Old, new ± σ, σ %, change %, change in σ with its mark, nameplate, distance from it.
+    assert " ".join(fourth.split()) == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
+    assert "+    gain: -9.2100" in shown
+    assert "nothing was written" in shown
+    assert bench.controller.read_bytes() == before
+    assert not bench.audit.exists()
+
+
+def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--json") == ExitCode.OK
+    dry = json.loads(capsys.readouterr().out)
+    assert (dry["applied"], dry["refusals"], dry["backup"]) == (False, [], None)
+    assert [change["axis"] for change in dry["changes"]] == list(AXES)
+    assert all(change["significant"] for change in dry["changes"])
+
+    assert bench.apply("--yes", "--base", "0" * 64) == ExitCode.CALIBRATION_REFUSED
+    assert "--base" in capsys.readouterr().err
+    assert bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
+    outcome = capsys.readouterr()
+    assert {refusal["gate"] for refusal in json.loads(outcome.out)["refusals"]} == {"change"}
+    assert "J4" in outcome.err
+    assert bench.controller.read_bytes() == before
+    assert bench.actions() == [AuditAction.REFUSED] * 2
+
+    assert bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada") == ExitCode.OK
+    undo = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("To undo: drivegain "))
+    assert undo == ["rollback", "--cell", str(bench.cell)]
+    assert b"-9.2100" in bench.controller.read_bytes()
+
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "these gains already" in capsys.readouterr().out
+
+    assert main(undo) == ExitCode.OK
+    assert "Restored" in capsys.readouterr().out
+    assert bench.controller.read_bytes() == before
+    there, back = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED], [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
+    assert read(bench.audit)[2].who == f"Ada (login {login()})"
+    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+        assert [event.target for event in store.events()] == [str(bench.controller)] * 2
+
+
+def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes") == ExitCode.OK
+    begun, applied = read(bench.audit)
+    assert (begun.action, begun.who, begun.subject) == (
+        AuditAction.APPLY_BEGUN,
+        login(),
+        str(bench.controller),
+    )
+    assert applied.details == {"begun": begun.number}
+    digests = demo_calibration().sources
+    logs = begun.details["logs"]
+    assert isinstance(logs, list)
+    assert [(log["name"], log["sha256"]) for log in logs] == [(one.name, one.sha256) for one in digests]
+    changes = begun.details["changes"]
+    assert isinstance(changes, list)
+    assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == ("J4", -11.52, -9.21)
+    told = begun.details["calibration"]
+    assert isinstance(told, dict)
+    assert told["file"] == str(bench.calibration)
+    assert begun.details["sha256_before"] != begun.details["sha256_after"]
+    assert len(bench.controller.read_bytes()) != len(before)
+
+
+def test_another_configuration_is_refused_until_somebody_says_so(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "# changed\n")
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--configuration-changed" in capsys.readouterr().err
+    assert bench.apply("--yes", "--configuration-changed") == ExitCode.OK
+
+
+def test_the_mass_may_be_entered_at_the_write_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    once = with_recordings(recorded(demo_calibration(), datetime.now(UTC)), entered_kg=None)
+    save(replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration)
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--payload-mass disc=KG" in capsys.readouterr().err
+    assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
+    assert bench.apply("--yes", "--payload-mass", "disc") == ExitCode.USAGE
+    assert bench.apply("--yes", "--payload-mass", "disc=4.592") == ExitCode.OK
+
+
+@pytest.mark.parametrize(
+    "text", ["disc", "disc=", "disc=-1", "disc=nan", "disc=inf", "=4.59", "block=4.59", "disc=1=2"]
+)
+def test_what_is_no_mass_of_a_payload_is_refused(text: str) -> None:
+    with pytest.raises(UsageError):
+        entered_masses([text], demo_calibration())
+
+
+def test_options_may_be_tighter_than_the_cell_and_not_wider(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = ApplyPolicy(max_change_percent=20.0)
+    assert tightened(policy, None, 40.0, None) == replace(policy, max_nameplate_percent=40.0)
+    assert tightened(policy, 20.0, None, 0.5) == replace(policy, max_std_percent=0.5)
+    for asked in ((20.1, None, None), (None, 51.0, None), (None, None, 3.1)):
+        with pytest.raises(UsageError, match="wider than the cell's"):
+            tightened(policy, *asked)
+    assert bench.apply("--max-change-percent", "36") == ExitCode.USAGE
+    assert "policy: {apply: {max_change_percent: ...}}" in capsys.readouterr().err
+
+
+def test_the_cell_s_policy_is_the_bound(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {max_change_percent: 15}}\n")
+    assert bench.apply("--configuration-changed", "--json") == ExitCode.CALIBRATION_REFUSED
+    refusals = json.loads(capsys.readouterr().out)["refusals"]
+    assert [(one["gate"], one["subject"]) for one in refusals] == [("change", "J4")]
+
+
+def test_a_policy_that_wants_more_signatures_than_it_names_is_refused(bench: Bench) -> None:
+    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {signatures: 1}}\n")
+    assert bench.apply() == ExitCode.CONFIGURATION
+
+
+def test_a_rollback_without_a_cell_says_that_it_is_not_written_down(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
+    assert "Not written down" in capsys.readouterr().out
+    audit = tmp_path / "elsewhere.jsonl"
+    assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
+    assert "Not written down" not in capsys.readouterr().out
+    assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert main(["rollback"]) == ExitCode.USAGE
+
+
+def test_without_room_for_the_audit_nothing_is_written(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes()
+    os.mkfifo(bench.audit)
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "the cell's audit, a regular file" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
+    assert not list(bench.controller.parent.glob("*.bak"))
+
+
+def test_nobody_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
+    other = tmp_path / "other.jsonl"
+    assert bench.apply("--yes", "--audit", str(other)) == ExitCode.USAGE
+    assert bench.apply("--yes") == ExitCode.OK
+    assert bench.rollback("--audit", str(other)) == ExitCode.USAGE
+    assert not other.exists()
+    assert bench.actions() == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+
+
+@pytest.mark.parametrize("spoil", ["an end cut off", "one line cut", "emptied", "deleted"])
+def test_an_audit_that_lost_a_write_is_noticed(bench: Bench, capsys: pytest.CaptureFixture[str], spoil: str) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    lines = bench.audit.read_bytes().splitlines(keepends=True)
+    if spoil == "deleted":
+        bench.audit.unlink()
+    else:
+        kept = {"an end cut off": lines[0], "one line cut": lines[0][:40], "emptied": b""}[spoil]
+        bench.audit.write_bytes(kept)
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert "noted elsewhere" in capsys.readouterr().err
+
+
+def test_an_audit_that_lost_a_rollback_is_noticed(bench: Bench) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    written = bench.audit.read_bytes()
+    assert bench.rollback() == ExitCode.OK
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    bench.audit.write_bytes(written)
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+
+
+def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(bench: Bench) -> None:
+    shared = "\nhistory: {audit: shared.jsonl, store: %s.sqlite}\n"
+    other = bench.cell.with_name("other.yaml")
+    text = bench.cell.read_text()
+    bench.cell.write_text(text + shared % "one")
+    other.write_text(text.replace("name: demo", "name: other") + shared % "two")
+    for file, factor in ((bench.cell, 1.0), (other, 1.01)):
+        declared = load_cell(file)
+        made = recorded(demo_calibration(), datetime.now(UTC))
+        gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
+        save(replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains), bench.calibration)
+        base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
+        assert main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base]) == ExitCode.OK
+    for file in (bench.cell, other):
+        assert main(["history", str(file), "--verify"]) == ExitCode.OK
+    assert main(["rollback", "--cell", str(other)]) == ExitCode.OK
+    for file in (bench.cell, other):
+        assert main(["history", str(file), "--verify"]) == ExitCode.OK
+
+
+def test_a_dry_run_says_that_the_history_cannot_be_read(
+    bench: Bench, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
+    assert bench.apply() == ExitCode.OK
+    assert "the history cannot be read" in caplog.text + capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["A\udcff", "A\x1b[31m", "A\u202e"])
+def test_a_name_that_cannot_be_shown_is_no_name(bench: Bench, name: str) -> None:
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes", "--by", name) == ExitCode.USAGE
+    assert bench.controller.read_bytes() == before
+
+
+def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("daq.cli.apply.tell_history", killed)
+        assert bench.apply("--yes") == ExitCode.INTERRUPTED
+    assert b"-9.2100" in bench.controller.read_bytes()
+    capsys.readouterr()
+    for _ in range(2):
+        assert bench.apply("--yes") == ExitCode.OK
+        assert "these gains already" in capsys.readouterr().out
+        with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+            assert store.in_force(str(bench.controller)) == store.entries()[0].digest
+            assert len(store.events()) == 1
+            assert store.audited() == {read(bench.audit)[1].sha256}
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    assert bench.rollback() == ExitCode.OK
+    assert bench.rollback() == ExitCode.OK
+    with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
+        assert store.in_force(str(bench.controller)) == store.entries()[0].digest
+
+
+def test_a_dry_run_of_what_stands_there_already_tells_the_history_nothing(bench: Bench) -> None:
+    bench.controller.write_bytes(bench.controller.read_bytes())
+    assert bench.apply() == ExitCode.OK
+    assert not bench.cell.with_name("cell.history.sqlite").exists()
+
+
+def test_a_history_that_is_none_does_not_make_a_write_undone(
+    bench: Bench, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert b"-9.2100" in bench.controller.read_bytes()
+
+
+def _change(axis: str, old: float, new: float, std: float) -> GainChange:
+    return GainChange(axis, axis, 1, old, new, std, "Nm/A", old, "")
+
+
+def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
+    large = _change("J1", 30.0, 33.0, 3.0)  # 10 %, 1 σ
+    small = _change("J2", 30.0, 30.3, 0.03)  # 1 %, 10 σ
+    broken = _change("J3", 30.0, float("nan"), 0.1)
+    assert significant((large, small, broken)) == {"J2"}
+    assert significant((broken,)) == frozenset()
+    # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
+    middle = _change("J4", 10.0, 10.25, 0.07)
+    assert significant((middle,)) == {"J4"}
+    assert significant((middle,), Known({"J4": 0.07})) == frozenset()
+
+
+def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fourth() -> dict[str, object]:
+        capsys.readouterr()
+        assert bench.apply("--json") == ExitCode.OK
+        found: dict[str, object] = json.loads(capsys.readouterr().out)["changes"][3]
+        return found
+
+    assert fourth()["change_sigmas"] == pytest.approx(2.31 / (DISPERSION * 0.03684))  # entered by hand: exact
+    assert bench.apply("--yes") == ExitCode.OK
+    known = decode(bench.calibration.read_bytes(), "")
+    gain = known.gains[3]
+    moved = replace(gain, value=gain.value * 1.015)
+    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    found = fourth()
+    assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01)
+    assert found["significant"] is False  # 3.7 σ would be, were the number exact
+    assert bench.apply() == ExitCode.OK
+    assert "σ of both" in capsys.readouterr().out
+
+
+def _told_base(shown: str) -> str:
+    """What the dry run says to repeat."""
+    return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
+
+
+def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, fitted = bench.controller.read_bytes(), bench.calibration.read_bytes()
+    assert bench.apply() == ExitCode.OK
+    base = _told_base(capsys.readouterr().out)
+    assert bench.apply("--json") == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["base"] == base
+    # Another calibration under the same name.
+    known = decode(fitted, "")
+    moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
+    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert "the keys or the factors have changed since the dry run" in " ".join(capsys.readouterr().err.split())
+    assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert _told_base(capsys.readouterr().out) != base
+    bench.calibration.write_bytes(fitted)
+    # Other keys in the cell: the gains of J1 and J2 exchanged.
+    cell = bench.cell.read_text()
+    swapped = cell.replace("[drives.J1.gain, drives.J2.gain,", "[drives.J2.gain, drives.J1.gain,")
+    assert swapped != cell
+    bench.cell.write_text(swapped)
+    assert bench.apply("--yes", "--base", base, "--configuration-changed") == ExitCode.CALIBRATION_REFUSED
+    bench.cell.write_text(cell)
+    # Another file.
+    bench.controller.write_bytes(before + b"# seen by K.\n")
+    assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
+    assert "as --base says" in " ".join(capsys.readouterr().err.split())
+    bench.controller.write_bytes(before)
+    assert not list(bench.controller.parent.glob("*.bak"))
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    (backup,) = bench.controller.parent.glob("*.bak")
+    assert f".{base}.bak" in backup.name
+    # Asked for once more, what it wants is there already.
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    for wrong in ("abc", base[:-1], base.replace("-", "_"), "x" * 64):
+        assert bench.apply("--yes", "--base", wrong) == ExitCode.USAGE
+
+
+def test_a_dry_run_of_a_file_that_changed_since_the_recording_tells_the_way_on(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = decode(bench.calibration.read_bytes(), "")
+    digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
+    save(with_recordings(known, controller_sha256=digest), bench.calibration)
+    bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert "--base" not in capsys.readouterr().out
+    assert bench.apply() == ExitCode.CALIBRATION_REFUSED
+    base = _told_base(capsys.readouterr().out)
+    assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
+    assert "--yes" not in capsys.readouterr().out  # another gate is closed
+    assert bench.apply("--yes", "--base", base) == ExitCode.OK
+    capsys.readouterr()
+    # The file is another one than at the recording, by this very write.
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "these gains already" in capsys.readouterr().out
+    assert bench.actions()[-1] is AuditAction.NOTHING_TO_DO
+    assert bench.apply() == ExitCode.OK
+    assert bench.actions().count(AuditAction.NOTHING_TO_DO) == 1
+    assert bench.apply("--configuration-changed", "--max-std-percent", "0.01") == ExitCode.CALIBRATION_REFUSED
+
+
+@pytest.mark.parametrize("place", ["controller", "cell", "calibration", "store", "notes"])
+@pytest.mark.parametrize("refused", [False, True])
+def test_no_other_file_becomes_an_audit(
+    bench: Bench, capsys: pytest.CaptureFixture[str], place: str, refused: bool
+) -> None:
+    notes, store = bench.cell.with_name("notes.txt"), bench.cell.with_name("cell.history.sqlite")
+    notes.write_text("the robot was moved\non Monday\n")
+    audit = {"store": store, "notes": notes}.get(place) or getattr(bench, place)
+    bench.cell.write_text(
+        bench.cell.read_text() + f"history: {{store: {json.dumps(str(store))}, audit: {json.dumps(str(audit))}}}\n"
+    )
+    paths = [bench.controller, bench.cell, bench.calibration, notes]
+    before = [path.read_bytes() for path in paths]
+    strict = ["--max-change-percent", "1"] if refused else []
+    assert bench.apply("--yes", "--configuration-changed", *strict) != ExitCode.OK
+    assert [path.read_bytes() for path in paths] == before
+    assert not store.exists()
+    if not refused:
+        assert "audit" in capsys.readouterr().err
+
+
+def test_a_rollback_writes_into_no_other_file(bench: Bench) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    link = bench.controller.with_name("audit.jsonl")
+    link.hardlink_to(bench.cell)
+    cell, written = bench.cell.read_bytes(), bench.controller.read_bytes()
+    for audit in (bench.controller, link):
+        assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
+    assert (bench.cell.read_bytes(), bench.controller.read_bytes()) == (cell, written)
+
+
+def test_whatever_the_history_does_a_write_is_not_called_undone(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise UnicodeEncodeError("utf-8", "\udcff", 0, 1, "surrogates not allowed")
+
+    monkeypatch.setattr(HistoryStore, "add", broken)
+    assert bench.apply("--yes") == ExitCode.OK
+    assert "the history does not know of this" in caplog.text + capsys.readouterr().err
+    assert b"-9.2100" in bench.controller.read_bytes()
+
+
+def _linked(bench: Bench, target: Path) -> None:
+    """Move the controller's file there; the cell file's name of it becomes a symbolic link."""
+    target.parent.mkdir(exist_ok=True)
+    bench.controller.rename(target)
+    bench.controller.symlink_to(target)
+
+
+def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    before = bench.controller.read_bytes() if bench.controller.exists() else b""
+    capsys.readouterr()
+    for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
+        assert code == ExitCode.CALIBRATION_REFUSED
+    told = " ".join(capsys.readouterr().err.split())
+    assert told.count(found) == 3
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.CALIBRATION_REFUSED
+    assert found in " ".join(capsys.readouterr().err.split())
+    assert before == (bench.controller.read_bytes() if bench.controller.exists() else b"")
+
+
+def test_a_link_of_the_cell_file_into_a_folder_that_everybody_may_write_is_refused(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _linked(bench, tmp_path / "open" / "gains.yaml")
+    assert bench.apply("--yes") == ExitCode.OK
+    (tmp_path / "open").chmod(0o777)
+    _all_refused(bench, "everybody may write", capsys)
+
+
+def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench.controller.parent.rename(tmp_path / "open")
+    bench.controller.parent.symlink_to(tmp_path / "open")
+    assert bench.apply("--yes") == ExitCode.OK
+    (tmp_path / "open").chmod(0o777)
+    _all_refused(bench, "everybody may write", capsys)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+@pytest.mark.parametrize("folder", [False, True], ids=["file", "folder"])
+@pytest.mark.parametrize("behind", [False, True], ids=["named", "behind one's own"])
+def test_a_stranger_s_link_of_the_cell_file_is_refused(
+    bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    link = bench.controller.parent if folder else bench.controller
+    moved, alias = tmp_path / "moved", tmp_path / "alias"
+    link.rename(moved)
+    if behind:
+        alias.symlink_to(moved)
+        link.symlink_to(alias)
+    else:
+        link.symlink_to(moved)
+    assert bench.apply("--yes") == ExitCode.OK
+    os.lchown(alias if behind else link, 4711, 4711)
+    _all_refused(bench, "user 4711 has made", capsys)
+    (moved / "demo.yaml" if folder else moved).unlink()  # a rollback would bring it back, there
+    _all_refused(bench, "user 4711 has made", capsys)
+
+
+def test_links_of_the_cell_file_in_a_circle_are_called_so(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.controller.unlink()
+    bench.controller.symlink_to(bench.controller)
+    _all_refused(bench, "round in a circle", capsys)
+
+
+def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_behind_it(
+    bench: Bench, tmp_path: Path
+) -> None:
+    """So do those of earlier versions, which never saw the link: they go on to match."""
+    target = tmp_path / "elsewhere" / "gains.yaml"
+    _linked(bench, target)
+    before = target.read_bytes()
+    assert bench.apply("--yes") == ExitCode.OK
+    assert bench.rollback() == ExitCode.OK
+    assert bench.controller.is_symlink()
+    assert target.read_bytes() == before
+    assert {entry.subject for entry in read(bench.audit)} == {str(target)}
+    place = load_cell(bench.cell).history
+    assert place is not None
+    with HistoryStore(place.store) as store:
+        assert {event.target for event in store.events()} == {str(target)}
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK

@@ -1,0 +1,215 @@
+"""The command line itself: help, exit codes, JSON, and the verbs init and info."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from rich.console import Console
+
+from daq.cli import main
+from daq.cli.app import VERBS
+from daq.cli.terminal import say_written
+from daq.cli.verb import Listed, VerbGroup
+from daq.config.cell import Pacing
+from daq.config.cell_file import load_cell
+from daq.config.import_description import load_import
+from daq.errors import ExitCode
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.logs import DISC, START_NS, demo_content, samples, write
+
+
+@pytest.mark.parametrize("listed", VERBS, ids=[verb.name for verb in VERBS])
+def test_every_help_is_whole_and_ends_with_an_example_to_copy(
+    listed: Listed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb = listed.load()
+    assert verb.name == listed.name
+    kinds = verb.kinds if isinstance(verb, VerbGroup) else ()
+    for command in ([verb.name], *([verb.name, kind.name] for kind in kinds)):
+        assert main([*command, "--help"]) == 0
+        output = capsys.readouterr().out
+        shown = next((kind for kind in kinds if kind.name == command[-1]), verb)
+        assert shown.example.startswith("drivegain " + " ".join(command))
+        assert output.splitlines()[-1].strip() == shown.example
+        # Nothing of a help text is taken for markup: units stand in brackets.
+        told = _squeezed(output)
+        for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
+            (option,) = parameter.annotation.__metadata__
+            assert _squeezed(option.help) in told
+
+
+def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    for listed in VERBS:
+        assert f"{listed.name} {listed.summary}" in lines
+
+
+def test_a_unit_in_a_help_text_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scan", "--help"]) == 0
+    assert "How long to wait for answers [s]." in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recrod"]) == ExitCode.USAGE
+    assert "Did you mean 'record'?" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["init", "--help"]])
+def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) -> None:
+    heavy = ("matplotlib", "pinocchio", "numba", "scipy", "canopen")
+    code = (
+        f"import sys; import daq.cli.app; daq.cli.app.main({arguments!r});"
+        f"print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=checkout, check=True)
+    assert done.stderr == "[]\n"
+
+
+def test_what_was_written_is_told_line_by_line(tmp_path: Path) -> None:
+    out = io.StringIO()
+    (tmp_path / "[s] pictures").mkdir()
+    say_written(Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures")
+    assert out.getvalue().splitlines() == ["Written: cali\\x1b.yaml", f"Written: {tmp_path}/[s] pictures/"]
+
+
+def _squeezed(text: str) -> str:
+    """Without white space: where a line is broken is no matter."""
+    return "".join(text.split())
+
+
+@pytest.mark.parametrize("arguments", [["no-such-verb"], ["info"], ["info", "--no-such-option", "x"], ["import", "x"]])
+def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "Usage" in output.err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("drivegain ")
+
+
+@pytest.fixture
+def log(checkout: Path, tmp_path: Path) -> Path:
+    """A loaded run of the demo cell."""
+    events = (
+        CellEvent(START_NS, None, EventKind.MOVE_START, 1, ""),
+        CellEvent(START_NS, 2, EventKind.EMCY, 0x2310, "\x1b[2Jcurrent"),
+    )
+    return write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(500)]), events)
+
+
+def test_info_json_is_one_object_and_nothing_else(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(log), "--json"]) == 0
+    output = capsys.readouterr()
+    assert output.err == ""
+    found = json.loads(output.out)
+    assert (found["role"], found["payload"]["known"]) == ("loaded", {"m": 4.59})
+    assert (found["samples"], found["duration_s"], found["rate_hz"]) == (500, 0.5, 1000.0)
+    assert (found["moves"], found["lost_cycles"], found["valid"]) == (1, 0, True)
+    assert found["axes"] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    assert [event["code"] for event in found["events"]] == [0x2310]
+    assert len(found["sha256"]) == len(found["cell_sha256"]) == 64
+
+
+def test_info_as_text_cannot_command_the_terminal(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(log)]) == 0
+    text = capsys.readouterr().out
+    assert "loaded" in text
+    assert "\x1b" not in text
+    assert "\\x1b[2Jcurrent" in text
+
+
+def test_info_of_a_damaged_log_is_exit_code_4(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 1
+    log.write_bytes(data)
+    assert main(["info", str(log), "--json"]) == 4
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "checksum" in output.err
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_an_output_that_cannot_be_written_is_told(log: Path, checkout: Path, more: list[str]) -> None:
+    command = [sys.executable, "-m", "daq", "info", str(log), *more]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+    assert done.returncode == ExitCode.UNEXPECTED
+    assert "no space left" in done.stderr
+    assert not re.search("Traceback|Exception", done.stderr)
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_reader_that_has_seen_enough_is_no_error_to_tell(log: Path, checkout: Path, more: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        command = [sys.executable, "-m", "daq", "info", str(log), *more]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (ExitCode.UNEXPECTED, "")
+
+
+def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "new" / "press-4"
+    assert main(["init", str(folder)]) == 0
+    written = {Path(line) for line in capsys.readouterr().out.splitlines()}
+    assert written == {path for path in folder.rglob("*") if path.is_file()}
+    cell = load_cell(folder / "cells/press-4.yaml")
+    assert cell.name == "press-4"
+    assert [(bus.interface, bus.channel) for bus in cell.buses] == [("socketcan", "can0")]
+    assert cell.controller_path == folder / "controllers/press-4.yaml"
+    assert cell.controller_path.is_file()
+    assert load_import(folder / "imports/press-4.yaml").cell.resolve() == folder / "cells/press-4.yaml"
+    for path in folder.rglob("*.yaml"):
+        head = re.match(r"(#.*\n)+", path.read_text(encoding="utf-8"))
+        assert head, path
+        assert not re.search("simulated|TX-40|tx40", head[0])
+        assert path.parent.name == "drives" or "press-4" in head[0]
+    text = (folder / "cells/press-4.yaml").read_text(encoding="utf-8")
+    (axis, *_) = yaml.safe_load(text)["axes"]
+    explained = re.findall(r"^  #   (\w+) ", text, re.MULTILINE)
+    assert explained == list(axis)
+    assert [path.name for path in folder.parent.iterdir()] == ["press-4"]
+
+
+def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Path) -> None:
+    for folder, option in (("real", []), ("simulated", ["--simulated"])):
+        assert main(["init", str(tmp_path / folder / "press-4"), *option]) == 0
+    real, simulated = (tmp_path / folder / "press-4/cells/press-4.yaml" for folder in ("real", "simulated"))
+    cell = load_cell(simulated)
+    assert [(bus.interface, bus.channel, bus.host, bus.port) for bus in cell.buses] == [
+        ("socketcand", "can0", "127.0.0.1", 29536)
+    ]
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing.LOCKSTEP
+    one, other = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in (real, simulated))
+    assert {key for key in one if one[key] != other[key]} == {"bus", "sync"}
+
+
+def test_init_overwrites_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "press-4").mkdir()
+    (tmp_path / "press-4/notes.txt").write_text("mine", encoding="utf-8")
+    assert main(["init", str(tmp_path / "press-4")]) == 2
+    assert "something in it" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "press-4").iterdir()] == ["notes.txt"]
+
+
+def test_init_into_an_empty_folder(tmp_path: Path) -> None:
+    (tmp_path / "press-4").mkdir()
+    assert main(["init", str(tmp_path / "press-4")]) == 0
+    assert main(["init", str(tmp_path / "press-4")]) == 2
+    assert main(["init", str(tmp_path / "press 4;")]) == 2

@@ -1,0 +1,173 @@
+"""`drivegain apply --drives` and `rollback --drives`: what a person and a program are told."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+
+from daq.cli.rollback import rollback_drives
+from daq.cli.writing import saving_of
+from daq.config.cell import Cell
+from daq.errors import BusTaken, CalibrationRefused, UsageError
+from daq.ledger.audit import AuditAction, read
+from daq.ledger.store import HistoryStore
+from daq.workflow.calibration_file import encode
+from daq.workflow.safeguards import bus_lock
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.parameters import Saving
+from drivers.canopen.sdo import ObjectAccess
+from drivers.simulation.cell import SimulatedCell
+from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
+from tests.daq.drives import DOER, NOW, apply_in_drives, entered_gain, on_its_own_bus, saved_gain, simulated
+
+
+@pytest.fixture
+def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
+    return on_its_own_bus(tmp_path, request.node.name)
+
+
+@pytest.fixture
+def simulation(cell: Cell) -> Iterator[SimulatedCell]:
+    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+        yield running
+
+
+def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
+    assert cell.history is not None
+    rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
+
+
+def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
+    apply_in_drives(cell)
+    shown = capsys.readouterr().out
+    assert "in the drive" in shown
+    assert "node 4, 2003h:01: -11520 -> -9210" in shown
+    assert "Dry run, nothing was written." in shown
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    base = shown.split("--base ")[1].split()[0]
+
+    apply_in_drives(cell, yes=True, base=base)
+    told = capsys.readouterr().out
+    assert "Written to the drives and read back" in told
+    assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
+    apply_in_drives(cell)
+    assert "The drives have these gains already" in capsys.readouterr().out
+
+    _back(cell, yes=False)
+    told = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in told
+    assert "the write of 2025-01-02T03:04:05+00:00 by Kim (login kim)" in told
+    assert "Dry run, nothing was written." in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
+    _back(cell)
+    told = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in told
+    assert "The drives have saved." in told
+    assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    assert cell.history is not None
+    assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
+        (action, "Kim (login kim)", "drives of cell demo")
+        for action in (
+            AuditAction.APPLY_BEGUN,
+            AuditAction.APPLIED,
+            AuditAction.ROLLBACK_BEGUN,
+            AuditAction.ROLLED_BACK,
+        )
+    ]
+    evidence = read(cell.history.audit)[0].details
+    assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
+    assert evidence["calibration"] == {
+        "file": str(Path("calibration.yaml").absolute()),
+        "sha256": hashlib.sha256(encode(demo_calibration())).hexdigest(),
+        "cell": "demo",
+        "created": demo_calibration().created,
+        "software": demo_calibration().software,
+    }
+    with HistoryStore(cell.history.store) as store:
+        assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
+        assert store.in_force() is None
+        # The two entries that tell how the writes ended.
+        assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::2]}
+    _back(cell)
+    with HistoryStore(cell.history.store) as store:
+        assert store.in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_program_is_told_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
+    apply_in_drives(cell, as_json=True)
+    looked = json.loads(capsys.readouterr().out)
+    assert (looked["applied"], looked["refusals"]) == (False, [])
+    assert looked["changes"][3]["new"] == -9.21
+    apply_in_drives(cell, as_json=True, yes=True, saving=Saving.RAM)
+    written = json.loads(capsys.readouterr().out)
+    assert (written["applied"], written["saved"]) == (True, False)
+    assert written["base_sha256"] == looked["base_sha256"]
+    assert Path(written["record"]).is_file()
+    for yes in (False, True):
+        _back(cell, yes=yes, as_json=True)
+        told = json.loads(capsys.readouterr().out)
+        assert (told["source"], told["restored"]) == (written["record"], yes)
+        assert told["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
+
+
+@pytest.mark.parametrize("yes", [False, True])
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_closed_gate_is_told_and_nothing_written(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], yes: bool, as_json: bool
+) -> None:
+    calibration = demo_calibration()
+    far = replace(calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:]))
+    with pytest.raises(CalibrationRefused, match="J1: found σ"):
+        apply_in_drives(cell, calibration=far, yes=yes, as_json=as_json)
+    shown = capsys.readouterr().out
+    if as_json:
+        assert [one["gate"] for one in json.loads(shown)["refusals"]] == ["uncertainty"]
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+
+
+def test_an_interrupt_puts_back_what_was_written(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    check = ObjectAccess.read
+    reads = 0
+
+    def interrupted(access: ObjectAccess, entry: object) -> int:
+        nonlocal reads
+        value = check(access, entry)  # type: ignore[arg-type]
+        if access.node_id == 3 and value == 24200:
+            reads += 1
+            if reads == 1:
+                raise KeyboardInterrupt
+        return value
+
+    monkeypatch.setattr(ObjectAccess, "read", interrupted)
+    with pytest.raises(typer.Exit) as caught:
+        apply_in_drives(cell, yes=True)
+    assert caught.value.exit_code == 130
+    assert "interrupted: kept: the old values stand again in J1, J2, J3" in capsys.readouterr().err
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+
+
+@pytest.mark.usefixtures("simulation")
+def test_a_bus_that_somebody_else_has_is_left_alone(cell: Cell) -> None:
+    with bus_lock(cell), pytest.raises(BusTaken):
+        apply_in_drives(cell)
+    apply_in_drives(cell)
+
+
+def test_the_two_options_of_saving() -> None:
+    assert [saving_of(False, False), saving_of(True, False), saving_of(False, True)] == [
+        Saving.KNOWN,
+        Saving.RAM,
+        Saving.ANY,
+    ]
+    with pytest.raises(UsageError, match="one at most"):
+        saving_of(True, True)

@@ -1,0 +1,75 @@
+"""Signals that stop a recording."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from daq.cli.record import _interrupted
+from daq.cli.terminal import GRACE_S, SIGNALS, interruptible
+from drivers.errors import DriveFault
+
+
+def test_signals_that_were_ignored_from_birth_are_heard_and_others_left_alone() -> None:
+    """A script's & starts its commands deaf to SIGINT."""
+    deaf = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    hangup = signal.getsignal(signal.SIGHUP)
+    try:
+        with interruptible(signals=(signal.SIGINT, signal.SIGTERM)):
+            assert signal.getsignal(signal.SIGHUP) == hangup
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, deaf)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_interrupts_once_and_again_after_the_stop_had_its_time(number: signal.Signals) -> None:
+    before = [signal.getsignal(each) for each in SIGNALS]
+    now_s = 100.0
+    with interruptible(lambda: now_s):
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+        now_s += GRACE_S / 2
+        for impatient in SIGNALS:
+            signal.raise_signal(impatient)
+        now_s += GRACE_S
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+    assert [signal.getsignal(each) for each in SIGNALS] == before
+
+
+def test_what_must_not_be_disturbed_is_not_for_as_long_as_a_stop_takes() -> None:
+    now_s = 100.0
+    with interruptible(lambda: now_s) as undisturbed:
+        with undisturbed():
+            signal.raise_signal(signal.SIGINT)  # the first of all: a fault began this stop
+            now_s += GRACE_S / 2
+            signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        now_s += GRACE_S + 1
+        with undisturbed():
+            now_s += GRACE_S
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)  # nobody is left without a way out
+
+
+def test_what_is_not_known_to_stand_is_not_said_to() -> None:
+    out = Path("run.mcap")
+    assert "axes stopped" in _interrupted(KeyboardInterrupt(), None, out)
+    fault = DriveFault(3, "EMCY 7305h")
+    fault.add_note("while stopping: node 2 does not answer")
+    cut = KeyboardInterrupt()
+    cut.__context__ = ValueError("in between")
+    cut.__context__.__context__ = fault
+    said = _interrupted(cut, None, out)
+    assert "NOT ALL AXES ARE KNOWN TO STAND" in said
+    assert "EMCY 7305h" in said
+    assert "node 2 does not answer" in said
+    harmless = KeyboardInterrupt()
+    harmless.__context__ = BlockingIOError()
+    assert "axes stopped" in _interrupted(harmless, None, out)

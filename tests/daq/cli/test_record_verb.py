@@ -1,0 +1,115 @@
+"""What `drivegain record` says when a recording fails, and before it begins."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+from daq.log.metadata import RunStatistics
+from daq.workflow.record import Recorded
+from drivers.errors import DriverError, HeartbeatLost, SampleLost
+from drivers.stream.stream import StreamStatistics
+
+
+@pytest.fixture
+def cells(tmp_path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Cell files by pacing; any plan will do."""
+    monkeypatch.setattr("daq.cli.record.load_plan", lambda *_: None)
+    monkeypatch.setattr("daq.cli.record.slowed", lambda *_: None)
+    folder = tmp_path / "cells"
+    folder.mkdir()
+    text = (checkout / "configs/cells/demo.yaml").read_text().replace("../robots", str(checkout / "configs/robots"))
+    for pacing in ("lockstep", "timed"):
+        (folder / f"{pacing}.yaml").write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
+    return {pacing: str(folder / f"{pacing}.yaml") for pacing in ("lockstep", "timed")}
+
+
+def _failing(error: DriverError, part: Path | None) -> object:
+    def record(*_: object, **__: object) -> NoReturn:
+        if part is not None:
+            part.touch()
+        raise error
+
+    return record
+
+
+@pytest.mark.parametrize(
+    ("valid", "code", "said"),
+    [(True, ExitCode.OK, "complete"), (False, ExitCode.DATA_UNFIT, "INVALID: 2 missing answers; a fit will refuse it")],
+)
+def test_a_recording_with_losses_is_told_of_and_is_no_success(
+    cells: dict[str, str],
+    valid: bool,
+    code: ExitCode,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    counted = RunStatistics(1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers")
+    monkeypatch.setattr(
+        "daq.cli.record.record", lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics())
+    )
+    command = ["record", cells["lockstep"], "plan.yaml", "--out", str(tmp_path / "a.mcap"), "--enable-motion"]
+    assert main(command) == code
+    assert said in capsys.readouterr().out
+    assert main([*command, "--json"]) == code
+    assert json.loads(capsys.readouterr().out)["valid"] is valid
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "my run.mcap"])
+def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_way(
+    cells: dict[str, str],
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out, part = tmp_path / name, tmp_path / f"{name}.part"
+    command = ["record", cells["lockstep"], "plan.yaml", "--out", str(out), "--enable-motion"]
+    monkeypatch.setattr("daq.cli.record.record", _failing(HeartbeatLost(3, 0.5), part))
+    assert main(command) == ExitCode.DEVICE_FAULT
+    first = " ".join(capsys.readouterr().err.split())
+    assert f"kept: what was recorded until then is in {part}" in first
+    # The second attempt does not even reach the bus.
+    monkeypatch.setattr("daq.cli.record.record", lambda *_, **__: pytest.fail("the recording began"))
+    assert main(command) == ExitCode.USAGE
+    second = " ".join(capsys.readouterr().err.split())
+    assert "the rest of a recording" in second
+    for told in (first, second):
+        assert f"`rm {shlex.quote(str(part))}`" in told
+        assert f"`mv {shlex.quote(str(part))} " in told
+        assert f"`drivegain salvage {shlex.quote(str(part))} --out " in told
+        assert "choose another --out" in told
+
+
+@pytest.mark.parametrize(
+    ("pacing", "error", "hinted"),
+    [
+        ("timed", SampleLost(7, (0,)), True),
+        ("lockstep", SampleLost(7, (0,)), False),
+        ("timed", HeartbeatLost(3, 0.5), False),
+    ],
+)
+def test_a_lost_sample_with_a_timed_pacing_names_lockstep(
+    cells: dict[str, str],
+    pacing: str,
+    error: DriverError,
+    hinted: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("daq.cli.record.record", _failing(error, None))
+    command = ["record", cells[pacing], "plan.yaml", "--out", str(tmp_path / "run.mcap")]
+    assert main(command) == ExitCode.DEVICE_FAULT
+    told = " ".join(capsys.readouterr().err.split())
+    assert ("hint:" in told) is hinted
+    assert ("`sync.pacing: lockstep`" in told) is hinted
+    assert "kept:" not in told

@@ -1,0 +1,135 @@
+"""What `drivegain scan` makes of the nodes that it found."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from daq.cli import main
+from daq.cli.scan import scan_rows, scan_table
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import bundle, cell_from_bundle, load_cell
+from daq.errors import ExitCode
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.canopen.bus import open_bus
+from drivers.canopen.scan import FoundNode
+from drivers.profiles.profile import Identity
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import ErrorCode, PowerState
+from tests.two_buses import on_two_buses
+
+
+@pytest.fixture(scope="module")
+def cell(checkout: Path) -> Cell:
+    """The demo cell."""
+    return load_cell(checkout / "configs/cells/demo.yaml")
+
+
+def _node(node_id: int, statusword: int | None, serial: int | None = None) -> FoundNode:
+    identity = Identity(0x29A, 0x40200, 1000 + node_id if serial is None else serial)
+    return FoundNode(node_id, identity, 1, "drive", 0x7F, statusword)
+
+
+def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
+    out = io.StringIO()
+    Console(file=out, width=width, soft_wrap=True).print(scan_table(scan_rows(cell, nodes, "demo"), width))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("statusword", "enabled"),
+    [
+        (0x0237, True),  # operation enabled
+        (0x0217, True),  # quick stop active: the motor is braked under power
+        (0x020F, True),  # fault reaction active
+        (0x0233, False),  # switched on
+        (0x0231, False),
+        (0x0250, False),
+        (0x0208, False),
+        (None, None),
+    ],
+)
+def test_an_enabled_axis_is_shouted(cell: Cell, statusword: int | None, enabled: bool | None) -> None:
+    nodes = (_node(1, 0x250), _node(2, statusword))
+    rows = scan_rows(cell, nodes, "demo")
+    assert [row["enabled"] for row in rows] == [False, enabled, None, None, None, None]
+    in_fault = statusword in {0x0208, 0x020F}
+    assert [row["in_fault"] for row in rows] == [False, in_fault, *[False] * 4]
+    assert [row["verdict"] for row in rows] == ["ok", "in fault" if in_fault else "ok", *["missing"] * 4]
+    for width in (40, 80, 200):
+        text = _shown(cell, nodes, width)
+        assert ("ENABLED" in text) is bool(enabled)
+        assert "…" not in text
+
+
+def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> None:
+    nodes = tuple(_node(number, 0x237) for number in range(1, 7))
+    for width in (50, 80, 200):
+        lines = _shown(cell, nodes, width).splitlines()
+        assert max(cell_len(line.rstrip()) for line in lines) <= width
+        assert sum("ENABLED" in line for line in lines) == 6
+
+
+def test_identity_and_power_are_told_apart(cell: Cell) -> None:
+    (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
+    assert (row["verdict"], row["enabled"]) == ("other identity", True)
+
+
+def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:
+    (row, *_) = scan_rows(cell, (_node(1, 0x208, serial=9),), "demo")
+    assert row["verdict"] == "other identity, in fault"
+
+
+def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
+    checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = str(checkout / "configs/cells/demo.yaml")
+    spec = load_simulation(shipped_simulation("clean"))
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
+        simulated.nodes[2].drive.fail(ErrorCode.FOLLOWING_ERROR)
+        assert main(["scan", file]) == ExitCode.OK
+        shown = capsys.readouterr().out
+        assert "in fault" in shown
+        assert "--reset-faults" in shown
+        assert simulated.nodes[2].drive.state is PowerState.FAULT
+        assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
+        told = json.loads(capsys.readouterr().out)
+        assert told["reset"] == ["J3"]
+        assert [node["verdict"] for node in told["nodes"]] == ["ok"] * 6
+        assert [node.drive.state for node in simulated.nodes] == [PowerState.SWITCH_ON_DISABLED] * 6
+        # Asked of a cell without a fault it does nothing.
+        assert main(["scan", file, "--reset-faults"]) == ExitCode.OK
+        assert "was reset" not in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def two(checkout: Path) -> Cell:
+    """The demo cell on two buses."""
+    files = bundle(checkout / "configs/cells/demo.yaml")
+    text = on_two_buses(files["cell.yaml"].decode(), "virtual", "a", "b")
+    return cell_from_bundle({**files, "cell.yaml": text.encode()})
+
+
+def test_a_node_is_told_where_it_is_and_where_it_belongs(two: Cell) -> None:
+    left = scan_rows(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
+    assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in left] == [
+        ("left", 1, "J1", "ok"),
+        ("left", 2, "J2", "ok"),
+        ("left", 3, "J3", "missing"),
+        ("left", 4, None, "belongs on right"),
+        ("left", 9, None, "not configured"),
+    ]
+    right = scan_rows(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
+    assert [row["verdict"] for row in right] == ["ok"] * 3
+    out = io.StringIO()
+    Console(file=out, width=50, soft_wrap=True).print(scan_table(left + right, 50, several=True))
+    heading, _, *lines = out.getvalue().splitlines()
+    assert heading.split()[:2] == ["bus", "node"]
+    assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3
+    assert "belongs on right" in out.getvalue()

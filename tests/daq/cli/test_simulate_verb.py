@@ -1,0 +1,95 @@
+"""What `drivegain simulate` makes of its buses, and what it says to put into a cell file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import daq.simulation.simulation_file
+from daq.cli.app import main
+from daq.cli.simulate import how_to_reach, nodes_on_buses
+from daq.errors import UsageError
+from drivers.canopen.bus import BusAddress
+from drivers.stream.split_bus import BusPart
+
+
+def test_each_bus_has_its_nodes() -> None:
+    there = nodes_on_buses(("can0=1,2,3", "can1=4,5"), (1, 2, 3, 4, 5))
+    assert there == {"can0": frozenset((1, 2, 3)), "can1": frozenset((4, 5))}
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        (("can0=1,2", "can1=3"), "node 1, 2, 3; expected: each node of the cell once: 1, 2, 3, 4"),
+        (("can0=1,2", "can1=2,3,4"), "node 1, 2, 2, 3, 4"),
+        (("can0=1,2", "can1=3,4,9"), "node 1, 2, 3, 4, 9"),
+        (("can0=1,2", "can0=3,4"), "--bus can0=3,4"),
+        (("can0=1,2", "can1"), "--bus can1"),
+        (("can0=1,2", "=3,4"), "--bus =3,4"),
+        (("can0=1,2", "can1=3,x"), "--bus can1=3,x"),
+        (("can0=1,2", "can1=3,,4"), "--bus can1=3,,4"),
+        (("can0=1,2", "can1=3-4"), "--bus can1=3-4"),
+    ],
+)
+def test_what_is_said_wrongly_of_a_bus_is_refused(said: tuple[str, ...], message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        nodes_on_buses(said, (1, 2, 3, 4))
+    assert message in f"{caught.value.subject} {caught.value.found}; expected: {caught.value.expected}"
+
+
+def test_the_part_of_a_cell_file_can_be_pasted() -> None:
+    nodes = frozenset((1, 2)), frozenset((3,))
+    hub = tuple(
+        BusPart(name, BusAddress("socketcand", name, port=4000), some)
+        for name, some in zip(("can0", "can1"), nodes, strict=True)
+    )
+    _, pasted, axes, _ = how_to_reach(hub, 2000).split("\n\n")
+    keys = {"interface": "socketcand", "host": "127.0.0.1", "port": 4000, "bitrate_bit_s": 1_000_000}
+    assert yaml.safe_load(pasted) == {
+        "bus": [{"name": name, "channel": name, **keys} for name in ("can0", "can1")],
+        "sync": {"period_us": 2000, "pacing": "lockstep"},
+    }
+    assert axes.splitlines() == ["axes with node_id 1, 2: add bus: can0", "axes with node_id 3: add bus: can1"]
+    one = BusPart("can0", BusAddress("socketcan", "can0"), frozenset())
+    _, pasted, _ = how_to_reach((one,), 1000).split("\n\n")
+    assert yaml.safe_load(pasted) == {
+        "bus": {"interface": "socketcan", "channel": "can0", "bitrate_bit_s": 1_000_000},
+        "sync": {"period_us": 1000, "pacing": "timed"},
+    }
+
+
+@pytest.mark.parametrize("verb", [["simulate", "demo"], ["demo", "--out", "made"]])
+@pytest.mark.parametrize("package", ["numba", "pinocchio"])
+def test_without_its_packages_the_extra_is_named(
+    verb: list[str],
+    package: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(daq.simulation.simulation_file, "find_spec", lambda name: None if name == package else object())
+    assert main(verb) == 6
+    said = capsys.readouterr().err
+    assert f"no package {package}" in said
+    assert "pip install 'drivegain[simulation]'" in said
+    assert not (tmp_path / "made").exists()
+
+
+def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
+    """Their help and what they do to a real cell need no package of the extra."""
+    code = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(('numba', 'pinocchio', 'llvmlite'), None))\n"
+        "import ident.clearance, ident.nominal, ident.physical\n"
+        "from daq.cli.app import VERBS\n"
+        "print(len([listed.load() for listed in VERBS]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 20

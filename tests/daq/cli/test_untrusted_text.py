@@ -1,0 +1,132 @@
+"""Text and numbers from a file that somebody made: in tables, pictures and on the terminal they are only shown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import warnings
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from daq.jobs.cell_fit import Failure
+from daq.jobs.fleet import FleetRow
+from daq.jobs.fleet_survey import Summary
+from daq.ledger.store import HistoryStore
+from daq.ledger.watch import Series, watch
+from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
+from daq.report.history import csv_text, plot_history
+from daq.report.proposal import show
+from daq.report.text import inert, terminal_lines, terminal_text
+from daq.writeback.file_proposal import Proposal, propose
+from daq.writeback.request import Request
+from ident.calibration import Gain
+from tests.daq.calibrations import AXES, demo_calibration, recorded
+from tests.daq.histories import calibration_of, enter
+
+FORMULAS = ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "＝1", "a\r=1"]
+
+
+@pytest.mark.parametrize("text", FORMULAS[:-1])
+def test_a_formula_is_text_to_a_spreadsheet(text: str) -> None:
+    assert inert(text) == "'" + text.replace("\r", "\n")
+
+
+@given(st.text() | st.floats() | st.none())
+def test_a_cell_is_what_it_was_but_for_an_apostrophe(value: object) -> None:
+    shown = inert(value)
+    if isinstance(value, str):
+        lines = value.replace("\r\n", "\n").replace("\r", "\n")
+        assert shown in (lines, f"'{lines}")
+        assert not shown.startswith(tuple("=+-@\t\n"))
+        assert "\r" not in shown
+    else:
+        assert shown is value
+
+
+def test_bytes_of_a_name_that_are_no_characters_are_spelt_out() -> None:
+    assert inert("b\udcff.mcap") == "b\\udcff.mcap"
+
+
+def _row(name: str, unit: str) -> FleetRow:
+    gain = Gain(name, -3.5, 0.01, unit, -3.4)
+    return FleetRow(name, "0" * 64, (name,), (), Summary((gain,), (), 3.0, False, False), 1.0, file=Path(name))
+
+
+@pytest.mark.parametrize("text", [*FORMULAS, "b\udcff"])
+def test_the_table_of_a_fleet_has_no_formula_and_can_be_written(text: str) -> None:
+    rows = (_row(text, text), FleetRow(text, "", (text,), (), Failure(text, text, 4), 0.0))
+    made = fleet_csv(rows)
+    assert made.encode().decode() == made
+    assert made.startswith(",".join(FIRST_COLUMNS))
+    header, *lines = csv.reader(io.StringIO(made, newline=""))
+    for cell in [*header, *(cell for line in lines for cell in line)]:
+        assert not cell.startswith(tuple("=+@\t\r\n"))
+    assert len(lines) == 2
+    assert lines[0][header.index(inert(f"{text} gain"))] == "-3.5"  # numbers stay numbers
+    document = fleet_document(rows)
+    assert str(document).encode()
+
+
+def _watched(path: Path, times: tuple[datetime, ...], unit: str = "Nm/A") -> tuple[Series, ...]:
+    with HistoryStore(path / "history.sqlite") as store:
+        for number, time in enumerate(times):
+            made = replace(calibration_of(number), created=time.isoformat())
+            enter(store, recorded(replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time))
+        return watch(store.entries(), store.acknowledgements())
+
+
+def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:
+    made = csv_text(_watched(tmp_path, (datetime(2026, 1, 5, tzinfo=UTC),), unit="=cmd|'/c calc'!A1"))
+    for row in csv.DictReader(io.StringIO(made, newline="")):
+        assert row["unit"] == "'=cmd|'/c calc'!A1"
+        assert float(row["gain"])
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        (datetime(9999, 12, 31, 23, tzinfo=UTC),),
+        (datetime(2026, 1, 5, tzinfo=UTC), datetime(9999, 12, 31, 23, 59, 59, tzinfo=UTC)),
+        (datetime(1, 1, 1, 1, tzinfo=UTC), datetime(9999, 1, 1, tzinfo=UTC)),
+    ],
+)
+def test_a_history_that_ends_with_the_calendar_is_drawn(times: tuple[datetime, ...], tmp_path: Path) -> None:
+    out = tmp_path / "history.svg"
+    with warnings.catch_warnings(action="error"):
+        plot_history(out, _watched(tmp_path, times)[:1], title="demo")
+    assert out.read_bytes().startswith(b"<?xml")
+
+
+def _proposal(folder: Path, unit: str) -> Proposal:
+    file = folder / "robot.yaml"
+    file.write_text("".join(f"{axis}: 30.0  # tab\t[/]\n" for axis in AXES))
+    demo = demo_calibration()
+    made = replace(demo, gains=tuple(replace(gain, unit=unit) for gain in demo.gains))
+    return propose(
+        Request(made, datetime(2025, 1, 2, tzinfo=UTC)), file, dict(zip(AXES, AXES, strict=True)), cell="demo"
+    )
+
+
+@pytest.mark.parametrize("unit", ["[/]", "[red]Nm/A", "Nm\x1b[2J", "\x9b2J"])
+def test_a_unit_neither_commands_the_terminal_nor_is_markup(unit: str, tmp_path: Path) -> None:
+    shown = io.StringIO()
+    show(_proposal(tmp_path, unit), Console(file=shown, width=200, force_terminal=False))
+    assert "\x1b" not in shown.getvalue()
+    assert "\x9b" not in shown.getvalue()
+    assert unit.replace("\x1b", "\\x1b").replace("\x9b", "\\x9b") in shown.getvalue()
+
+
+@given(st.text())
+def test_terminal_text_has_no_control_characters(text: str) -> None:
+    assert terminal_text(text).plain.isprintable()
+    assert terminal_lines(text).replace("\n", "").replace("\t", "").isprintable()
+
+
+def test_lines_keep_their_tabs_and_lose_their_carriage_returns() -> None:
+    assert terminal_lines("-a:\t1\r\n+a:\t2\r\n") == "-a:\t1\n+a:\t2"

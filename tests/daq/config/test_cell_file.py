@@ -1,0 +1,273 @@
+"""Cell files: read whole, bundled whole, refused with the reason."""
+
+from __future__ import annotations
+
+import shutil
+from math import radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.bus import bus_address, bus_parts, cell_address, drive_axes
+from daq.config.cell import Pacing
+from daq.config.cell_file import bundle, cell_from_bundle, load_cell
+from daq.config.drive import drive_from_text
+from daq.environment import shipped_configurations
+from daq.errors import ConfigurationError, ConfigurationInconsistent, ConfigurationMissing, SchemaMismatch
+from drivers.canopen.bus import BusAddress
+from drivers.profiles.profile import Amplitude, ObjectEntry, TapPoint
+from drivers.stream.split_bus import SplitAddress
+from tests.two_buses import LEFT, RIGHT, on_two_buses
+
+
+@pytest.fixture
+def configurations(tmp_path: Path) -> Path:
+    """A copy of the shipped configurations that a test may spoil."""
+    folder = tmp_path / "configs"
+    shutil.copytree(shipped_configurations(), folder)
+    return folder
+
+
+def _spoil(path: Path, old: str, new: str) -> Path:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return path
+
+
+def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    assert cell.name == "demo"
+    assert cell.axis_names == ("J1", "J2", "J3", "J4", "J5", "J6")
+    np.testing.assert_array_equal(cell.ratio[5], [0, 0, 0, 0, 32, 32])
+    assert cell.axes[4].limits.position == (radians(-115), radians(128))
+    assert cell.axes[3].nameplate_gain == -11.52
+    assert cell.axes[0].gain_unit == "Nm/A"
+    assert cell.payloads[0].payload.known == {"m": 4.59}
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing.LOCKSTEP
+    assert cell.controller_path == checkout / "configs/controllers/demo.yaml"
+    profile = cell.axes[0].profile
+    assert profile is not None
+    assert profile.current == ObjectEntry(0x6074, 0, 16, signed=True)
+    assert (profile.amplitude, profile.tap) == (Amplitude.RMS, TapPoint.REFERENCE)
+    assert [axis.node_id for axis in drive_axes(cell)] == [1, 2, 3, 4, 5, 6]
+    assert bus_address(cell).interface == "virtual"
+
+
+def test_a_cell_without_a_bus_only_imports(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/tx40.yaml")
+    assert cell.buses == ()
+    assert cell.axes[1].zero_offset_rad == radians(-90)
+    assert cell.axes[0].gain_unit == "Nm/Nm(motor, a priori)"
+    with pytest.raises(ConfigurationInconsistent, match="no bus"):
+        bus_address(cell)
+    with pytest.raises(ConfigurationInconsistent, match="without node_id"):
+        drive_axes(cell)
+
+
+def test_a_bundle_takes_the_data_sheet_along_that_a_profile_names(checkout: Path, tmp_path: Path) -> None:
+    cells, drives = tmp_path / "cells", tmp_path / "drives"
+    cells.mkdir()
+    drives.mkdir()
+    configs = checkout / "configs"
+    text = (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+    (cells / "cell.yaml").write_text(text)
+    profile = (configs / "drives/generic-cia402.yaml").read_text()
+    (drives / "generic-cia402.yaml").write_text(profile)
+    assert not [name for name in bundle(cells / "cell.yaml") if name.endswith(".eds")]
+    (drives / "generic-cia402.yaml").write_text(profile + "eds: maker.eds\n")
+    (drives / "maker.eds").write_bytes(b"[FileInfo]\n")
+    assert bundle(cells / "cell.yaml")["drives/generic-cia402.eds"] == b"[FileInfo]\n"
+    (drives / "maker.eds").unlink()
+    with pytest.raises(ConfigurationMissing, match=r"maker\.eds"):
+        bundle(cells / "cell.yaml")
+
+
+def test_a_bundle_is_the_same_cell_without_its_files(checkout: Path) -> None:
+    path = checkout / "configs/cells/demo.yaml"
+    files = bundle(path)
+    assert set(files) == {"cell.yaml", "robot.urdf", "drives/generic-cia402.yaml"}
+    cell, again = load_cell(path), cell_from_bundle({**files, "readback.json": b"{}"})
+    assert again.digest == cell.digest
+    assert again.axes == cell.axes
+    assert again.urdf == cell.urdf
+    assert again.folder is None
+    with pytest.raises(ConfigurationMissing, match=r"robot\.urdf"):
+        cell_from_bundle({name: data for name, data in files.items() if name != "robot.urdf"})
+
+
+def test_the_digest_follows_every_file(configurations: Path) -> None:
+    path = configurations / "cells/demo.yaml"
+    before = load_cell(path).digest
+    _spoil(configurations / "drives/generic-cia402.yaml", "amplitude: rms", "amplitude: peak")
+    assert load_cell(path).digest != before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("    - [32, 0, 0, 0, 0, 0]\n", "", "5 rows"),
+        ("[32, 0, 0, 0, 0, 0]", "[32, 0, 0, 0, 0]", r"rows of 5, 6 numbers; expected 6 × 6"),
+        ("[0, 0, 0, 0, 32, 32]", "[0, 0, 0, 0, 45, 0]", "singular"),
+        ("node_id: 2", "node_id: 1", "1, used 2 times"),
+        ("node_id: 2", "node_id: 128", "1 to 127"),
+        ("node_id: 2\n", "#\n", "axes.1..node_id: found nothing"),
+        ("name: J2", "name: J1", "J1, used 2 times"),
+        ("[-170, 170]", "[170, -170]", "lower limit first"),
+        ("[-170, 170]", "[-2.967, 2.967]", "the numbers of the URDF in rad"),
+        ("[-170, 170]", "[-17000, 17000]", "at most ±720 deg"),
+        ("[-170, 170]", "[-0.05, 0.05]", "a range of at least 0.2 deg"),
+        ("mass_kg: 4.59", "mass_kg: -4.59", "positive mass"),
+        ("gain_nm_per_a: 25.65", "gain_nm_per_a: 0", "not zero"),
+        ("-9.81]", "-9810]", "9810 m/s²"),
+        ("[0.03, 0.03, ", "[0.03, ", "5 speeds"),
+        ("[drives.J1.gain, ", "[", "5 keys"),
+        ("tx40.urdf", "../simulation/demo.yaml", "a URDF of an arm"),
+        ("sync:\n  period_us: 1000\n  pacing: lockstep ", "#", "sampling period"),
+        ("interface: virtual", "interface: socketcan", "lockstep on a bus of interface socketcan; expected timed"),
+        ("interface: virtual", "interface: pcan", "lockstep on a bus of interface pcan; expected timed"),
+        ("period_us: 1000", "period_us: 999", r"999, while drive generic-cia402 refreshes .* every 1000 µs; .*1000 or"),
+    ],
+)
+def test_a_cell_that_contradicts_itself_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("interface", "pacing"), [("socketcand", "lockstep"), ("socketcan", "timed"), ("socketcand", "timed")]
+)
+def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
+    configurations: Path, interface: str, pacing: str
+) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}")
+    cell = load_cell(_spoil(path, "pacing: lockstep", f"pacing: {pacing}"))
+    assert cell.sync is not None
+    assert cell.sync.pacing is Pacing(pacing)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("velocity_deg_s: 200", "velocity_deg: 200", r"axes\[0\].limits.velocity_deg: .*velocity_deg_s"),
+        ("velocity_deg_s: 200", "velocity_deg_s: -200", "greater than 0"),
+        ("pacing: lockstep", "pacing: slowly", "'lockstep' or 'timed'"),
+        ("nameplate_gain_nm_per_a: 25.65", "gain_unit: Nm/A", "nameplate_gain together with gain_unit"),
+        ("mounting: flange-a", "", r"payloads\[0\].mounting: found nothing"),
+    ],
+)
+def test_a_misspelt_cell_is_refused(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("drive: generic-cia402", "drive: unheard-of", "no file .*generic-cia402"),
+        ("tx40.urdf", "none.urdf", "no such file"),
+    ],
+)
+def test_a_missing_file_is_named(configurations: Path, old: str, new: str, message: str) -> None:
+    path = _spoil(configurations / "cells/demo.yaml", old, new)
+    with pytest.raises(ConfigurationMissing, match=message):
+        load_cell(path)
+    with pytest.raises(ConfigurationMissing, match="nowhere"):
+        load_cell(configurations / "nowhere.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("index: 0x6064", "index: 0x64"),
+        ("amplitude: rms", "amplitude: RMS"),
+        ("type: i32}", "type: i64}"),
+        ("tap:", "tip:"),
+    ],
+)
+def test_a_wrong_drive_profile_is_refused(old: str, new: str) -> None:
+    text = (shipped_configurations() / "drives/generic-cia402.yaml").read_text(encoding="utf-8")
+    assert drive_from_text(text.encode(), "x").saturation_bit == 11
+    with pytest.raises(ConfigurationError):
+        drive_from_text(text.replace(old, new, 1).encode(), "x")
+
+
+@pytest.fixture
+def two_buses(configurations: Path) -> Path:
+    """The demo cell on two."""
+    path = configurations / "cells/demo.yaml"
+    path.write_text(on_two_buses(path.read_text(encoding="utf-8"), "socketcan", "can0", "can1"), encoding="utf-8")
+    return _spoil(path, "pacing: lockstep", "pacing: timed")
+
+
+def test_a_cell_may_have_several_buses(two_buses: Path) -> None:
+    cell = load_cell(two_buses)
+    assert [axis.bus for axis in cell.axes] == ["left"] * 3 + ["right"] * 3
+    address = cell_address(cell)
+    assert isinstance(address, SplitAddress)
+    assert str(address) == "left (socketcan:can0) + right (socketcan:can1)"
+    assert [sorted(part.node_ids) for part in bus_parts(cell)] == [list(LEFT), list(RIGHT)]
+    with pytest.raises(ConfigurationInconsistent, match="2 buses; expected one"):
+        bus_address(cell)
+
+
+def test_a_list_of_one_bus_is_one_bus(configurations: Path) -> None:
+    path = configurations / "cells/demo.yaml"
+    listed = _spoil(path, "bus:\n  interface: virtual", "bus:\n  - name: main\n    interface: virtual")
+    cell = load_cell(_spoil(_spoil(listed, "  channel: demo", "    channel: demo"), "  bitrate", "    bitrate"))
+    assert cell_address(cell) == BusAddress("virtual", "demo")
+    assert {axis.bus for axis in cell.axes} == {"main"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("    bus: right\n", "", r"axes\[3\].bus: found nothing; expected the bus .* several: left, right"),
+        ("bus: right\n", "bus: middle\n", r"axes\[3\].bus: found middle, .* one of left, right"),
+        ("name: right", "name: left", r"bus\[1\].name: found left, used 2 times; expected each name once"),
+        ("channel: can1", "channel: can0", r"bus\[1\]: found socketcan can0, which bus left is too"),
+        ("node_id: 4", "node_id: 1", r"node_id: found 1, used 2 times; expected each node once, on all buses"),
+        (
+            "  - {name: right",
+            "  - {name: spare, interface: pcan, channel: x}\n  - {name: right",
+            "spare without an axi",
+        ),
+        ("pacing: timed", "pacing: lockstep", "lockstep on a bus of interface socketcan"),
+        ("pacing: timed", "pacing: timed\n  producer: J1", "J1, with 2 buses; expected recorder: one SYNC must"),
+        ("channel: can1", "channel: can1, bitrate_bit_s: 250000", r"load bus right by 1\d\d % .* at 250000 bit/s"),
+    ],
+)
+def test_two_buses_that_contradict_each_other_are_refused(two_buses: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(_spoil(two_buses, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("name: right, ", "", r"bus\[1\].name: found nothing"),
+        ("channel: can1", "chanel: can1", r"bus\[1\].chanel: found unknown key .*channel"),
+        ("channel: can1", "channel: 1", r"demo.yaml:\d+: bus\[1\].channel: found integer 1"),
+    ],
+)
+def test_a_misspelt_bus_of_several_is_refused_with_its_place(two_buses: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(_spoil(two_buses, old, new))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("  channel: demo", "  chanel: demo", r"demo.yaml:\d+: bus.chanel: found unknown key .*channel"),
+        ("  channel: demo", "  name: x", "bus.name: found unknown key"),
+    ],
+)
+def test_a_misspelt_single_bus_is_refused_with_its_place(
+    configurations: Path, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(SchemaMismatch, match=message):
+        load_cell(_spoil(configurations / "cells/demo.yaml", old, new))

@@ -1,0 +1,162 @@
+"""Strict YAML refuses what it would otherwise have to guess."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field
+
+from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_bytes, read_model
+from daq.errors import ConfigurationError, ConfigurationMissing, SchemaMismatch, YamlInvalid
+
+
+class _Limits(StrictModel):
+    velocity_deg_s: float
+    range_deg: tuple[float, float] = (0.0, 1.0)
+
+
+class _Axis(StrictModel):
+    name: str
+    limits: _Limits
+
+
+class _File(StrictModel):
+    axes: Annotated[tuple[_Axis, ...], Field(min_length=1)]
+    bodies: dict[str, _Limits] = Field(default_factory=dict)
+
+
+def _read(text: str) -> _File:
+    return read_model(parse_yaml(text.encode(), "file.yaml"), _File)
+
+
+def test_a_good_file_is_read() -> None:
+    file = _read("axes:\n  - {name: J1, limits: {velocity_deg_s: 1e-3, range_deg: [-1, 2]}}\n")
+    assert file.axes[0].limits.velocity_deg_s == 1e-3
+    assert file.axes[0].limits.range_deg == (-1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "found", "expected"),
+    [
+        (
+            "axes:\n - name: J1\n   limits: {velocity_deg: 3}\n",
+            "axes[0].limits.velocity_deg",
+            "unknown key",
+            "velocity_deg_s",
+        ),
+        (
+            "axes:\n - name: J1\n   limits: {velocity_deg_s: fast}\n",
+            "axes[0].limits.velocity_deg_s",
+            '"fast"',
+            "number",
+        ),
+        ("axes:\n - name: J1\n   limits: {velocity_deg_s: '3'}\n", "axes[0].limits.velocity_deg_s", '"3"', "number"),
+        ("axes:\n - name: J1\n   limits: {velocity_deg_s: true}\n", "axes[0].limits.velocity_deg_s", "true", "number"),
+        ("axes:\n - name: J1\n   limits: {velocity_deg_s: .nan}\n", "axes[0].limits.velocity_deg_s", "NaN", "finite"),
+        ("axes:\n - name: 1\n   limits: {velocity_deg_s: 1}\n", "axes[0].name", "integer 1", "string"),
+        ("axes:\n - name: J1\n", "axes[0].limits", "nothing", "required"),
+        ("axes: []\n", "axes", "list []", "at least 1"),
+        (
+            "bodies: {disc: {velocity_deg_s: 1, rang_deg: [1, 2]}}\naxes: 3\n",
+            "bodies.disc.rang_deg",
+            "unknown",
+            "range_deg",
+        ),
+        ("- 1\n", "the whole file", "list [1]", "object"),
+        ("", "the whole file", "null", "object"),
+    ],
+)
+def test_a_mistake_is_named_with_place_found_and_expected(text: str, where: str, found: str, expected: str) -> None:
+    with pytest.raises(SchemaMismatch) as caught:
+        _read(text)
+    message = str(caught.value)
+    assert where in message
+    assert found in message
+    assert expected in message
+
+
+def test_all_mistakes_come_at_once_with_their_lines() -> None:
+    with pytest.raises(SchemaMismatch, match="2 faults") as caught:
+        _read("axes:\n  - name: J1\n    limits:\n      velocity_deg_s: x\n      colour: red\n")
+    assert "file.yaml:4: axes[0].limits.velocity_deg_s" in str(caught.value)
+    assert "file.yaml:5: axes[0].limits.colour" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "found"),
+    [
+        ("a: 1\nb: 2\na: 3\n", ":3", "duplicate key 'a', first on line 1"),
+        ("a:\n  b: 1\n  b: 2\n", ":3: a.b", "duplicate key 'b'"),
+        ("a: &x [1]\nb: *x\n", ":2", "alias"),
+        ("a: !!python/name:os.system\n", ":1: a", "tag"),
+        ("a: [1, 2\nb: 3\n", ":2", ""),
+        ("a: 1\n---\nb: 2\n", ":2", "another document"),
+        ("1: x\n", ":1", "key '1'"),
+        ("a: \xff\x00", "", ""),
+        ("[" * 3000, ":1", "lists in lists"),
+        ("a: [" + "1," * 60_000 + "]", ":1", "more than 50000 values"),
+        ("\n".join(f"k{k}: 1" for k in range(30_000)), ":25000", "more than 50000 values"),
+    ],
+)
+def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, found: str) -> None:
+    with pytest.raises(YamlInvalid) as caught:
+        parse_yaml(text.encode("latin-1"), "file.yaml")
+    assert f"file.yaml{line}" in str(caught.value)
+    assert found in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("no", "no"), ("on", "on"), ("12:30:00", "12:30:00"), ("2024-01-01", "2024-01-01"), ("017", "017"), ("0x1F", 31)],
+)
+def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
+    assert parse_yaml(f"a: {text}\n".encode(), "file.yaml").tree == {"a": value}
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_a_document_or_a_named_error(data: bytes) -> None:
+    try:
+        read_model(parse_yaml(data, "file.yaml"), _File)
+    except ConfigurationError as error:
+        assert error.subject.startswith("file.yaml")
+
+
+def test_a_pipe_or_a_device_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    # Opened for reading as usual, the one would be waited for, and the other never end.
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(ConfigurationMissing, match="a pipe, a device or a socket"):
+            read_bytes(path)
+
+
+def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "large.yaml"
+    with path.open("wb") as stream:
+        stream.truncate(2**40)  # a hole: it would fill the memory, not the disk
+    with pytest.raises(ConfigurationMissing, match=f"more than {MAX_BYTES} bytes"):
+        read_bytes(path)
+    with path.open("wb") as stream:
+        stream.truncate(MAX_BYTES)
+    assert len(read_bytes(path)) == MAX_BYTES
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationMissing, match="directory"):
+        read_bytes(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])
+def test_an_integer_that_nothing_can_hold_is_told(text: str) -> None:
+    with pytest.raises(YamlInvalid):
+        _read(f"axes:\n  - {{name: J1, limits: {{velocity_deg_s: {text}}}}}\n")
+
+
+@given(st.integers(-(2**64) + 1, 2**64 - 1))
+def test_every_other_integer_is_what_was_written(value: int) -> None:
+    written = f"0x{value:x}" if value >= 0 else str(value)
+    assert parse_yaml(f"a: {written}".encode(), "x").tree == {"a": value}

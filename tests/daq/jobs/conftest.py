@@ -1,0 +1,40 @@
+"""One whole job, made once: the tests of what follows the recordings take its logs and its fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from tests.daq.jobs.made import Made, whole_job
+from tests.daq.jobs.rig import Rig, make_plan
+
+
+@pytest.fixture(scope="session")
+def short_plan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A few moves."""
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    return make_plan(cell, tmp_path_factory.mktemp("plan") / "short.yaml", seed=3, duration_s=6.0, moves=2)
+
+
+@pytest.fixture(scope="session")
+def one_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A single move."""
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    return make_plan(cell, tmp_path_factory.mktemp("plan") / "one.yaml", seed=3, duration_s=6.0, moves=1)
+
+
+@pytest.fixture(scope="session", name="whole_job")
+def whole_job_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, Made]:
+    """A real job from the first frame to the controller's file, and what it made."""
+    folder = tmp_path_factory.mktemp("whole") / "cell"
+    folder.mkdir()
+    return whole_job(folder)
+
+
+@pytest.fixture(scope="session")
+def made(whole_job: tuple[Rig, Made]) -> Made:
+    """Its logs and its fit."""
+    return whole_job[1]

@@ -1,0 +1,128 @@
+"""A whole job, made once: rigs whose recordings and fit are copies of it, at a time of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.files import sha256_of
+from daq.jobs.tools import Tools
+from daq.workflow.fit import Fit
+from daq.workflow.plan import Plan
+from daq.workflow.record import Recorded
+from ident.calibration import Calibration
+from tests.daq.jobs.rig import Rig, make_plan, make_rig, powerless, serving
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a whole real job has made, for tests of what comes after the recordings.
+
+    Attributes:
+        plan_file: of its runs.
+        logs: by their runs' names.
+        recorded: what the recorder told of each.
+        fitted, closed: before and after the loop.
+        calibration: of the latter.
+    """
+
+    plan_file: Path
+    logs: dict[str, Path]
+    recorded: dict[str, Recorded]
+    fitted: Fit
+    closed: Fit
+    calibration: Calibration
+
+    def tools(self, rig: Rig, **factors: float) -> Tools:
+        """Recorder and fit that know the result already: with the rig's cell, at the rig's time.
+
+        Args:
+            rig: whose tools they are.
+            factors: by which gains have changed since, by axis.
+        """
+
+        def copied(_file: Path, _cell: Cell, _plan: Plan, out: Path, **further: Any) -> Recorded:
+            further["before_motion"]()
+            # Logs of another day are other logs; the fit that would read them knows its result already.
+            out.write_bytes(self.logs[out.stem].read_bytes() + str(rig.clock.at).encode())
+            return replace(self.recorded[out.stem], path=out)
+
+        def in_this_cell(_fit: Fit, created: datetime) -> Calibration:
+            session = rig.sessions[-1].folder
+            sources = tuple(
+                replace(
+                    source,
+                    sha256=sha256_of(session / f"{source.name}.mcap") or "",
+                    recording=source.recording
+                    and replace(source.recording, controller_sha256=None, recorded_s=created.timestamp()),
+                )
+                for source in self.calibration.sources
+            )
+            return replace(
+                self.calibration,
+                created=created.isoformat(),
+                configuration_sha256=rig.cell.digest,
+                recording_configuration_sha256=rig.cell.recording_digest,
+                sources=sources,
+                gains=tuple(
+                    replace(gain, value=gain.value * factors.get(gain.axis, 1.0)) for gain in self.calibration.gains
+                ),
+            )
+
+        return replace(
+            rig.tools,
+            save_report=lambda _fit, _account, _calibration, folder: (folder / "report.html").touch(),
+            drives=lambda _cell, _undisturbed: None,
+            record=copied,
+            fit=lambda _logs, **_: self.fitted,
+            close_loop=lambda _fit, _seed, _told: self.closed,
+            calibration=in_this_cell,
+        )
+
+
+def made_rig(folder: Path, made: Made, **section: Any) -> Rig:
+    """A rig whose recordings are copies of those that were made."""
+    rig = make_rig(folder, made.plan_file, **section)
+    rig.tools = made.tools(rig)
+    return rig
+
+
+def whole_job(folder: Path) -> tuple[Rig, Made]:
+    """A real job from the first frame to the controller's file, and what it made.
+
+    Args:
+        folder: of the cell; empty, the plan goes beside it.
+    """
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    plan_file = make_plan(cell, folder.parent / "plan.yaml", seed=10, duration_s=6.0, moves=4)
+    rig = make_rig(folder, plan_file)
+    kept: dict[str, Any] = {}
+    recorded: dict[str, Recorded] = {}
+    tools = rig.tools
+
+    def keep_record(*given: Any, **further: Any) -> Recorded:
+        found = tools.record(*given, **further)
+        recorded[found.path.stem] = found
+        return found
+
+    def keep(name: str) -> Any:
+        def called(*given: Any, **further: Any) -> Any:
+            found = getattr(tools, name)(*given, **further)
+            kept[name] = found
+            return found
+
+        return called
+
+    rig.tools = replace(
+        tools, record=keep_record, fit=keep("fit"), close_loop=keep("close_loop"), calibration=keep("calibration")
+    )
+    with serving(rig) as cell_there:
+        rig.job()
+        assert powerless(cell_there)
+    logs = {name: rig.session.folder / f"{name}.mcap" for name in recorded}
+    return rig, Made(plan_file, logs, recorded, kept["fit"], kept["close_loop"], kept["calibration"])

@@ -1,0 +1,209 @@
+"""A cell of one's own for each test: its files, its clock, its commands, and the simulated cell on a virtual bus."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from daq.cli.residual import save_report
+from daq.cli.simulate import MountedFile
+from daq.config.bus import bus_address
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.jobs.conclusion import Conclusion
+from daq.jobs.job import recalibrate
+from daq.jobs.journal import Form, Journal
+from daq.jobs.session import Session, sessions
+from daq.jobs.tools import Tools
+from daq.ledger.audit import AuditEntry, read, verify
+from daq.simulation.simulation_file import load_simulation
+from daq.workflow.plan import Plan, plan
+from daq.workflow.plan_file import save_plan
+from daq.workflow.record import Clocks, record
+from drivers.canopen.bus import open_bus
+from drivers.simulation.cell import MountingCell, SimulatedCell
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultSpec
+from drivers.simulation.spec import CellSpec
+
+BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
+WHO = "the test's job"
+RUNS: tuple[dict[str, Any], ...] = (
+    {"name": "bare-1"},
+    {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59},
+    {"name": "unused", "payload": "disc", "mass_kg": 4.59, "holdout": True},
+)
+
+
+@cache
+def _cell(path: Path, _content: bytes) -> Cell:
+    return load_cell(path)
+
+
+@cache
+def _truth(payload: str | None) -> CellSpec:
+    return load_simulation(shipped_configurations() / "simulation" / "demo.yaml", payload)
+
+
+class TestClock:
+    """A wall clock that goes on by a second whenever it is asked, and further when it is told."""
+
+    __test__ = False
+
+    def __init__(self, at: datetime = BEGAN) -> None:
+        self.at = at
+
+    def __call__(self) -> datetime:
+        self.at += timedelta(seconds=1)
+        return self.at
+
+    def go_on(self, **by: float) -> None:
+        self.at += timedelta(**by)
+
+
+@dataclass
+class Rig:
+    """One cell.
+
+    Attributes:
+        folder: with `cells`, `controllers` and `robots`.
+        clock: of the job.
+        tools: that the job gets.
+        said: the journal's lines.
+    """
+
+    folder: Path
+    clock: TestClock
+    tools: Tools
+    said: io.StringIO = field(default_factory=io.StringIO)
+
+    @property
+    def cells(self) -> Path:
+        return self.folder / "cells"
+
+    @property
+    def cell_file(self) -> Path:
+        return self.cells / "demo.yaml"
+
+    @property
+    def cell(self) -> Cell:
+        return _cell(self.cell_file, self.cell_file.read_bytes())
+
+    @property
+    def controller(self) -> Path:
+        return self.folder / "controllers" / "demo.yaml"
+
+    @property
+    def closed(self) -> Path:
+        """The interlock's command looks for it."""
+        return self.cells / "closed"
+
+    @property
+    def sessions(self) -> tuple[Session, ...]:
+        return sessions(self.cells / "demo.recalibration", "demo")
+
+    @property
+    def session(self) -> Session:
+        """The only one."""
+        (only,) = self.sessions
+        return only
+
+    @property
+    def audit(self) -> tuple[AuditEntry, ...]:
+        path = self.cells / "demo.audit.jsonl"
+        assert verify(path).holds
+        return read(path)
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        """The journal."""
+        return [json.loads(line) for line in self.said.getvalue().splitlines()]
+
+    @property
+    def backups(self) -> list[Path]:
+        return sorted(self.controller.parent.glob("*.bak"))
+
+    def job(self, **further: Any) -> Conclusion:
+        journal = Journal(self.said, Form.JSON, lambda: self.clock.at)
+        return recalibrate(self.cell_file, self.cell, self.tools, journal, who=WHO, lock_folder=self.folder, **further)
+
+
+def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = None, **section: Any) -> Rig:
+    """A cell's files, and tools with a clock of their own.
+
+    Args:
+        folder: empty; its name makes the bus's.
+        plan_file: of all runs.
+        policy: instead of one in which the job applies.
+        section: of `recalibration`, instead of what is here.
+    """
+    shipped = shipped_configurations()
+    for part in ("controllers", "robots"):
+        shutil.copytree(shipped / part, folder / part)
+    (folder / "cells").mkdir()
+    document = yaml.safe_load((shipped / "cells" / "demo.yaml").read_text(encoding="utf-8"))
+    document["bus"]["channel"] = f"recalibration {folder.parent.name} {folder.name}"
+    document["policy"] = policy or {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8}}
+    document["recalibration"] = {
+        "runs": [{"plan_file": str(plan_file), **run} for run in RUNS],
+        "interlock": {"command": ["test", "-e", "closed"]},
+        "mount": {"command": ["sh", "-c", 'echo "$1" > mounted', "mount"]},
+        "warm_up_min": 0,
+        "min_free_mb": 100,
+        "metrics": ".",
+        **section,
+    }
+    # As JSON, which is YAML without aliases.
+    (folder / "cells" / "demo.yaml").write_text(json.dumps(document, indent=1), encoding="utf-8")
+    (folder / "cells" / "closed").touch()
+    clock = TestClock()
+    tools = Tools(
+        save_report=save_report,
+        record=partial(record, clocks=Clocks(wall_ns=lambda: int(clock.at.timestamp()) * 10**9)),
+        free=lambda _: 10**12,
+        now=clock,
+        monotonic_s=lambda: clock().timestamp(),
+    )
+    return Rig(folder, clock, tools)
+
+
+@contextmanager
+def serving(
+    rig: Rig, *faults: FaultSpec, toggle_bit: int | None = None, seed: int = 1, spec: CellSpec | None = None
+) -> Iterator[SimulatedCell]:
+    """The simulated cell of a rig, powered on, with what its mount command has mounted."""
+    mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
+    truth = replace(spec or mounted.at_power_on(), faults=faults, seed=seed)
+    truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
+    bus = open_bus(bus_address(rig.cell))
+    try:
+        with MountingCell(truth, bus, mounted) as cell:
+            yield cell
+    finally:
+        bus.shutdown()
+
+
+def powerless(cell: SimulatedCell) -> bool:
+    """Whether no axis has power, as the simulator knows it."""
+    powered = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.SWITCHED_ON)
+    return not any(node.drive.state in powered for node in cell.nodes)
+
+
+def make_plan(cell: Cell, path: Path, *, seed: int, duration_s: float, moves: int | None = None) -> Path:
+    """A plan for tests: not the best one."""
+    made: Plan = plan(
+        cell, seed=seed, duration_s=duration_s, exchanges=100, largest_condition=1e6, largest_std_percent=100.0
+    )
+    save_plan(replace(made, moves=made.moves[:moves]), path)
+    return path

@@ -1,0 +1,239 @@
+"""What becomes of a calibration, by statistics and by policy, over many weeks."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.cli.app import main
+from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable, ModelContradicted
+from daq.jobs.session import Outcome
+from daq.ledger.audit import AuditAction
+from daq.ledger.store import HistoryStore
+from daq.writeback.signature import generate
+from drivers.errors import DriveFault
+from tests.daq.jobs.made import Made, made_rig
+from tests.daq.jobs.rig import Rig
+
+BY_A_PERSON, BY_THE_JOB = (
+    {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}} for by in ("person", "job")
+)
+"""The logs of these tests are as old as the year in which they play."""
+
+
+def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_told(
+    tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_A_PERSON)
+    before = rig.controller.read_bytes()
+    ended = rig.job()
+    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert rig.controller.read_bytes() == before
+    assert [entry.action for entry in rig.audit][1:] == [AuditAction.PROPOSED, AuditAction.RECALIBRATION_ENDED]
+    assert "+    gain: -9." in (rig.session.folder / "proposal.diff").read_text()
+    *_, command = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    assert main(command.split()[1:]) == ExitCode.OK
+    capsys.readouterr()
+    assert rig.controller.read_bytes() != before
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        assert store.in_force(str(rig.controller)) == rig.audit[2].details["calibration_sha256"]
+    # The next week nothing is new: the σ of what the person applied is known from the history.
+    rig.clock.go_on(days=7)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    decision = rig.sessions[-1].state.decision
+    assert decision is not None
+    assert all(gain.old_std > 0 for gain in decision.gains)
+
+
+def test_a_closed_gate_refuses_and_the_next_job_records_anew(tmp_path: Path, made: Made) -> None:
+    strict = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 0.01}}
+    rig = made_rig(tmp_path / "cell", made, policy=strict)
+    before = rig.controller.read_bytes()
+    for number in (1, 2):
+        with pytest.raises(CalibrationRefused, match="σ"):
+            rig.job()
+        rig.clock.go_on(hours=1)
+        assert len(rig.sessions) == number
+        assert rig.sessions[-1].state.outcome is Outcome.REFUSED
+        assert rig.sessions[-1].state.exit_code == ExitCode.CALIBRATION_REFUSED
+    assert rig.controller.read_bytes() == before
+    actions = [entry.action for entry in rig.audit]
+    assert actions[:3] == [
+        AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.REFUSED,
+        AuditAction.RECALIBRATION_ENDED,
+    ]
+
+
+def test_recordings_that_contradict_the_model_are_not_fitted_twice(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    known = rig.tools
+
+    def contradicted(*_: Any, **__: Any) -> Any:
+        raise ModelContradicted("the fit", found="80 %", expected="5 %", remedy="look")
+
+    rig.tools = replace(known, fit=contradicted)
+    with pytest.raises(ModelContradicted):
+        rig.job()
+    assert (rig.session.state.outcome, rig.session.state.exit_code) == (Outcome.UNFIT, ExitCode.DATA_UNFIT)
+    rig.tools = known
+    assert rig.job().outcome is Outcome.APPLIED
+    assert len(rig.sessions) == 2
+
+
+def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
+    """The job once a day at three, due once a week: it acts where something has changed, and only there."""
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=4)
+    days = 7 * 8
+    outcomes: list[tuple[int, str]] = []
+    for day in range(days):
+        rig.tools = made.tools(rig, **({"J4": 0.9} if day >= 28 else {}))
+        if day == 14:
+            rig.tools = failing_once(rig)
+        if day == 43:
+            rig.closed.unlink()
+        if day == 44:
+            rig.closed.touch()
+        before = rig.controller.read_bytes()
+        try:
+            outcome = rig.job().outcome.value
+        except Exception as error:  # noqa: BLE001 - the kinds are what is compared
+            outcome = type(error).__name__
+        assert (rig.controller.read_bytes() != before) == (outcome == "applied"), day
+        if outcome != "not due":
+            outcomes.append((day, outcome))
+        rig.clock.go_on(days=1, seconds=-rig.clock.at.timestamp() % 60)
+    assert outcomes == [
+        (0, "applied"),
+        (7, "unchanged"),
+        (14, "DriveFault"),
+        # The session of the day before is too old to be taken up.
+        (15, "unchanged"),
+        (22, "unchanged"),
+        (29, "applied"),
+        (36, "unchanged"),
+        (43, "NotReleased"),
+        (44, "unchanged"),
+        (51, "unchanged"),
+    ]
+    decision = rig.sessions[-1].state.decision
+    assert decision is not None
+    assert not any(gain.differs for gain in decision.gains)
+    # The last four, and the one whose gains are in force: its logs are what the controller rests on.
+    assert len(rig.sessions) == 5
+    assert rig.sessions[0].state.outcome is Outcome.APPLIED
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        fitted = rig.sessions[0].state.fitted
+        assert fitted is not None
+        assert store.in_force() == fitted.calibration_sha256
+    assert len(rig.backups) == 2
+    begun, ended = (
+        [entry for entry in rig.audit if entry.action is action]
+        for action in (AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED)
+    )
+    assert len(begun) == len(ended) == len(outcomes)
+
+
+def test_a_write_that_the_history_was_not_told_of_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
+    """Whoever wrote them was killed right behind it: taken for exact, they would differ from each new one too often."""
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    assert rig.job().outcome is Outcome.APPLIED
+    with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
+        history.execute("DELETE FROM event")
+        history.commit()
+    rig.clock.go_on(days=7)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    decision = rig.sessions[-1].state.decision
+    assert decision is not None
+    assert all(gain.old_std > 0 for gain in decision.gains)
+
+
+def test_a_drift_is_told_although_the_job_applies_it_in_slices(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    for week in range(12):
+        rig.tools = made.tools(rig, J4=0.98**week)
+        assert rig.job().outcome in (Outcome.APPLIED, Outcome.UNCHANGED)
+        alarms = {gain.axis: gain.alarm for gain in rig.sessions[-1].state.watched}
+        if any(alarms.values()):
+            break
+        rig.clock.go_on(days=7)
+    assert [axis for axis, alarm in alarms.items() if alarm] == ["J4"]
+    warned = [event for event in rig.events if event["event"] == "drift"]
+    assert [(event["level"], event["axis"], event["text"]) for event in warned] == [("warning", "J4", alarms["J4"])]
+    assert alarms["J4"] in (rig.sessions[-1].folder / "summary.txt").read_text()
+    metrics = (rig.cells / "drivegain_demo.prom").read_text()
+    told = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
+    assert [line for line in told if line not in metrics] == []
+
+
+def test_nothing_is_removed_while_nobody_knows_what_is_in_force(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
+    for outcome in (Outcome.APPLIED, Outcome.UNCHANGED):
+        assert rig.job().outcome is outcome
+        rig.clock.go_on(days=7)
+    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    with pytest.raises(HistoryUnreadable):
+        rig.job()
+    assert len(rig.sessions) == 3
+    assert "no old session removed" in {event["event"] for event in rig.events}
+
+
+def test_what_is_written_stays_told_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB)
+    apply = rig.tools.apply
+
+    def breaks_the_history(*given: Any, **further: Any) -> Any:
+        written = apply(*given, **further)
+        with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:
+            history.execute("DROP TABLE event")
+            history.commit()
+        return written
+
+    rig.tools = replace(rig.tools, apply=breaks_the_history)
+    before = rig.controller.read_bytes()
+    assert rig.job().outcome is Outcome.APPLIED
+    assert rig.controller.read_bytes() != before
+    assert "the history does not know of this write" in {event["event"] for event in rig.events}
+    assert "drivegain rollback" in " ".join(json.loads((rig.session.folder / "summary.json").read_text())["to_do"])
+
+
+def test_a_history_that_cannot_be_read_is_told_before_anything_moves(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    with pytest.raises(HistoryUnreadable):
+        rig.job()
+    assert rig.session.state.runs == ()
+
+
+def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
+    tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
+) -> None:
+    public = generate(tmp_path, "bob")[1].line
+    signed = {"by": "person", "max_std_percent": 8, "max_age_days": None, "signatures": 1, "signers": {"bob": public}}
+    rig = made_rig(tmp_path / "cell", made, policy={**BY_A_PERSON, "apply": signed})
+    assert rig.job().outcome is Outcome.PROPOSED
+    sign, _, _, apply = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    assert main(apply.split()[1:]) == ExitCode.CALIBRATION_REFUSED
+    options = sign.partition("drivegain ")[2].replace("KEY", str(tmp_path / "bob.key"))
+    assert main(options.replace("NAME", "bob").split()) == ExitCode.OK
+    assert main(apply.split()[1:]) == ExitCode.OK
+    capsys.readouterr()
+
+
+def failing_once(rig: Rig) -> Any:
+    """A drive fails in the second run."""
+    tools = rig.tools
+    copied = tools.record
+
+    def record(*given: Any, **further: Any) -> Any:
+        if given[3].stem == "loaded-1":
+            raise DriveFault(3, "EMCY 7305h")
+        return copied(*given, **further)
+
+    return replace(tools, record=record)

@@ -1,0 +1,168 @@
+"""Every fault of tests/faults in a job: exit code, the controller's file untouched, audit, axes without power."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+import daq.workflow.record
+from daq.environment import shipped_configurations
+from daq.errors import ExitCode, MountFailed, RunInvalid, exit_code
+from daq.jobs.session import Outcome
+from daq.ledger.audit import AuditAction
+from drivers.errors import BusError, CellSilent, DriveFault, SampleLost, StateRefused
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultKind, FaultSpec
+from tests.daq.jobs.rig import Rig, make_rig, powerless, serving
+from tests.faults.test_at_start import REFUSALS
+from tests.faults.test_in_motion import STOPS
+
+STRIKE = 120
+"""SYNCs since power-on: in the first move of the first recording, which begins at about 30 and takes more than 500."""
+AXIS = 2
+CUT_OFF = {
+    "silent": (FaultSpec(FaultKind.SILENT, None, STRIKE), CellSilent),
+    "silent axis": (FaultSpec(FaultKind.SILENT, AXIS, STRIKE), SampleLost),
+    "bus off": (FaultSpec(FaultKind.BUS_OFF, None, STRIKE), BusError),
+}
+COUNTED = (FaultKind.LOST, FaultKind.LATE, FaultKind.DUPLICATE, FaultKind.SHORT_PDO)
+BORNE = (
+    FaultSpec(FaultKind.NO_GUARD, AXIS),
+    FaultSpec(FaultKind.REFUSES_WRITE, AXIS),
+    FaultSpec(FaultKind.REFUSES_SAVE, AXIS),
+    FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
+)
+"""No run ends of them: one is warned of, one is told in the log, and a job writes no gain into a drive."""
+ONLY_BARE = {"command": ["sh", "-c", 'test "$1" = none', "mount"]}
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulated cell in this process is never that late; waiting for one that is silent would be most of the time."""
+    monkeypatch.setattr(daq.workflow.record, "LOCKSTEP_TIMEOUT_S", 0.4)
+
+
+def fails(rig: Rig, cell: SimulatedCell, kind: type[Exception]) -> Exception:
+    """Run the job, which ends with an error of that kind; what is promised of every such end."""
+    before = rig.controller.read_bytes()
+    with pytest.raises(kind) as caught:
+        rig.job()
+    cell.check()
+    code = exit_code(type(caught.value))
+    session = rig.session
+    assert rig.controller.read_bytes() == before
+    assert rig.backups == []
+    assert (session.state.outcome, session.state.exit_code) == (Outcome.STOPPED, code)
+    assert [entry.action for entry in rig.audit] == [AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED]
+    assert rig.audit[-1].details["outcome"] == "stopped"
+    assert rig.audit[-1].details["exit_code"] == code
+    assert type(caught.value).__name__ in session.state.problem
+    assert f'exit_code{{cell="demo"}} {code}.0' in (rig.cells / "drivegain_demo.prom").read_text()
+    assert "stopped" in (session.folder / "summary.txt").read_text()
+    return caught.value
+
+
+@pytest.mark.parametrize("name", STOPS)
+def test_a_fault_in_motion_ends_the_job_and_leaves_the_controller_as_it_was(
+    tmp_path: Path, short_plan: Path, name: str
+) -> None:
+    promise = STOPS[name]
+    rig = make_rig(tmp_path / "cell", short_plan)
+    if promise.toggle_bit is not None:
+        with_toggle_bit(rig, promise.toggle_bit)
+    with serving(rig, replace(promise.fault, at_cycle=STRIKE), toggle_bit=promise.toggle_bit) as cell:
+        fails(rig, cell, promise.error)
+        assert powerless(cell)
+    assert exit_code(promise.error) == ExitCode.DEVICE_FAULT
+    assert (rig.session.folder / "bare-1.mcap.part").exists()
+    assert rig.session.state.runs == ()
+
+
+@pytest.mark.parametrize("name", CUT_OFF)
+def test_a_cell_that_is_cut_off_ends_the_job_and_what_nobody_can_reach_is_said(
+    tmp_path: Path, short_plan: Path, name: str
+) -> None:
+    fault, kind = CUT_OFF[name]
+    rig = make_rig(tmp_path / "cell", short_plan)
+    with serving(rig, fault) as cell:
+        error = fails(rig, cell, kind)
+        # Those that can be reached stand; the others stop by themselves (tests/faults), later than this test waits.
+        others = [node for index, node in enumerate(cell.nodes) if fault.axis is not None and index != fault.axis]
+        assert {node.drive.state for node in others} <= {PowerState.SWITCH_ON_DISABLED}
+    assert any(note.startswith("while stopping") for note in error.__notes__)
+    assert "while stopping" in (rig.session.folder / "summary.txt").read_text()
+
+
+@pytest.mark.parametrize("kind", REFUSALS, ids=lambda kind: kind.value)
+def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
+    tmp_path: Path, short_plan: Path, kind: FaultKind
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    with serving(rig, FaultSpec(kind, 1)) as cell:
+        fails(rig, cell, REFUSALS[kind][0])
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        assert cell.plant.time_s < 1.0
+
+
+def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
+    """Once its recorder stands for it the job goes on, here to a payload that nobody mounts."""
+    rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=ONLY_BARE)
+    with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
+        fails(rig, cell, MountFailed)
+        assert powerless(cell)
+    (run,) = rig.session.state.runs
+    assert (run.name, run.attempts) == ("bare-1", 2)
+    assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
+
+
+def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move, retries=0, mount=ONLY_BARE)
+    with serving(rig, *BORNE) as cell:
+        fails(rig, cell, MountFailed)
+        assert powerless(cell)
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    warned = [event["text"] for event in rig.events if event["level"] == "warning"]
+    assert [text for text in warned if "no 1016h" in text]
+
+
+def test_no_kind_of_fault_is_left_out() -> None:
+    seen = {promise.fault.kind for promise in STOPS.values()} | {fault.kind for fault, _ in CUT_OFF.values()}
+    assert seen | {*REFUSALS, *COUNTED, *(fault.kind for fault in BORNE)} == set(FaultKind)
+
+
+@pytest.mark.parametrize("kind", COUNTED, ids=lambda kind: kind.value)
+def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
+    tmp_path: Path, one_move: Path, kind: FaultKind
+) -> None:
+    """A single bad frame of any kind makes it so."""
+    rig = make_rig(tmp_path / "cell", one_move, retries=0)
+    with serving(rig, FaultSpec(kind, AXIS, STRIKE, 1)) as cell:
+        fails(rig, cell, RunInvalid)
+        assert powerless(cell)
+    assert rig.session.state.exit_code == ExitCode.DATA_UNFIT
+
+
+def test_a_drive_in_fault_and_one_that_has_power_are_a_persons_business(tmp_path: Path, short_plan: Path) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    with serving(rig) as cell:
+        cell.nodes[AXIS].drive.state = PowerState.FAULT
+        fails(rig, cell, DriveFault)
+        assert cell.nodes[AXIS].drive.state is PowerState.FAULT
+    rig = make_rig(tmp_path / "other", short_plan)
+    with serving(rig) as cell:
+        cell.nodes[AXIS].drive.state = PowerState.OPERATION_ENABLED
+        fails(rig, cell, StateRefused)
+
+
+def with_toggle_bit(rig: Rig, bit: int) -> None:
+    """A profile beside the cell that has one."""
+    shipped = shipped_configurations() / "drives" / "generic-cia402.yaml"
+    profile = yaml.safe_load(shipped.read_text(encoding="utf-8"))
+    profile["toggle_bit"] = bit
+    profile["facts"]["toggle_bit"] = {"basis": "assumed", "where": "of a drive that this test makes up"}
+    (rig.cells / "drives").mkdir()
+    (rig.cells / "drives" / shipped.name).write_text(yaml.safe_dump(profile), encoding="utf-8")

@@ -1,0 +1,639 @@
+"""Many cells' logs: each fitted as it would be alone, whoever does it and however often it was interrupted."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import distributed
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.cli import main
+from daq.config.cell_file import bundle
+from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputExists, OutputFailed, UsageError
+from daq.jobs import fleet as fleet_module
+from daq.jobs import workers as crew_module
+from daq.jobs.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell, open_shelf
+from daq.jobs.fleet import FleetRow, each, fit_fleet
+from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
+from daq.jobs.workers import Crew, Processes, Scheduler, Threads, crew_of
+from daq.workflow.calibration_file import as_document, load
+from daq.workflow.fit import calibration_of, fit
+from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
+from tests.daq.logs import content, samples, write
+
+CELLS = 4
+WITH_HOLDOUT = 1
+"""Of them; the others have one run without load and one with."""
+CREATED = datetime(2025, 1, 2, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Short logs of simulated cells; to make them takes most of the time here."""
+    folder = tmp_path_factory.mktemp("fleet")
+    (plans,) = plans_of(1, exchanges=40, duration_s=7.0)
+    for number in range(CELLS):
+        make_cell(FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def single(fleet: Path) -> dict[str, dict[str, Any]]:
+    """What single fits make of them, by cell."""
+    made = {}
+    for folder in sorted(fleet.iterdir()):
+        holdout = [log for log in (folder / "unused.mcap",) if log.exists()]
+        fitted = fit([folder / "bare.mcap", folder / "loaded.mcap"], holdout=holdout)
+        made[folder.name] = _timeless(as_document(calibration_of(fitted, CREATED)))
+    return made
+
+
+@pytest.fixture
+def few(fleet: Path, tmp_path: Path) -> Path:
+    """A folder of its own with the logs of three of the cells."""
+    folder = tmp_path / "logs"
+    for number in (0, 2, 3):
+        shutil.copytree(fleet / f"cell-{number:03d}", folder / f"cell-{number:03d}")
+    return folder
+
+
+def _timeless(document: dict[str, object]) -> dict[str, Any]:
+    return {key: value for key, value in document.items() if key != "created"}
+
+
+def _files(out: Path) -> dict[str, dict[str, Any]]:
+    """Calibrations in a folder, by cell."""
+    made = [load(file) for file in sorted(out.glob("*.yaml"))]
+    return {calibration.cell: _timeless(as_document(calibration)) for calibration in made}
+
+
+def _fitted(logs: Path, out: Path | None, loop: Loop = Loop.OPEN) -> tuple[FleetRow, ...]:
+    with Threads(2).engaged() as crew:
+        shelf = None if out is None else open_shelf(out, loop)
+        return fit_fleet(list_logs(str(logs)), crew, loop, shelf, lambda: CREATED)
+
+
+def _told(rows: tuple[FleetRow, ...]) -> list[FleetRow]:
+    """All but what differs from one run to the next."""
+    return [replace(row, seconds=0.0, kept=False) for row in rows]
+
+
+def test_threads_give_each_cell_what_a_single_fit_gives(
+    fleet: Path,
+    single: dict[str, dict[str, Any]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # Several tasks look at heads, and a cell's logs are spread over two of them.
+    monkeypatch.setattr(fleet_module, "SURVEYED", 4)
+    out, table = tmp_path / "out", tmp_path / "fleet.csv"
+    code = main(["fleet", str(fleet), "--workers", "2", "--out", str(out), "--csv", str(table), "--json"])
+    assert code == ExitCode.OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["fitted"], told["failed"]) == (CELLS, 0)
+    assert _files(out) == single
+    assert [cell["error_on"] for cell in told["cells"]] == ["holdout"] * WITH_HOLDOUT + ["fit"] * (CELLS - WITH_HOLDOUT)
+    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    for row, cell in zip(rows, told["cells"], strict=True):
+        assert row["cell"] == cell["cell"]
+        assert [float(row[f"{gain['axis']} gain"]) for gain in cell["gains"]] == [
+            gain["value"] for gain in single[row["cell"]]["gains"]
+        ]
+        assert load(Path(row["calibration"])).cell == row["cell"]
+
+
+def test_processes_give_the_same(fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = ["fleet", str(fleet), "--scheduler", "processes", "--workers", "2", "--out", str(out)]
+    assert main(command) == ExitCode.OK
+    assert _files(out) == single
+
+
+def test_a_scheduler_that_runs_already_gives_the_same(
+    few: Path, single: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with distributed.LocalCluster(  # type: ignore[no-untyped-call]
+        n_workers=1, threads_per_worker=2, processes=False, host="127.0.0.1", protocol="tcp", dashboard_address=None
+    ) as cluster:
+        assert main(["fleet", str(few), "--scheduler", cluster.scheduler_address, "--out", str(out)]) == ExitCode.OK
+        assert len(cluster.scheduler.workers) == 1  # it goes on
+    made = _files(out)
+    assert made == {cell: single[cell] for cell in made}
+    assert len(made) == 3
+
+
+def test_the_table_shows_every_cell_and_marks_errors_on_the_fit_itself(
+    few: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["fleet", str(few)]) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert "3 of 3 fitted." in shown
+    lines = {line.split()[0]: line for line in shown.splitlines() if line.startswith("cell-")}
+    assert set(lines) == {"cell-000", "cell-002", "cell-003"}
+    assert [name for name, line in lines.items() if "*" in line] == ["cell-002", "cell-003"]
+    assert "* on the moves of the fit itself" in shown
+
+
+def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (few / "cell-000" / "loaded.mcap").unlink()
+    (few / "cell-000" / "unused.mcap").unlink()
+    whole = (few / "cell-002" / "bare.mcap").read_bytes()
+    (few / "cell-002" / "bare.mcap").write_bytes(whole[: len(whole) // 2])
+    (few / "nobody's.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
+    write(few / "foreign.mcap", content(2), samples([(1, 2)] * 5))
+    assert main(["fleet", str(few), "--json"]) == ExitCode.DATA_UNFIT
+    told = json.loads(capsys.readouterr().out)
+    errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in told["cells"]}
+    assert errors == {
+        "cell-000": "DataUnfit",
+        "cell-002": "LogTruncated",
+        "cell-003": None,
+        "foreign.mcap": "SchemaMismatch",
+        "nobody's.mcap": "LogTruncated",
+    }
+    assert [cell["exit_code"] for cell in told["cells"]] == [4, 4, 0, 6, 4]
+    (truncated,) = (cell for cell in told["cells"] if cell["cell"] == "cell-002")
+    assert str(few / "cell-002" / "bare.mcap") in truncated["error"]["text"]
+
+
+def test_a_run_that_its_recorder_marked_invalid_is_told_of_its_cell(tmp_path: Path, checkout: Path) -> None:
+    files = bundle(checkout / "configs/cells/demo.yaml")
+    write(tmp_path / "a.mcap", content(6, None, files), samples([(0,) * 6] * 9), verdict=(False, "the drives fell off"))
+    (row,) = _fitted(tmp_path, None)
+    assert row.cell == "demo"
+    assert isinstance(row.result, Failure)
+    assert (row.result.kind, row.result.exit_code) == ("RunInvalid", ExitCode.DATA_UNFIT)
+    assert "the drives fell off" in row.result.text
+
+
+def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = bundle(checkout / "configs/cells/demo.yaml")
+    other = files | {"cell.yaml": files["cell.yaml"] + b"\n# moved to another hall\n"}
+    for name, carried in (("a", files), ("b", other), ("c", files)):
+        write(tmp_path / f"{name}.mcap", content(6, None, carried), samples([(0,) * 6] * 9))
+    assert main(["fleet", str(tmp_path), "--json"]) == ExitCode.DATA_UNFIT
+    told = json.loads(capsys.readouterr().out)["cells"]
+    assert [(cell["cell"], cell["configurations"]) for cell in told] == [("demo", 2), ("demo", 2)]
+    assert sorted(len(cell["fit"]) for cell in told) == [1, 2]
+    assert main(["fleet", str(tmp_path)]) == ExitCode.DATA_UNFIT
+    assert "demo: logs of 2 configurations" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = _fitted(few, out)
+    assert [row.kept for row in first] == [False] * 3
+    second = _fitted(few, out)
+    assert [row.kept for row in second] == [True] * 3
+    assert second == tuple(replace(row, kept=True) for row in first)
+    # Another log, another content, a damaged calibration, a state that is none.
+    (few / "cell-000" / "unused.mcap").unlink()
+    assert [row.kept for row in _fitted(few, out)] == [False, True, True]
+    bare = few / "cell-002" / "bare.mcap"
+    bare.write_bytes(bare.read_bytes()[:-1])
+    third = _fitted(few, out)
+    assert [row.kept for row in third] == [True, False, True]
+    assert not third[1].fitted
+    assert third[2].file is not None
+    third[2].file.write_bytes(third[2].file.read_bytes().replace(b"cell-003", b"cell-004"))
+    assert [row.kept for row in _fitted(few, out)] == [True, False, False]
+    third[2].file.with_suffix(".json").write_text("[]")
+    assert [row.kept for row in _fitted(few, out)] == [True, False, False]
+    for cell in ("cell-000", "cell-002"):
+        shutil.rmtree(few / cell)
+    assert _told(_fitted(few, None)) == [replace(_told(third)[2], file=None)]
+
+
+def _only(few: Path, cell: str) -> CellLogs:
+    """The logs of one of the cells, the others removed."""
+    for folder in few.iterdir():
+        if folder.name != cell:
+            shutil.rmtree(folder)
+    (logs,) = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
+    return logs
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".json"])
+@pytest.mark.parametrize("what", ["pipe", "large"])
+def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
+    ending: str, what: str, few: Path, tmp_path: Path
+) -> None:
+    cell, out = _only(few, "cell-003"), tmp_path / "out"
+    (first,) = _fitted(few, out)
+    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    file.unlink()
+    if what == "pipe":
+        os.mkfifo(file)
+    else:
+        with file.open("wb") as stream:
+            stream.truncate(2**40)
+    assert _told(_fitted(few, out)) == _told((first,))
+    assert file.is_file()
+    assert file.stat().st_size < 2**20
+    (third,) = _fitted(few, out)
+    assert third.kept
+
+
+@pytest.mark.parametrize("ending", [".yaml", ".json"])
+@pytest.mark.parametrize("what", ["folder", "link to a folder", "link to a device"])
+def test_what_cannot_be_replaced_on_the_shelf_is_told_before_anything_is_fitted(
+    ending: str, what: str, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, out = _only(few, "cell-003"), tmp_path / "out"
+    monkeypatch.setattr(fleet_module, "fit_cell", None)
+    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    if what == "folder":
+        file.mkdir()
+    else:
+        # No device of the system: if it were replaced after all, everybody would miss it.
+        target = tmp_path / "there"
+        target.mkdir() if what == "link to a folder" else os.mkfifo(target)
+        file.symlink_to(target)
+    before = file.lstat().st_ino
+    with pytest.raises(OutputExists, match=re.escape(str(file))) as caught:
+        _fitted(few, out)
+    assert ("a folder" if "folder" in what else "no regular file") in str(caught.value)
+    assert "move it away" in str(caught.value)
+    assert file.lstat().st_ino == before
+    assert main(["fleet", str(few), "--out", str(out)]) == ExitCode.USAGE
+
+
+def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_told_by_its_name(few: Path, tmp_path: Path) -> None:
+    cell = _only(few, "cell-003")
+    shelf, made = open_shelf(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
+    note = shelf.file(cell).with_suffix(".json")
+    note.mkdir()
+    assert isinstance(made, Fitted)
+    with pytest.raises(OutputFailed, match=re.escape(str(note))):
+        shelf.keep(cell, made)
+
+
+def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
+    for cell in ("cell-000", "cell-003"):
+        shutil.rmtree(few / cell)
+    logs = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
+    _fitted(few, tmp_path / "out")
+    opened, closed = (open_shelf(tmp_path / "out", loop) for loop in (Loop.OPEN, Loop.CLOSED))
+    assert all(opened.standing(cell) is not None for cell in logs)
+    assert all(closed.standing(cell) is None for cell in logs)
+
+
+KILLED = """
+import os, signal, sys
+from datetime import UTC, datetime
+from importlib import import_module
+from daq.fleet.cell_fit import Loop
+from daq.fleet.crew import Threads
+from daq.fleet.fleet import fit_fleet
+from daq.fleet.log_store import list_logs
+from daq.fleet.shelf import open_shelf
+
+def told(done, total, remark):
+    if remark.startswith("cell-") and done == int(sys.argv[3]):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+with Threads(2).engaged() as crew:
+    shelf = open_shelf(__import__("pathlib").Path(sys.argv[2]), Loop.OPEN)
+    fit_fleet(list_logs(sys.argv[1]), crew, Loop.OPEN, shelf, lambda: datetime.now(UTC), told)
+"""
+
+
+def test_killed_in_the_middle_and_started_again_it_gives_the_same(
+    fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, str(fleet), str(out), "2"],
+        check=False,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == -signal.SIGKILL
+    again = _fitted(fleet, out)
+    assert 2 <= sum(row.kept for row in again) < CELLS
+    assert [row.cell for row in again] == sorted(single)
+    assert _files(out) == single
+    # No half file is left beside the calibrations and their states.
+    assert len(list(out.iterdir())) == 2 * CELLS
+
+
+def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
+    few: Path, single: dict[str, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    store: Any = import_module("fsspec").filesystem("memory")
+    for log in few.rglob("*.mcap"):
+        store.pipe(f"/hall/{log.relative_to(few)}", log.read_bytes())
+    try:
+        out = tmp_path / "out"
+        assert main(["fleet", "memory://hall", "--out", str(out)]) == ExitCode.OK
+        made = _files(out)
+        assert made == {cell: single[cell] for cell in made}
+        assert len(made) == 3
+        assert list(scratch.iterdir()) == []
+        seen = by_cell(log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog))
+        assert all(open_shelf(out, Loop.OPEN).standing(cell) is not None for cell in seen)
+        # What is wrong with a copy is told of what it is a copy of.
+        whole = store.cat_file("/hall/cell-002/bare.mcap")
+        store.pipe("/hall/cell-002/bare.mcap", whole[:-100])
+        with Threads(1).engaged() as crew:
+            rows = fit_fleet(list_logs("memory://hall"), crew, Loop.OPEN, None, lambda: CREATED)
+        (failed,) = (row.result for row in rows if isinstance(row.result, Failure))
+        assert failed.text.startswith("memory:///hall/cell-002/bare.mcap")
+    finally:
+        store.rm("/hall", recursive=True)
+
+
+def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
+    by_path, by_address = list_logs(str(few)), list_logs(f"file://{few}")
+    assert [log.name for log in by_path] == [log.name for log in by_address]
+    told = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]
+            for logs in (by_path, by_address)]  # fmt: skip
+    assert told[0] == told[1]
+    assert len(told[0]) == 7
+
+
+@pytest.mark.parametrize("address", ["{}", "file://{}", "local://{}"])
+def test_a_name_of_a_log_that_is_no_file_is_a_row(
+    address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """None of them is opened: nobody would ever come to the other end of the pipe."""
+    logs = tmp_path / "logs"
+    (logs / "folder.mcap").mkdir(parents=True)
+    (logs / "folder.mcap" / "gone.mcap").symlink_to(tmp_path / "unmounted.mcap")
+    (logs / "link.mcap").symlink_to(logs / "folder.mcap")
+    (logs / "round.mcap").symlink_to(logs / "round.mcap")
+    (logs / "zero.mcap").symlink_to("/dev/zero")
+    os.mkfifo(logs / "pipe.mcap")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind(str(logs / "socket.mcap"))
+        assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
+    told = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
+    assert {name: cell["error"]["text"].split("; expected")[0] for name, cell in told.items()} == {
+        "folder.mcap": f"{logs}/folder.mcap: found a folder",
+        "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to {tmp_path}/unmounted.mcap, "
+        "which leads nowhere",
+        "link.mcap": f"{logs}/link.mcap: found a folder",
+        "pipe.mcap": f"{logs}/pipe.mcap: found something that is no regular file",
+        "round.mcap": f"{logs}/round.mcap: found a link to {logs}/round.mcap, which leads nowhere",
+        "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
+        "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
+    }
+    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in told.values()} == {("LogMissing", 4)}
+
+
+def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
+    links = tmp_path / "links"
+    links.mkdir()
+    for log in (few / "cell-002").iterdir():
+        (links / log.name).symlink_to(log)
+    assert [row.fitted for row in _fitted(links, None)] == [True]
+
+
+def test_a_pipe_that_takes_the_place_of_a_log_meanwhile_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(LogMissing, match="no regular file"):
+        at_hand(StoredLog(str(tmp_path / "a.mcap"), "a.mcap"), tmp_path)
+
+
+@pytest.mark.parametrize("place", ["nowhere", "memory://nowhere", "."])
+def test_a_place_without_logs_is_no_empty_table(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(LogMissing):
+        list_logs(place)
+    assert main(["fleet", place]) == ExitCode.DATA_UNFIT
+
+
+def test_what_is_not_installed_is_named_with_the_line_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> Any:
+        raise ImportError(name)
+
+    monkeypatch.setattr(crew_module, "import_module", absent)
+    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), Processes(1).engaged():
+        pass
+    with pytest.raises(ConfigurationMissing, match="nonsense"):
+        list_logs("nonsense://bucket/logs")
+
+
+def test_processes_of_this_machine_listen_to_nobody_else() -> None:
+    with Processes(1).engaged() as crew:
+        assert crew.executor.submit(len, "abc").result() == 3
+        assert crew.present()
+        psutil = import_module("psutil")  # distributed brings it
+        here = psutil.Process()
+        ours = [here, *here.children(recursive=True)]
+        listening = [
+            connection.laddr.ip
+            for process in ours
+            for connection in process.net_connections("inet")
+            if connection.status == psutil.CONN_LISTEN
+        ]
+    assert len(listening) >= 3
+    assert set(listening) == {"127.0.0.1"}
+
+
+def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew_module, "CONNECT_S", 0.2)
+    # Port 9, discard: nobody answers there.
+    with pytest.raises(UsageError, match="a dask scheduler that answers"), Scheduler("tcp://127.0.0.1:9", 1).engaged():
+        pass
+
+
+def test_the_words_of_scheduler() -> None:
+    assert crew_of("threads", 3) == Threads(3)
+    assert crew_of("processes", 2) == Processes(2)
+    assert crew_of("tcp://10.0.0.1:8786", None) == Scheduler("tcp://10.0.0.1:8786", None)
+    assert crew_of("threads", None).workers
+    with pytest.raises(UsageError):
+        crew_of("process", None)
+
+
+def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes.csv"
+    notes.write_text("my notes\n")
+    assert main(["fleet", str(few), "--csv", str(notes)]) == ExitCode.USAGE
+    assert notes.read_text() == "my notes\n"
+    assert main(["fleet", str(few), "--csv", str(tmp_path / "absent" / "fleet.csv")]) == ExitCode.UNEXPECTED
+    assert main(["fleet", str(few), "--out", str(notes)]) == ExitCode.USAGE
+
+
+def test_an_error_that_nobody_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+
+    def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Unfitted:
+        if cell.cell == "cell-002":
+            raise MemoryError
+        return fit_cell(cell, loop, created)
+
+    monkeypatch.setattr(fleet_module, "fit_cell", sometimes)
+    rows = _fitted(few, None)
+    assert [row.fitted for row in rows] == [True, False, True]
+    assert rows[1].result == Failure("MemoryError", "MemoryError", ExitCode.UNEXPECTED)
+
+
+def test_heads_that_nobody_could_read_are_rows(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(_logs: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(fleet_module, "survey", killed)
+    rows = _fitted(few, None)
+    assert len(rows) == 7
+    assert not any(row.fitted for row in rows)
+
+
+def test_a_name_that_is_no_text_ends_nothing(few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Bytes that are no UTF-8, in a log of a cell and in one of nobody."""
+    shutil.rmtree(few / "cell-000")
+    (few / "cell-002" / "bare.mcap").rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
+    (few / os.fsdecode(b"=c\xff\x1b[2J.mcap")).write_bytes(b"\x89MCAP0\r\nno log of ours")
+    out, table = tmp_path / "out", tmp_path / "fleet.csv"
+    assert main(["fleet", str(few), "--out", str(out), "--csv", str(table)]) == ExitCode.DATA_UNFIT
+    assert "\x1b[2J" not in capsys.readouterr().out
+    assert [row["cell"] for row in csv.DictReader(io.StringIO(table.read_text()))] == [
+        "cell-002",
+        "cell-003",
+        "'=c\\udcff\x1b[2J.mcap",
+    ]
+    assert main(["fleet", str(few), "--out", str(out), "--json"]) == ExitCode.DATA_UNFIT
+    cells = json.loads(capsys.readouterr().out.encode())["cells"]
+    assert [cell["exit_code"] for cell in cells] == [4, 0, 4]
+    assert "rename it" in cells[0]["error"]["text"]
+    assert "b\\udcff.mcap" in " ".join(cells[0]["fit"])
+
+
+def test_a_log_that_changes_meanwhile_is_told(few: Path) -> None:
+    cells = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
+    shutil.copy(few / "cell-002" / "bare.mcap", few / "cell-003" / "loaded.mcap")
+    shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "unused.mcap")
+    kinds = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
+    assert [made.failure.kind if isinstance(made, Unfitted) else "" for made in kinds] == [
+        "LogRepeated",
+        "",
+        "LogsDiffer",
+    ]
+    whole = cells[1]
+    stale = replace(whole, fit=(replace(whole.fit[0], fingerprint="0" * 64), *whole.fit[1:]))
+    made = fit_cell(stale, Loop.OPEN, CREATED)
+    assert isinstance(made, Unfitted)
+    assert "another content" in made.failure.text
+
+
+class _Gone(Executor):
+    """Whose scheduler has died: everything is cancelled, or nothing ever comes back."""
+
+    def __init__(self, cancels: bool) -> None:
+        self.cancels = cancels
+
+    def submit(self, _function: Callable[..., Any], /, *_: Any, **__: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self.cancels:
+            future.cancel()
+            future.set_running_or_notify_cancel()
+        return future
+
+
+@pytest.mark.parametrize("cancels", [True, False])
+def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_module, "LOOK_S", 0.01)
+    crew = Crew(_Gone(cancels), 2, lambda: False)
+
+    def submit(piece: int) -> Future[str]:
+        return crew.executor.submit(str, piece)
+
+    outcomes = each(submit, (1, 2, 3), crew)
+    with pytest.raises(UsageError, match="goes on where it was"):
+        next(outcomes)
+
+
+@given(st.integers(1, 5), st.integers(0, 30))
+def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) -> None:
+    handed, back, most = 0, 0, 0
+    with ThreadPoolExecutor(workers) as executor:
+
+        def submit(piece: int) -> Future[int]:
+            nonlocal handed, most
+            handed += 1
+            most = max(most, handed - back)
+            return executor.submit(pow, piece, 2)
+
+        results = {}
+        for piece, made in each(submit, range(pieces), Crew(executor, workers, lambda: True)):
+            results[piece] = made
+            back += 1
+    assert results == {piece: piece**2 for piece in range(pieces)}
+    # The next one goes out before the one that came back is looked at.
+    assert most <= workers + 1
+
+
+def _seen_logs() -> st.SearchStrategy[list[SeenLog]]:
+    one = st.builds(
+        SeenLog,
+        log=st.just(StoredLog("", "")),
+        fingerprint=st.just(""),
+        cell=st.sampled_from(("a", "b")),
+        configuration_sha256=st.sampled_from(("1", "2")),
+        mounting=st.sampled_from((None, "x", "y")),
+        started_ns=st.integers(0, 5),
+    )
+    return st.lists(one, max_size=12).map(
+        lambda logs: [
+            replace(log, log=StoredLog(f"/{number}", str(number)), fingerprint=f"{number:064x}")
+            for number, log in enumerate(logs)
+        ]
+    )
+
+
+@given(_seen_logs(), st.randoms(use_true_random=False))
+def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) -> None:
+    cells = by_cell(logs)
+    assert sorted(seen.log.name for cell in cells for seen in (*cell.fit, *cell.holdout)) == sorted(
+        seen.log.name for seen in logs
+    )
+    assert len({(cell.cell, cell.configuration_sha256) for cell in cells}) == len(cells)
+    for cell in cells:
+        assert {(seen.cell, seen.configuration_sha256) for seen in (*cell.fit, *cell.holdout)} == {
+            (cell.cell, cell.configuration_sha256)
+        }
+        fitted = [seen.mounting for seen in cell.fit]
+        assert len(cell.holdout) <= 1
+        for held in cell.holdout:
+            assert held.mounting is not None
+            assert {held.mounting, None} <= set(fitted)
+            assert all(seen.started_ns <= held.started_ns for seen in cell.fit if seen.mounting is not None)
+        if not cell.holdout and None in fitted:
+            newest = [mounting for mounting in fitted if mounting is not None][-1:]
+            assert all(fitted.count(mounting) == 1 for mounting in newest)
+    shuffled = list(logs)
+    random.shuffle(shuffled)
+    assert by_cell(shuffled) == cells
+
+
+def test_a_log_that_cannot_be_read_is_told_by_its_name(tmp_path: Path) -> None:
+    (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere")
+    (found,) = survey([StoredLog(str(tmp_path / "gone.mcap"), "gone.mcap")])
+    assert isinstance(found, UnknownLog)
+    assert isinstance(found.error, DaqError)

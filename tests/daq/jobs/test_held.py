@@ -1,0 +1,504 @@
+"""What holds a job: interlock, mount, another job, time, signals, room, clock; and that the next one takes it up."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import tracemalloc
+from contextlib import suppress
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.cli.terminal import interruptible
+from daq.config.recalibration import Command, Interlock, InterlockFile
+from daq.errors import (
+    BusTaken,
+    ClockWentBack,
+    ConfigurationInconsistent,
+    ControllerUnfit,
+    DiskSpaceShort,
+    ExitCode,
+    MountFailed,
+    NotReleased,
+    OutputFailed,
+    TimeBoundReached,
+    exit_code,
+)
+from daq.jobs.interlock import TOLD, Finished, require_release, run_command, time_bound
+from daq.jobs.job import preview
+from daq.jobs.journal import Form, Journal
+from daq.jobs.preflight import section_of
+from daq.jobs.session import Outcome
+from daq.ledger.audit import AuditAction
+from daq.workflow.record import Recorded
+from daq.workflow.safeguards import bus_lock, lock_name
+from drivers.errors import MotionRefused
+from drivers.simulation.drive import PowerState
+from tests.daq.jobs.made import Made, made_rig
+from tests.daq.jobs.rig import BEGAN, Rig, make_rig, powerless, serving
+
+
+def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
+    """The job is held by that; nothing was written but where it is told."""
+    before = rig.controller.read_bytes()
+    with pytest.raises(kind) as caught:
+        rig.job()
+    assert rig.controller.read_bytes() == before
+    assert exit_code(kind) == code
+    assert rig.session.state.outcome is Outcome.STOPPED
+    assert rig.session.state.exit_code == code
+    assert rig.audit[-1].action is AuditAction.RECALIBRATION_ENDED
+    assert rig.audit[-1].details["exit_code"] == code
+    return caught.value
+
+
+def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.closed.unlink()
+    asked = []
+    rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
+    held(rig, NotReleased, ExitCode.NOT_RELEASED)
+    assert asked == []
+    assert not (rig.cells / "mounted").exists()
+    # The door is closed: the next job takes the session up.
+    rig.closed.touch()
+    assert rig.job().outcome is Outcome.APPLIED
+    assert rig.session.state.attempt == 2
+
+
+def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: Path, one_move: Path) -> None:
+    """In the simulated cell: whoever mounts the payload leaves the door open."""
+    left_open = {"command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]}
+    rig = make_rig(tmp_path / "cell", one_move, mount=left_open)
+    with serving(rig) as cell:
+        held(rig, NotReleased, ExitCode.NOT_RELEASED)
+        assert powerless(cell)
+        moved_s = cell.plant.time_s
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    assert not (rig.session.folder / "loaded-1.mcap.part").exists()
+    assert moved_s < 10.0
+
+
+@pytest.mark.parametrize("warm_up_min", [0, 0.05], ids=["run", "warm-up"])
+def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_power(
+    tmp_path: Path, one_move: Path, warm_up_min: float
+) -> None:
+    """Preflight and the recorder's begin have seen it closed; the last question comes when only the motion is left."""
+    rig = make_rig(tmp_path / "cell", one_move, warm_up_min=warm_up_min)
+    cycles: list[int] = []
+    with serving(rig) as cell:
+
+        def asking(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
+            ended = run_command(command, further, folder)
+            if command.arguments[0] == "test":
+                cycles.append(cell.cycles)
+                if len(cycles) == 2:
+                    rig.closed.unlink()
+            return ended
+
+        rig.tools = replace(rig.tools, run=asking)
+        held(rig, NotReleased, ExitCode.NOT_RELEASED)
+        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        assert cell.cycles == cycles[2]
+    # By the third question the drives had been mapped and had answered a SYNC, and no move had been made.
+    assert len(cycles) == 3
+    assert 0 < cycles[2] - cycles[1] < 10
+    assert not list(rig.session.folder.glob("*.mcap*"))
+
+
+def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, mount={"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]})
+    error = held(rig, MountFailed, ExitCode.JOB_HELD)
+    assert "disc" in str(error)
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    first = rig.session.state.runs[0]
+    (rig.cells / "changer").touch()
+    recorded = []
+    copied = rig.tools.record
+
+    def noting(*given: Any, **further: Any) -> Recorded:
+        recorded.append(given[3].stem)
+        found: Recorded = copied(*given, **further)
+        return found
+
+    rig.tools = replace(rig.tools, record=noting)
+    assert rig.job().outcome is Outcome.APPLIED
+    assert recorded == ["loaded-1", "unused"]
+    assert rig.session.state.runs[0] == first
+
+
+def test_two_jobs_at_once_are_one(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
+        rig.job()
+    assert rig.sessions == ()
+    assert exit_code(BusTaken) == ExitCode.BUS_TAKEN
+    assert rig.job().outcome is Outcome.APPLIED
+    assert not list(rig.folder.glob("*.lock"))
+
+
+def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> None:
+    """A bus across processes; the other one is killed."""
+    rig = made_rig(tmp_path / "cell", made)
+    shared = replace(
+        rig.cell, buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
+    )
+    told, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException), bus_lock(shared, rig.folder):
+            os.write(tell, b"x")
+            signal.pause()
+        os._exit(0)
+    try:
+        assert os.read(told, 1) == b"x"
+        with pytest.raises(BusTaken), bus_lock(shared, rig.folder):
+            pass
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(told)
+        os.close(tell)
+    with bus_lock(shared, rig.folder):
+        pass
+
+
+def test_another_user_learns_that_a_bus_is_taken_whatever_our_umask_is(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    before = os.umask(0o077)
+    try:
+        with bus_lock(rig.cell, rig.folder):
+            (lock,) = rig.folder.glob("*.lock")
+            assert lock.stat().st_mode & 0o777 == 0o644
+    finally:
+        os.umask(before)
+
+
+def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    (bus,) = rig.cell.buses
+    os.mkfifo(rig.folder / lock_name(bus))
+    with pytest.raises(OutputFailed, match="no regular file"), bus_lock(rig.cell, rig.folder):
+        pass
+    assert (rig.folder / lock_name(bus)).is_fifo()
+
+
+def test_a_hub_has_one_lock_whatever_it_is_called(tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    known = {"hub": ["fd00::7", "10.0.0.9", "10.0.0.7"], "hub.lan": ["10.0.0.7", "10.0.0.9"], "other": ["10.0.0.8"]}
+    known |= {"localhost": ["::1", "127.0.0.1"], "127.0.0.1": ["127.0.0.1"], "::1": ["::1"]}
+
+    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
+        if host not in known:
+            raise socket.gaierror(-2, "Name or service not known")
+        kinds = [socket.AF_INET6 if ":" in one else socket.AF_INET for one in known[host]]
+        return [(kind, 1, 6, "", (one, port)) for kind, one in zip(kinds, known[host], strict=True)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", addresses)
+
+    def name(host: str) -> str:
+        return lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
+
+    assert name("hub") == name("hub.lan") == "drivegain-socketcand-can0-10.0.0.7-29536.lock"
+    assert name("localhost") == name("127.0.0.1") == name("::1") != name("hub")
+    assert name("other") != name("hub")
+    assert name("Nowhere") == name("nowhere") == "drivegain-socketcand-can0-nowhere-29536.lock"
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1", "127.0.0.2", "0.0.0.0", "::", "::1", "::ffff:127.0.0.1", "::ffff:0.0.0.0", "::FFFF:7f00:1"],
+)
+def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
+    assert (
+        lock_name(hub) == lock_name(replace(hub, host="localhost")) == "drivegain-socketcand-can0-localhost-29536.lock"
+    )
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("::ffff:10.0.0.7", "10.0.0.7"), ("::ffff:a00:7", "10.0.0.7"), ("fd00:0::7", "fd00::7")]
+)
+def test_an_address_of_a_hub_may_be_spelt_in_several_ways(one: str, other: str, tmp_path: Path, made: Made) -> None:
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    names = [
+        lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
+        for host in (one, other, "10.0.0.8")
+    ]
+    assert names[0] == names[1] != names[2]
+
+
+def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
+    tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As getaddrinfo answers where it maps; the IPv4 address goes before others as it does unmapped."""
+    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    known = {"hub": ["2001:db8::1", "::ffff:10.0.0.7"], "10.0.0.7": ["10.0.0.7"]}
+
+    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
+        return [(socket.AF_INET6 if ":" in one else socket.AF_INET, 1, 6, "", (one, port)) for one in known[host]]
+
+    monkeypatch.setattr(socket, "getaddrinfo", addresses)
+    hub = replace(bus, interface="socketcand", channel="can0", host="hub", port=29536)
+    assert lock_name(hub) == lock_name(replace(hub, host="10.0.0.7"))
+
+
+def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    powered = []
+    with serving(rig) as cell:
+
+        def room(_folder: Path) -> int:
+            # Asked ten times a second of recorded time: in the middle of the first move the bound is reached.
+            if any(node.drive.state is PowerState.OPERATION_ENABLED for node in cell.nodes):
+                powered.append(True)
+                if len(powered) == 3:
+                    signal.raise_signal(signal.SIGALRM)
+            return 10**12
+
+        rig.tools = replace(rig.tools, free=room)
+        held(rig, TimeBoundReached, ExitCode.TIME_BOUND)
+        assert powerless(cell)
+    assert len(powered) == 3
+    assert (rig.session.folder / "bare-1.mcap.part").exists()
+
+
+def test_an_alarm_does_not_cut_a_stop_short() -> None:
+    with time_bound(60.0) as undisturbed:
+        with undisturbed():
+            signal.raise_signal(signal.SIGALRM)
+            # It comes again.
+            left_s, _ = signal.getitimer(signal.ITIMER_REAL)
+            assert 0.0 < left_s <= 1.0
+        with pytest.raises(TimeBoundReached):
+            signal.raise_signal(signal.SIGALRM)
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+
+
+def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move)
+    asked = []
+    with serving(rig) as cell:
+
+        def room(_folder: Path) -> int:
+            asked.append(True)
+            if len(asked) == 5:
+                signal.raise_signal(signal.SIGTERM)
+            return 10**12
+
+        rig.tools = replace(rig.tools, free=room)
+        before = rig.controller.read_bytes()
+        with interruptible() as undisturbed, pytest.raises(KeyboardInterrupt):
+            rig.job(undisturbed=undisturbed)
+        assert powerless(cell)
+    assert rig.controller.read_bytes() == before
+    assert rig.session.state.outcome is Outcome.INTERRUPTED
+    assert rig.session.state.exit_code == ExitCode.INTERRUPTED
+    assert rig.audit[-1].details["outcome"] == "interrupted"
+
+
+def test_a_disk_that_is_full_is_told_of_before_and_during_a_run(tmp_path: Path, one_move: Path) -> None:
+    rig = make_rig(tmp_path / "cell", one_move, min_free_mb=1000)
+    rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
+    error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
+    assert "min_free_mb" in str(error)
+    rooms = iter((10**12, 10**12, 10**12, 10**12))
+    rig.tools = replace(rig.tools, free=lambda _: next(rooms, 10**6))
+    with serving(rig) as cell:
+        held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
+        assert powerless(cell)
+
+
+def test_a_clock_that_went_back_is_an_alarm(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    assert rig.job().outcome is Outcome.APPLIED
+    rig.clock.at = BEGAN - timedelta(days=3)
+    with pytest.raises(ClockWentBack, match="2026-01-02"):
+        rig.job()
+    assert len(rig.sessions) == 1
+    assert exit_code(ClockWentBack) == ExitCode.JOB_HELD
+
+
+def test_nothing_moves_without_the_cells_own_leave(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, policy={"motion": "ask"})
+    with pytest.raises(MotionRefused, match="policy"):
+        rig.job()
+    assert rig.sessions == ()
+    assert not (rig.cells / "demo.audit.jsonl").exists()
+
+
+def test_two_weighings_agree_as_they_do_everywhere(tmp_path: Path, made: Made) -> None:
+    """0.4 - 0.3 is more than 0.1 in binary; as for `record` and the gates, two spellings of one number are one."""
+    cell = made_rig(tmp_path / "cell", made).cell
+    section = cell.recalibration
+    assert section is not None
+    runs = tuple(replace(run, mass_kg=None if run.payload is None else 0.4) for run in section.runs)
+    payloads = tuple(replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1) for payload in cell.payloads)
+    weighed = replace(cell, payloads=payloads, recalibration=replace(section, runs=runs))
+    assert section_of(weighed).runs == runs
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [("payload", "anvil", "disc"), ("mass_kg", 4.7, r"4.59 kg ± 0.005")],
+)
+def test_a_run_whose_payload_is_not_the_cells_is_refused(
+    tmp_path: Path, made: Made, key: str, value: object, message: str
+) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    text = rig.cell_file.read_text(encoding="utf-8")
+    document = json.loads(text)
+    document["recalibration"]["runs"][1][key] = value
+    rig.cell_file.write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        rig.job()
+    assert rig.sessions == ()
+
+
+def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
+    path = tmp_path / "interlock"
+    file = InterlockFile(path, "closed", 5.0)
+    interlock = Interlock(Command(("some", "program"), 1.0), file)
+
+    def ask(code: int | None = 0, later_s: float = 0.0) -> None:
+        now = BEGAN + timedelta(seconds=later_s)
+        require_release(interlock, lambda *_: Finished(code, "said"), lambda: now, tmp_path)
+
+    with pytest.raises(NotReleased, match="no such file"):
+        ask()
+    path.write_text("closed\nand more\n")
+    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    for later_s in (-5.0, 0.0, 4.9):
+        ask(later_s=later_s)
+    for later_s in (-6.0, 6.0, 3600.0):
+        with pytest.raises(NotReleased, match="an age of"):
+            ask(later_s=later_s)
+    for code in (1, None, -9):
+        with pytest.raises(NotReleased, match="said"):
+            ask(code)
+    for text in ("open\n", "", "closed?\n"):
+        path.write_text(text)
+        os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+        with pytest.raises(NotReleased, match="in its first line"):
+            ask()
+
+
+def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path) -> None:
+    """A command that takes 9 s of a file's 5: the file was fresh when the command was asked, and is not any more."""
+    path = tmp_path / "interlock"
+    path.write_text("closed\n")
+    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    at = [BEGAN]
+
+    def slow(*_: object) -> Finished:
+        at[0] += timedelta(seconds=9)
+        return Finished(0, "")
+
+    interlock = Interlock(Command(("some", "program"), 10.0), InterlockFile(path, "closed", 5.0))
+    with pytest.raises(NotReleased, match="an age of 9 s"):
+        require_release(interlock, slow, lambda: at[0], tmp_path)
+
+
+def test_an_interlock_that_is_no_file_says_no_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", tmp_path, Path(os.devnull)):
+        interlock = Interlock(None, InterlockFile(path, "closed", 5.0))
+        with pytest.raises(NotReleased, match=r"no regular file|is a directory"):
+            require_release(interlock, run_command, lambda: BEGAN, tmp_path)
+
+
+def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Path) -> None:
+    much = "i=0; while [ $i -lt 2000 ]; do printf '%01000d' 0; i=$((i+1)); done; echo; echo the end; exit 3"
+    tracemalloc.start()
+    try:
+        ended = run_command(Command(("sh", "-c", much), 60.0), (), tmp_path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert ended.code == 3
+    assert ended.said.endswith("0\nthe end")
+    assert len(ended.said) == TOLD
+    assert peak < 1_000_000
+    endless = run_command(Command(("yes",), 0.2), (), tmp_path)
+    assert endless == Finished(None, "not ended within 0.2 s")
+    silent = run_command(Command(("sh", "-c", "exec >&- 2>&-; sleep 60"), 0.2), (), tmp_path)
+    assert silent == Finished(None, "not ended within 0.2 s")
+
+
+def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    ended = run_command(Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0), ("disc",), tmp_path)
+    assert ended.code == 3
+    assert ended.said == f"disc in {tmp_path.resolve()}"
+    assert run_command(Command(("no such program",), 10.0), (), tmp_path).code is None
+    slow = run_command(Command(("sh", "-c", "sleep 60 & echo $! > pid; wait"), 0.2), (), tmp_path)
+    assert slow == Finished(None, "not ended within 0.2 s")
+    with suppress(ProcessLookupError):  # which has gone already
+        started = os.pidfd_open(int((tmp_path / "pid").read_text()))
+        ended_within_s = 30.0
+        assert select.select([started], [], [], ended_within_s)[0] == [started]
+        os.close(started)
+
+
+def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, warm_up_min=5)
+    before = sorted(rig.folder.rglob("*"))
+    journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    seen = preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+    assert "a new session" in seen.remark
+    assert seen.steps[0] == "warm up for 5 min"
+    assert "mount disc, record loaded-1" in seen.steps
+    assert sorted(rig.folder.rglob("*")) == before
+    rig.closed.unlink()
+    with pytest.raises(NotReleased):
+        preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+
+
+def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, warm_up_min=0.2)
+    made_of, copied = [], rig.tools.record
+
+    def noting(*given: Any, **further: Any) -> Recorded:
+        made_of.append(given[3].stem)
+        if given[3].stem == "warm-up":
+            further["before_motion"]()
+            given[3].touch()
+            return made.recorded["bare-1"]
+        found: Recorded = copied(*given, **further)
+        return found
+
+    asked = []
+
+    def asking(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
+        asked.append(command.arguments[0])
+        return run_command(command, further, folder)
+
+    rig.tools = replace(rig.tools, record=noting, run=asking)
+    assert rig.job().outcome is Outcome.APPLIED
+    # 12 s in passes of a plan of about 4.4 s.
+    assert made_of == ["warm-up"] * 3 + ["bare-1", "loaded-1", "unused"]
+    # Preflight; then before each recording, and again before its motion.
+    assert asked == ["test", "sh", *["test"] * 8, "sh", *["test"] * 2, "sh", *["test"] * 2]
+    assert not list(rig.session.folder.glob("warm-up*"))
+
+
+def test_a_link_that_no_write_would_follow_is_refused_before_anything_is_recorded(
+    tmp_path: Path, short_plan: Path
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    behind = tmp_path / "open" / "gains.yaml"
+    behind.parent.mkdir()
+    rig.controller.rename(behind)
+    rig.controller.symlink_to(behind)
+    behind.parent.chmod(0o777)
+    with pytest.raises(ControllerUnfit, match="everybody may write"):
+        rig.job()
+    assert rig.sessions == ()

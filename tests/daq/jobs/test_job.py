@@ -1,0 +1,99 @@
+"""The job as a whole: what it makes, when it is not due, what it refuses, and what it leaves to a person."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+from daq.jobs.session import Outcome
+from daq.ledger.audit import AuditAction
+from daq.ledger.store import HistoryStore
+from tests.daq.jobs.made import Made, made_rig
+from tests.daq.jobs.rig import WHO, Rig
+
+
+def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_it(
+    whole_job: tuple[Rig, Made],
+) -> None:
+    rig, _ = whole_job
+    session = rig.session
+    assert session.state.outcome is Outcome.APPLIED
+    assert session.state.exit_code == ExitCode.OK
+    names = {path.name for path in session.folder.rglob("*")}
+    assert {"calibration.yaml", "report.html", "residual.json", "summary.txt", "proposal.diff", "state.json"} <= names
+    found = {
+        gain["axis"]: gain["value"]
+        for gain in yaml.safe_load((session.folder / "calibration.yaml").read_text())["gains"]
+    }
+    written = yaml.safe_load(rig.controller.read_text())["drives"]
+    for axis, value in found.items():
+        assert written[axis]["gain"] == pytest.approx(value, rel=1e-3)
+    actions = [entry.action for entry in rig.audit]
+    assert actions == [
+        AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        AuditAction.RECALIBRATION_ENDED,
+    ]
+    assert rig.audit[-1].details["outcome"] == "applied"
+    assert rig.audit[-1].sha256 == session.state.audit_sha256
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        assert [event.who for event in store.events()] == [WHO]
+        assert store.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
+        # By which `history --verify` notices an audit whose end was cut off.
+        assert store.audited() <= {entry.sha256 for entry in rig.audit}
+        assert len(store.audited()) == 1
+    # The numbers in the file were the manufacturer's: of none of them a σ is known.
+    assert session.state.decision is not None
+    assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
+    assert [gain.alarm for gain in session.state.watched] == [""] * 6
+    summary = json.loads((session.folder / "summary.json").read_text())
+    assert summary["outcome"] == "applied"
+    assert "drivegain rollback" in " ".join(summary["to_do"])
+    metrics = (rig.cells / "drivegain_demo.prom").read_text()
+    assert 'drivegain_recalibration_outcome{cell="demo",outcome="applied"} 1.0' in metrics
+    assert 'drivegain_recalibration_gain_drift_sigma{axis="J4",cell="demo"}' in metrics
+    assert {event["level"] for event in rig.events} <= {"info", "notice", "warning"}
+
+
+def test_the_way_back_and_back_again_to_what_a_job_wrote_is_known(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.job()
+    target, digest = str(rig.controller), rig.audit[-1].details["calibration_sha256"]
+    known: list[str | None] = []
+    for _ in range(2):
+        assert main(["rollback", "--cell", str(rig.cell_file), "--by", "a person"]) == ExitCode.OK
+        with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+            known.append(store.in_force(target))
+    assert known == [None, digest]
+
+
+def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -> None:
+    """By the mount command alone; a fit of runs that all carried the same would have found no gain."""
+    rig, made = whole_job
+    assert (rig.cells / "mounted").read_text() == "disc\n"
+    mounted = [event["payload"] for event in rig.events if event["event"] == "mounted"]
+    assert mounted == ["none", "disc", "disc"]
+    assert made.closed.final.training_error.total < 10.0
+
+
+def test_nothing_is_due_while_the_last_good_calibration_is_young(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, every_h=144)
+    assert rig.job().outcome is Outcome.APPLIED
+    before = rig.controller.read_bytes()
+    for hours in (1, 100, 42):
+        rig.clock.go_on(hours=hours)
+        assert rig.job().outcome is Outcome.NOT_DUE
+    assert len(rig.sessions) == 1
+    assert len(rig.audit) == 4
+    rig.clock.go_on(hours=2)
+    # The same logs again: what is found is what the controller has.
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert rig.controller.read_bytes() == before
+    assert len(rig.sessions) == 2
+    assert len(rig.backups) == 1

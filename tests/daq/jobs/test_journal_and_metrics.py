@@ -1,0 +1,93 @@
+"""What a job says while it runs, and what a monitor reads."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client.parser import text_string_to_metric_families
+
+from daq.errors import OutputFailed
+from daq.jobs.journal import Figures, Form, Journal, Level, form_of, write_metrics
+from daq.jobs.session import Outcome
+
+AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)
+
+
+def said(form: Form, level: Level = Level.INFO, event: str = "event", **fields: object) -> str:
+    stream = io.StringIO()
+    Journal(stream, form, lambda: AT, session="s", step="fit").say(level, event, **fields)
+    return stream.getvalue()
+
+
+@given(st.text(), st.dictionaries(st.text(), st.floats() | st.text() | st.integers()), st.sampled_from(Level))
+def test_an_event_is_one_line_whatever_is_in_it(text: str, values: dict[str, object], level: Level) -> None:
+    for form in (Form.JSON, Form.JOURNAL):
+        line = said(form, level, "event", text=text, values=values)
+        assert line.endswith("\n")
+        assert line.count("\n") == 1
+        prefix = f"<{int(level)}>" if form is Form.JOURNAL else ""
+        assert line.startswith(prefix)
+        found = json.loads(line.removeprefix(prefix))
+        assert (found["event"], found["text"], found["step"]) == ("event", text, "fit")
+        assert found["level"] == level.name.lower()
+        assert datetime.fromisoformat(found["time"]) == AT
+
+
+def test_a_person_reads_words_and_no_control_characters() -> None:
+    line = said(Form.TEXT, text="one\n\x1b[31mtwo", share=0.25)
+    assert line.count("\n") == 1
+    assert "\x1b" not in line
+    assert "share 0.25" in line
+
+
+def test_numbers_that_json_cannot_say_are_null() -> None:
+    assert json.loads(said(Form.JSON, gain=math.nan, more=[math.inf, 1.0]))["more"] == [None, 1.0]
+
+
+def test_a_reader_that_has_gone_does_not_stop_a_job(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as stream:
+        Journal(stream, Form.JSON, lambda: AT).say(Level.INFO, "event")
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def test_the_journal_is_known_by_the_stream_that_systemd_names(tmp_path: Path) -> None:
+    path = tmp_path / "stderr"
+    with path.open("w") as stream:
+        found = os.fstat(stream.fileno())
+        assert form_of(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}) is Form.JOURNAL
+        # Of a service whose stderr was redirected since.
+        assert form_of(stream, {"JOURNAL_STREAM": "1:2"}) is Form.JSON
+        assert form_of(stream, {}) is Form.JSON
+
+
+def figures(outcome: Outcome) -> Figures:
+    return Figures('the "cell"\\', outcome, 11, AT, 12.5, None, None, None)
+
+
+def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: Path) -> None:
+    (tmp_path / "drivegain_the_cell__e183a8.prom").write_text("half of a fi")
+    path = write_metrics(figures(Outcome.STOPPED), tmp_path)
+    assert path.name == "drivegain_the_cell__e183a8.prom"
+    assert path.stat().st_mode & 0o777 == 0o644
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    families = {family.name: family for family in text_string_to_metric_families(path.read_text())}
+    outcomes = {s.labels["outcome"]: s.value for s in families["drivegain_recalibration_outcome"].samples}
+    assert outcomes["stopped"] == 1.0
+    assert sum(outcomes.values()) == 1.0
+    assert families["drivegain_recalibration_exit_code"].samples[0].labels["cell"] == 'the "cell"\\'
+    assert "drivegain_recalibration_last_success_timestamp_seconds" not in families
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(OutputFailed, match="no such file"):
+        write_metrics(figures(Outcome.APPLIED), tmp_path / "none")

@@ -1,0 +1,221 @@
+"""A job that is killed (-9) at any step, and the next one, which goes on: what was found is applied exactly once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import warnings
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daq.errors import ExitCode
+from daq.jobs.session import Outcome
+from daq.jobs.tools import Tools
+from daq.ledger.audit import AuditAction
+from daq.ledger.store import HistoryStore
+from daq.writeback.file_target import roll_back
+from tests.daq.jobs.made import Made, made_rig
+from tests.daq.jobs.rig import Rig
+
+CALLED = tuple(field.name for field in fields(Tools) if field.name not in {"monotonic_s", "plan"})
+"""What a job hands its work to: between two of these calls it reads and writes its own files."""
+
+
+EFFECTS = ("record", "save_report", "apply")
+PURE = ("close_loop", "calibration", "account")
+"""Nothing is written between the fit and these: to be killed there is to be killed at the fit."""
+FREQUENT = {"now": 6, "run": 6, "record": 2, "free": 2}
+"""Of these calls every so manieth is enough here; `tests.studies.recalibration_study --kills` takes every call."""
+
+
+class Kill:
+    """Counts the calls of a job's tools, and kills the process at one of them: before it, or behind it."""
+
+    def __init__(self, at: int | None = None, *, behind: bool = False) -> None:
+        self.calls: list[str] = []
+        self._at, self._behind = at, behind
+
+    def tools(self, tools: Tools) -> Tools:
+        return replace(tools, **{name: self._called(name, getattr(tools, name)) for name in CALLED})
+
+    def _called(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **further: Any) -> Any:
+            mine = len(self.calls) == self._at
+            self.calls.append(name)
+            if mine and not self._behind:
+                os.kill(os.getpid(), signal.SIGKILL)
+            found = function(*given, **further)
+            if mine:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return found
+
+        return call
+
+
+def killed_job(rig: Rig, kill: Kill) -> None:
+    """The job in a process of its own, which does not survive it."""
+    with warnings.catch_warnings():
+        # Of threads of the test runner, which the child never meets.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        try:
+            replace(rig, tools=kill.tools(rig.tools)).job()
+        finally:
+            os._exit(0)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status)
+    assert os.WTERMSIG(status) == signal.SIGKILL
+
+
+def applied_once(rig: Rig) -> None:
+    """By all that tells of it."""
+    session = rig.session
+    assert session.state.outcome is Outcome.APPLIED
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLIED) <= 1
+    assert actions.count(AuditAction.APPLY_BEGUN) == 1
+    assert actions[0] is AuditAction.RECALIBRATION_BEGUN
+    assert actions[-1] is AuditAction.RECALIBRATION_ENDED
+    assert len(rig.backups) == 1
+    with HistoryStore(rig.cells / "demo.history.sqlite") as store:
+        assert len(store.events()) == len(store.entries()) == 1
+    assert rig.job().outcome is Outcome.NOT_DUE
+
+
+@pytest.fixture(scope="module")
+def calls(tmp_path_factory: pytest.TempPathFactory, made: Made) -> list[str]:
+    """Those of a job that nobody kills."""
+    rig = made_rig(tmp_path_factory.mktemp("counted") / "cell", made, metrics=None)
+    kill = Kill()
+    assert replace(rig, tools=kill.tools(rig.tools)).job().outcome is Outcome.APPLIED
+    return kill.calls
+
+
+def test_every_step_is_among_the_calls(calls: list[str]) -> None:
+    assert set(calls) == set(CALLED)
+    assert calls.count("record") == 3
+    assert calls.count("run") >= 6
+
+
+@pytest.mark.parametrize("behind", [False, True], ids=["before", "behind"])
+def test_a_job_that_is_killed_at_any_call_is_finished_by_the_next(
+    tmp_path: Path, made: Made, calls: list[str], behind: bool
+) -> None:
+    """Before each call, and behind each that has an effect: what it made is there, and the state does not know it."""
+    for at, name in enumerate(calls):
+        chosen = name not in PURE and calls[:at].count(name) % FREQUENT.get(name, 1) == 0
+        if chosen and (name in EFFECTS or not behind):
+            finished_by_the_next(made_rig(tmp_path / f"{at}-{name}", made, metrics=None), Kill(at, behind=behind))
+
+
+def finished_by_the_next(rig: Rig, kill: Kill) -> None:
+    """Kill a job there, and let the next one finish it: what was found is in the controller's file, once."""
+    before = rig.controller.read_bytes()
+    killed_job(rig, kill)
+    begun = bool(rig.sessions)
+    whole = rig.controller.read_bytes()
+    rig.clock.go_on(minutes=10)
+    # Killed as the very last thing it was done already.
+    outcome = rig.job().outcome
+    if outcome is not Outcome.NOT_DUE:
+        assert outcome is Outcome.APPLIED
+        assert rig.session.state.attempt == 1 + begun
+    assert rig.controller.read_bytes() != before
+    if whole != before:
+        assert rig.controller.read_bytes() == whole
+    applied_once(rig)
+
+
+@pytest.mark.parametrize("way", ["rollback", "cp", "edited"])
+def test_what_a_person_took_back_behind_a_killed_write_is_not_written_again(
+    tmp_path: Path, made: Made, calls: list[str], way: str
+) -> None:
+    """The file is as it was before the write; only the audit knows that there was one."""
+    rig = made_rig(tmp_path / "cell", made)
+    killed_job(rig, Kill(calls.index("apply"), behind=True))
+    assert rig.session.state.outcome is None
+    (backup,) = rig.backups
+    if way == "rollback":
+        roll_back(rig.controller, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="a person")
+    else:
+        shutil.copyfile(backup, rig.controller)
+    if way == "edited":
+        rig.controller.write_text(rig.controller.read_text() + "\n# looked at\n")
+    taken_back = rig.controller.read_bytes()
+    rig.clock.go_on(minutes=10)
+    ended = rig.job()
+    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert "rolled back since the session began" in ended.remark
+    assert rig.controller.read_bytes() == taken_back
+    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
+    assert rig.job().outcome is Outcome.NOT_DUE
+    assert rig.controller.read_bytes() == taken_back
+
+
+def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    whole = made.logs["loaded-1"].read_bytes()
+    copied = rig.tools.record
+
+    def dies(*given: Any, **further: Any) -> Any:
+        out = given[3]
+        if out.stem == "loaded-1":
+            out.with_name(out.name + ".part").write_bytes(whole[: len(whole) // 2])
+            os.kill(os.getpid(), signal.SIGKILL)
+        return copied(*given, **further)
+
+    rig.tools = replace(rig.tools, record=dies)
+    killed_job(rig, Kill())
+    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    rig.tools = replace(rig.tools, record=copied)
+    assert rig.job().outcome is Outcome.APPLIED
+    names = {path.name for path in rig.session.folder.iterdir()}
+    assert "loaded-1-partial-1.mcap" in names
+    assert "loaded-1.mcap.part" not in names
+    applied_once(rig)
+
+
+def test_a_log_that_is_not_what_was_recorded_is_recorded_again(tmp_path: Path, made: Made, calls: list[str]) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    killed_job(rig, Kill(calls.index("fit")))
+    log = rig.session.folder / "bare-1.mcap"
+    log.write_bytes(log.read_bytes()[:-1] + b"\0")
+    assert rig.job().outcome is Outcome.APPLIED
+    assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
+    assert rig.session.state.runs[-1].name == "bare-1"
+
+
+def too_old(rig: Rig) -> None:
+    rig.clock.go_on(hours=3)
+
+
+def of_another_configuration(rig: Rig) -> None:
+    rig.cell_file.write_text(rig.cell_file.read_text() + "\n# another comment\n")
+
+
+def with_another_plan(rig: Rig) -> None:
+    """Somebody has approved other moves: half of the logs would be of these, half of those."""
+    plan = rig.cells / "plan.yaml"
+    plan.write_bytes(plan.read_bytes() + b"\n# approved again\n")
+
+
+@pytest.mark.parametrize("change", [too_old, of_another_configuration, with_another_plan])
+def test_a_session_of_something_else_is_not_taken_up(
+    tmp_path: Path, made: Made, calls: list[str], change: Callable[[Rig], None]
+) -> None:
+    own = replace(made, plan_file=tmp_path / "cell" / "cells" / "plan.yaml")
+    rig = made_rig(tmp_path / "cell", own, resume_within_h=2)
+    shutil.copyfile(made.plan_file, own.plan_file)
+    killed_job(rig, Kill(calls.index("fit")))
+    change(rig)
+    rig.tools = own.tools(rig)
+    assert rig.job().outcome is Outcome.APPLIED
+    old, new = rig.sessions
+    assert old.state.outcome is None
+    assert (len(old.state.runs), len(new.state.runs)) == (3, 3)

@@ -1,0 +1,113 @@
+"""`recalibration` of the cell file: what may stand there, and what is refused with its line."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from daq.config.cell_file import load_cell
+from daq.config.recalibration import RecalibrationModel, RunModel
+from daq.errors import SchemaMismatch
+from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, save, sessions, to_take_up
+from tests.daq.jobs.rig import BEGAN, make_rig
+
+DOCUMENT = Path(__file__).parents[3] / "docs" / "recalibration.md"
+
+
+def changed(tmp_path: Path, **section: Any) -> Path:
+    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml", **section)
+    return rig.cell_file
+
+
+BASIS = Basis("demo", "c" * 64, "b" * 64)
+RUN = {"name": "bare-1", "plan": {"seed": 1}}
+LOADED = {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59, "plan": {"seed": 1}}
+UNUSED = {**LOADED, "name": "unused", "holdout": True}
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ({"interlock": {}}, "no job moves a robot unasked"),
+        ({"warm_up_minutes": 1}, "warm_up_min"),
+        ({"runs": [RUN, LOADED, {**UNUSED, "holdout": False}]}, "holdout: true"),
+        ({"runs": [RUN, {**LOADED, "holdout": True}, UNUSED]}, "one run without and one with a payload"),
+        ({"runs": [RUN, {**LOADED, "name": "bare-1"}, UNUSED]}, "names of their own"),
+        ({"runs": [{**RUN, "mass_kg": 1.0}, LOADED, UNUSED]}, "payload and its mass_kg"),
+        ({"runs": [{**RUN, "plan_file": "a.yaml"}, LOADED, UNUSED]}, "plan_file with approved moves"),
+        ({"runs": [{**RUN, "name": "warm-up"}, LOADED, UNUSED]}, "another name than warm-up"),
+        ({"runs": [{**RUN, "name": "../up"}, LOADED, UNUSED]}, "name"),
+        ({"mount": {"command": []}}, "at least 1 item"),
+        ({"mount": {"command": "mount-it"}}, "mount"),
+        ({"every_h": -1}, "greater than or equal to 0"),
+    ],
+)
+def test_what_is_not_so_is_refused(tmp_path: Path, section: dict[str, Any], message: str) -> None:
+    with pytest.raises(SchemaMismatch, match=re.escape(message)):
+        load_cell(changed(tmp_path, **section))
+
+
+def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
+    file = changed(
+        tmp_path,
+        runs=[{**RUN, "plan": None, "plan_file": "plans/a.yaml"}, LOADED, UNUSED],
+        interlock={"file": "state/interlock"},
+        metrics="../metrics",
+    )
+    section = load_cell(file).recalibration
+    assert section is not None
+    assert section.runs[0].plan_file == (file.parent / "plans" / "a.yaml").resolve()
+    assert (section.runs[1].seed, section.runs[1].duration_s) == (1, 40.0)
+    assert section.interlock.command is None
+    assert section.interlock.file is not None
+    assert section.interlock.file.path == (file.parent / "state" / "interlock").resolve()
+    assert section.metrics == (file.parent.parent / "metrics").resolve()
+    assert section.folder == (file.parent / "demo.recalibration").resolve()
+
+
+def test_the_page_shows_every_key_and_its_example_is_one() -> None:
+    (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    RecalibrationModel.model_validate_json(json.dumps(yaml.safe_load(example)["recalibration"]))
+    for model in (RecalibrationModel, RunModel):
+        for key in model.model_fields:
+            assert re.search(rf"\b{key}:", example), key
+
+
+def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) -> None:
+    made = []
+    for week in range(6):
+        session = begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week))
+        outcome = (Outcome.APPLIED, Outcome.STOPPED)[week % 2]
+        state = session.state.with_(outcome=outcome, ended=session.state.began)
+        made.append(save(type(session)(session.folder, state)))
+    (tmp_path / "20260101T000000Z").mkdir()
+    (tmp_path / "notes").mkdir()
+    found = sessions(tmp_path)
+    assert found == tuple(made)
+    assert last_good(found) == made[4]
+    now = BEGAN + timedelta(days=35)
+    assert to_take_up(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
+    for basis in (replace(BASIS, configuration_sha256="d" * 64), replace(BASIS, plans_sha256="d" * 64)):
+        assert to_take_up(found, basis, now + timedelta(hours=1), 2.0) is None
+    for later_h in (3, -1):
+        assert to_take_up(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
+    assert to_take_up(found[:5], BASIS, made[4].began, 2.0) is None
+    # The calibration of the third week is in force: its logs and signatures are what the controller rests on.
+    fitted = Fitted(calibration_sha256="f" * 64, sentences=())
+    save(replace(made[2], state=made[2].state.with_(fitted=fitted)))
+    removed = remove_old(sessions(tmp_path), 1, {"f" * 64})
+    assert removed == tuple(session.folder for session in (made[0], made[1], made[3]))
+    assert [session.folder for session in sessions(tmp_path)] == [made[i].folder for i in (2, 4, 5)]
+
+
+def test_two_sessions_of_one_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    names = [begin(tmp_path, BASIS, BEGAN).folder.name for _ in range(3)]
+    assert names == ["20260105T020000Z", "20260105T020000Z-02", "20260105T020000Z-03"]
+    assert [session.folder.name for session in sessions(tmp_path)] == names

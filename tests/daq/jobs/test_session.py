@@ -1,0 +1,118 @@
+"""Sessions of several cells in one folder, states that are not ours, and files of metrics with names of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.config.cell_file import load_cell
+from daq.errors import ClockWentBack
+from daq.jobs.journal import file_stem
+from daq.jobs.preflight import CLOCK_SLACK, require_clock
+from daq.jobs.recording import calibration_of_session
+from daq.jobs.session import STATE, Basis, Outcome, Session, SessionState, begin, remove_old, save, sessions
+from tests.daq.jobs.made import Made, made_rig
+from tests.daq.jobs.rig import BEGAN, make_rig
+
+BASIS = Basis("demo", "c" * 64, "b" * 64)
+
+
+def test_two_cells_of_one_folder_have_sessions_of_their_own(tmp_path: Path) -> None:
+    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
+    other = rig.cell_file.with_name("other.yaml")
+    shutil.copyfile(rig.cell_file, other)
+    folders = [section.folder.name for file in (rig.cell_file, other) if (section := load_cell(file).recalibration)]
+    assert folders == ["demo.recalibration", "other.recalibration"]
+
+
+def test_a_cell_is_due_whatever_another_one_keeps_in_its_folder(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made, keep_sessions=1, every_h=1)
+    folder = rig.cells / "demo.recalibration"
+    for minutes in range(3):
+        one = begin(folder, replace(BASIS, cell="another"), BEGAN - timedelta(minutes=30 - minutes))
+        save(replace(one, state=one.state.with_(outcome=Outcome.APPLIED, ended=one.state.began)))
+    assert rig.job().outcome is Outcome.APPLIED
+    rig.clock.go_on(hours=2)
+    assert rig.job().outcome is Outcome.UNCHANGED
+    assert len(sessions(folder, "another")) == 3
+    assert len(sessions(folder)) == 3 + len(rig.sessions)
+    assert "last_success_timestamp_seconds" in (rig.cells / "drivegain_demo.prom").read_text()
+
+
+def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
+    for week in range(3):
+        for cell in ("demo", "another"):
+            begin(tmp_path, replace(BASIS, cell=cell), BEGAN + timedelta(days=7 * week))
+    assert len(remove_old(sessions(tmp_path, "demo"), 1, ())) == 2
+    assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
+
+
+def test_nobody_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None:
+    session = begin(tmp_path, BASIS, BEGAN)
+    (session.folder / STATE).unlink()
+    os.mkfifo(session.folder / STATE)
+    assert sessions(tmp_path) == ()
+
+
+def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    rig.job()
+    session = rig.session
+    assert calibration_of_session(session) is not None
+    first, *others = session.state.runs
+    for runs in ((first.model_copy(update={"sha256": "0" * 64}), *others), tuple(others)):
+        assert calibration_of_session(replace(session, state=session.state.with_(runs=runs))) is None
+
+
+@pytest.mark.parametrize("key", ["began", "attempt_began", "ended"])
+@pytest.mark.parametrize("time", ["2026-01-05T02:00:00", "yesterday", "", "2026-13-01T00:00:00+00:00"])
+def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, time: str) -> None:
+    session = begin(tmp_path, BASIS, BEGAN)
+    state = json.loads((session.folder / STATE).read_text())
+    (session.folder / STATE).write_text(json.dumps({**state, key: time}))
+    assert sessions(tmp_path) == ()
+
+
+@given(st.datetimes(timezones=st.just(UTC)), st.integers(0, 10**9))
+def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s: int) -> None:
+    at, told = BEGAN + timedelta(seconds=later_s), began.isoformat()
+    state = SessionState(session="s", cell="demo", configuration_sha256="", began=told, attempt_began=told)
+    if began > at + CLOCK_SLACK:
+        with pytest.raises(ClockWentBack):
+            require_clock((Session(Path("s"), state),), at)
+    else:
+        require_clock((Session(Path("s"), state),), at)
+
+
+def test_a_session_of_the_far_future_is_told_and_does_not_end_all_calibrations(tmp_path: Path, made: Made) -> None:
+    rig = made_rig(tmp_path / "cell", made)
+    foreign = begin(rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099))
+    ended = foreign.state.with_(outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat())
+    save(replace(foreign, state=ended))
+    with pytest.raises(ClockWentBack, match="move that folder away") as caught:
+        rig.job()
+    assert str(foreign.folder) in str(caught.value)
+    shutil.rmtree(foreign.folder)
+    assert rig.job().outcome is Outcome.APPLIED
+
+
+@given(st.lists(st.text(min_size=1, max_size=8), min_size=2, max_size=2, unique=True))
+def test_two_cells_never_share_a_file_of_metrics(cells: list[str]) -> None:
+    one, other = map(file_stem, cells)
+    assert one != other
+    assert one.isascii()
+    assert "/" not in one
+
+
+def test_a_plain_name_is_its_own() -> None:
+    assert file_stem("press-4") == "press-4"
+    assert file_stem("Пресс 4") != file_stem("Робот 4")
+    assert file_stem("press 4").startswith("press_4_")

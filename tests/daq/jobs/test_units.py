@@ -1,0 +1,173 @@
+"""Service, timer and crontab line: what is in them, that systemd takes them, and that nothing foreign is replaced."""
+
+from __future__ import annotations
+
+import configparser
+import os
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+from daq.jobs.units import Installation, cron_line, unit_name, units_of
+from tests.daq.jobs.rig import Rig, make_rig
+
+NAME = "drivegain-recalibrate-demo"
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Rig:
+    return make_rig(tmp_path / "a cell", tmp_path / "plan.yaml", max_duration_min=30)
+
+
+def installation(rig: Rig, *, user: bool = False, schedule: str = "weekly") -> Installation:
+    return Installation(rig.cell_file, Path("/usr/bin/true"), schedule, user, "root")
+
+
+def read(text: str) -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(strict=False, interpolation=None, delimiters=("=",))
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string(text)
+    return parser
+
+
+def test_the_timer_never_makes_up_for_a_date_and_the_service_bounds_the_job(rig: Rig) -> None:
+    section = rig.cell.recalibration
+    assert section is not None
+    service, timer = (read(unit.text) for unit in units_of(rig.cell, section, installation(rig)))
+    assert timer["Timer"]["Persistent"] == "false"
+    assert timer["Timer"]["OnCalendar"] == "weekly"
+    assert service["Service"]["Type"] == "oneshot"
+    assert service["Service"]["Restart"] == "no"
+    assert service["Service"]["KillSignal"] == "SIGTERM"
+    assert float(service["Service"]["TimeoutStartSec"]) > 30 * 60
+    assert service["Service"]["SuccessExitStatus"] == str(ExitCode.PROPOSED.value)
+    assert "AF_CAN" in service["Service"]["RestrictAddressFamilies"]
+    assert "PrivateTmp" not in service["Service"]
+    assert "User" not in read(units_of(rig.cell, section, installation(rig, user=True))[0].text)["Service"]
+
+
+def test_what_is_written_through_a_link_is_writable_to_the_service(rig: Rig, tmp_path: Path) -> None:
+    """ProtectHome= would lock the folder in which the file is, wherever the link to it is."""
+    elsewhere = tmp_path / "controllers of all cells"
+    elsewhere.mkdir()
+    rig.controller.rename(elsewhere / "demo.yaml")
+    rig.controller.symlink_to(elsewhere / "demo.yaml")
+    section = rig.cell.recalibration
+    assert section is not None
+    service = units_of(rig.cell, section, installation(rig))[0].text
+    assert f'ReadWritePaths="-{elsewhere}"' in service.splitlines()
+
+
+@pytest.mark.parametrize("user", [False, True], ids=["system", "user"])
+def test_systemd_takes_them(rig: Rig, tmp_path: Path, user: bool) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("no systemd-analyze on this machine")
+    section = rig.cell.recalibration
+    assert section is not None
+    units = units_of(rig.cell, section, installation(rig, user=user, schedule="Sun *-*-* 03:00:00"))
+    for unit in units:
+        (tmp_path / unit.name).write_text(unit.text, encoding="utf-8")
+    command = ["systemd-analyze", *(["--user"] if user else []), "--man=no", "verify"]
+    done = subprocess.run(
+        [*command, *(str(tmp_path / unit.name) for unit in units)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+    )
+    said = done.stdout + done.stderr
+    if "Failed to initialize manager" in said:
+        pytest.skip(f"systemd-analyze cannot verify here: {said.strip()}")
+    # It also reads what else is installed on this machine.
+    ours = [line for line in said.splitlines() if NAME in line]
+    assert ours == [], said
+    assert done.returncode == 0, said
+
+
+def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "units"
+    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(folder)]
+    assert main(command) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert "Dry run" in shown
+    assert "ExecStart=" in shown
+    assert not folder.exists()
+    assert main([*command, "--yes"]) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert f"systemctl enable --now {NAME}.timer" in shown
+    assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.service", f"{NAME}.timer"]
+    assert main([*command, "--yes", "--schedule", "daily"]) == ExitCode.OK
+    assert "OnCalendar=daily" in (folder / f"{NAME}.timer").read_text()
+    (folder / f"{NAME}.timer").write_text("[Timer]\nOnCalendar=yearly\n")
+    before = (folder / f"{NAME}.service").read_bytes()
+    assert main([*command, "--yes"]) == ExitCode.USAGE
+    assert "did not make" in capsys.readouterr().err
+    assert (folder / f"{NAME}.timer").read_text() == "[Timer]\nOnCalendar=yearly\n"
+    assert (folder / f"{NAME}.service").read_bytes() == before
+
+
+def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["install-units", "--cell", str(rig.cell_file), "--cron"]) == ExitCode.OK
+    line = capsys.readouterr().out
+    assert line.startswith("0 3 * * 0  ")
+    assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
+    assert line.count("\n") == 1
+    assert main(["install-units", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"]) == ExitCode.USAGE
+
+
+def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
+    section = rig.cell.recalibration
+    assert section is not None
+    named = replace(rig.cell, name='50 %h "cell"\nExecStart=/bin/false')
+    wanted = replace(installation(rig), cell_file=Path("/cells/100 % $HOME/it's.yaml"))
+    assert unit_name(named) == "drivegain-recalibrate-50-h-cell-execstart-bin-false-cc6ad2"
+    assert unit_name(rig.cell) == f"drivegain-recalibrate-{rig.cell.name}"
+    others = {unit_name(replace(rig.cell, name=name)) for name in ("Пресс 4", "Робот 4", "press 4", "press-4")}
+    assert len(others) == 4
+    service = read(units_of(named, section, wanted)[0].text)["Service"]
+    assert service["ExecStart"] == '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
+    assert units_of(named, section, wanted)[0].text.count("\nExecStart=") == 1
+    assert cron_line(wanted).endswith("--cell '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
+
+
+def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
+    rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "units"
+    command = ["install-units", "--to", str(folder), "--yes", "--cell"]
+    assert main([*command, str(rig.cell_file)]) == ExitCode.OK
+    other = rig.cell_file.with_name("another.yaml")
+    shutil.copyfile(rig.cell_file, other)
+    before = (folder / f"{NAME}.service").read_bytes()
+    capsys.readouterr()
+    assert main([*command, str(other)]) == ExitCode.USAGE
+    assert "the unit of another cell file" in capsys.readouterr().err
+    assert (folder / f"{NAME}.service").read_bytes() == before
+    (folder / f"{NAME}.service").unlink()
+    os.mkfifo(folder / f"{NAME}.service")
+    assert main([*command, str(rig.cell_file)]) == ExitCode.USAGE
+    assert "did not make" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("schedule", ["", "  ", "weekly\nPersistent=true"])
+def test_a_schedule_that_no_line_can_say_is_refused(
+    rig: Rig, tmp_path: Path, schedule: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["install-units", "--cell", str(rig.cell_file), "--to", str(tmp_path / "units"), "--schedule", schedule]
+    assert main([*command, "--yes"]) == ExitCode.USAGE
+    assert "--schedule" in capsys.readouterr().err
+    assert not (tmp_path / "units").exists()
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not on this computer")
+def test_systemd_reads_the_schedule_before_it_is_written(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "every sunday"]) == ExitCode.USAGE
+    assert "calendar" in capsys.readouterr().err
+    assert main(["install-units", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK

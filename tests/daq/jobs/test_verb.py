@@ -1,0 +1,111 @@
+"""`drivegain recalibrate` as a timer calls it: exit codes, standard output, standard error."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.cli.simulate import MountedFile
+from daq.errors import ExitCode, UsageError
+from daq.simulation.simulation_file import load_simulation, shipped_simulation
+from drivers.simulation.cell import MountingCell
+from drivers.simulation.spec import CellSpec
+from tests.daq.jobs.rig import make_rig, serving
+from tests.drivers.scripted import FakeClock, ScriptedBus
+
+
+def test_a_dry_run_says_what_a_job_would_do(
+    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    command = ["recalibrate", "--cell", str(rig.cell_file), "--dry-run"]
+    with serving(rig):
+        assert main([*command, "--json"]) == ExitCode.OK
+        told = capsys.readouterr()
+        assert json.loads(told.out)["steps"][0] == "mount none, record bare-1"
+        assert [json.loads(line)["level"] for line in told.err.splitlines()] == ["info", "info"]
+        assert main(command) == ExitCode.OK
+    assert "a new session" in capsys.readouterr().out
+    assert not (rig.cells / "recalibration").exists()
+
+
+def test_a_job_that_is_held_says_so_in_its_exit_code_and_in_json_alone(
+    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    rig.closed.unlink()
+    assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
+    told = capsys.readouterr()
+    events = [json.loads(line) for line in told.err.splitlines()]
+    assert events[-1]["error"] == "NotReleased"
+    assert events[-1]["level"] == "error"
+    assert told.out == ""
+    assert main(["recalibrate", "--cell", str(rig.cell_file), "--json"]) == ExitCode.NOT_RELEASED
+    assert rig.session.state.attempt == 2
+
+
+def test_a_person_at_a_terminal_reads_what_to_do(
+    tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(tmp_path / "cell", short_plan)
+    rig.closed.unlink()
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
+    told = capsys.readouterr().err
+    assert "session ended: outcome stopped" in told
+    assert "close the cell" in told
+
+
+def test_a_cell_without_the_section_is_told_what_it_lacks(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell = checkout / "configs" / "cells" / "demo.yaml"
+    for verb in ("recalibrate", "install-units"):
+        assert main([verb, "--cell", str(cell)]) == ExitCode.CONFIGURATION
+        assert "recalibration" in capsys.readouterr().err
+
+
+def masses(cell: MountingCell) -> float:
+    return float(sum(inertia.mass for inertia in cell.plant._model.inertias))
+
+
+def test_the_simulated_payload_changes_with_the_file_but_never_under_power(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    file = tmp_path / "mounted"
+    complaints: list[UsageError] = []
+
+    def load(name: str | None) -> CellSpec:
+        return load_simulation(shipped_simulation("demo"), name)
+
+    mounted = MountedFile(file, load, complaints.append)
+    bus = ScriptedBus((), FakeClock())
+    request.addfinalizer(bus.shutdown)
+    cell = MountingCell(mounted.at_power_on(), bus, mounted)
+    bare = masses(cell)
+
+    def frame() -> float:
+        cell._next_frame()
+        return masses(cell)
+
+    assert frame() == bare
+    file.write_text("disc\n")
+    assert frame() == pytest.approx(bare + 4.59)
+    cell.nodes[2].drive.state = cell.nodes[2].drive.state.OPERATION_ENABLED
+    file.write_text("none\n")
+    assert frame() == pytest.approx(bare + 4.59)
+    cell.nodes[2].drive.reset()
+    assert frame() == bare
+    # While it is being written, and what nobody knows: it stays as it was.
+    file.write_text("plate\n")
+    frame()
+    for text in ("", "anvil\n"):
+        file.write_text(text)
+        assert frame() == pytest.approx(bare + 1.686)
+    assert [error.found for error in complaints] == ["no such body in the simulation"]
+    file.unlink()
+    assert frame() == bare

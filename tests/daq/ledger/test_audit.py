@@ -1,0 +1,400 @@
+"""The audit: whatever is done to its lines is found, what a killed writer leaves is told, nothing is taken away."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.errors import AuditUnusable, exit_code
+from daq.ledger import audit
+from daq.ledger.audit import AuditAction, AuditEntry, Content, Flaw, append, read, verify
+from daq.ledger.audit_chain import encode, entry, judge
+
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+TREES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(st.characters(), max_size=20),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+DETAILS = st.dictionaries(st.text(max_size=8), TREES, max_size=4)
+
+
+@contextmanager
+def _folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory() as name:
+        yield Path(name)
+
+
+def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
+    return tuple(
+        append(
+            path,
+            AuditAction.PROPOSED,
+            at=NOW + timedelta(seconds=k),
+            who="K. Ito",
+            subject="/c/x.yaml",
+            details={"k": k},
+        )
+        for k in range(count)
+    )
+
+
+def _judge(lines: list[bytes]) -> audit.AuditVerdict:
+    return judge(b"".join(line + b"\n" for line in lines), lambda _: None)
+
+
+def _lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines()
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(AuditAction), st.text(max_size=30), st.text(max_size=30), DETAILS), max_size=5)
+)
+def test_what_is_appended_is_read_back_and_the_chain_holds(
+    asked: list[tuple[AuditAction, str, str, dict[str, object]]],
+) -> None:
+    asked = [(a, w, s, d) for a, w, s, d in asked if a is not AuditAction.TORN_LINE]
+    with _folder() as folder:
+        path = folder / "cell.audit.jsonl"
+        assert read(path) == ()
+        written = [append(path, a, at=NOW, who=w, subject=s, details=d) for a, w, s, d in asked]
+        assert list(read(path)) == written
+        assert [one.number for one in written] == list(range(1, len(asked) + 1))
+        for one, (action, who, subject, details) in zip(written, asked, strict=True):
+            assert (one.action, one.who, one.subject, one.details) == (action, who, subject, details)
+        verdict = verify(path, heads=[one.sha256 for one in written])
+        assert verdict.holds
+        assert verdict.broken is None
+        assert verdict.entries == tuple(written)
+
+
+def test_the_digest_is_sha256_of_canonical_json_and_covers_the_one_before(tmp_path: Path) -> None:
+    first, second = _filled(tmp_path / "a", 2)
+    tree = json.loads(_lines(tmp_path / "a")[1])
+    assert tree.pop("sha256") == second.sha256
+    assert tree["previous"] == first.sha256
+    assert second.sha256 == hashlib.sha256(json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    assert first.previous == "0" * 64
+
+
+@given(line=st.integers(0, 5), data=st.data())
+def test_one_changed_byte_is_found_at_its_line(line: int, data: st.DataObject) -> None:
+    with _folder() as folder:
+        _filled(folder / "a")
+        lines = _lines(folder / "a")
+    place = data.draw(st.integers(0, len(lines[line]) - 1))
+    byte = data.draw(st.integers(0, 255).filter(lambda b: b not in {lines[line][place], 10}))
+    lines[line] = lines[line][:place] + bytes([byte]) + lines[line][place + 1 :]
+    verdict = _judge(lines)
+    if line < 5:
+        assert verdict.broken == line + 1
+        assert verdict.flaws[0].flaw is Flaw.EDITED
+        assert len(verdict.flaws) == 1
+    else:
+        # An unfinished last line may be a killed writer's: told, and no entry of what it was.
+        assert verdict.broken == 6 or verdict.torn == (6,)
+
+
+@given(line=st.integers(0, 4), count=st.integers(1, 4))
+def test_removed_lines_are_found_where_they_were(line: int, count: int) -> None:
+    with _folder() as folder:
+        _filled(folder / "a")
+        lines = _lines(folder / "a")
+    last = min(line + count, 5)
+    verdict = _judge(lines[:line] + lines[last:])
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(line + 1, Flaw.REMOVED)]
+    assert str(line + 1) in verdict.flaws[0].says
+
+
+@given(st.permutations(range(6)))
+def test_a_changed_order_is_found(order: list[int]) -> None:
+    with _folder() as folder:
+        _filled(folder / "a")
+        lines = _lines(folder / "a")
+    verdict = _judge([lines[k] for k in order])
+    first = next((place for place, k in enumerate(order) if place != k), None)
+    assert verdict.broken == (None if first is None else first + 1)
+    assert {flaw.flaw for flaw in verdict.flaws} <= {Flaw.MOVED}
+
+
+@given(place=st.integers(0, 6), copied=st.integers(0, 5))
+def test_a_line_that_was_added_twice_is_found(place: int, copied: int) -> None:
+    with _folder() as folder:
+        _filled(folder / "a")
+        lines = _lines(folder / "a")
+    verdict = _judge([*lines[:place], lines[copied], *lines[place:]])
+    assert not verdict.holds
+    assert Flaw.ADDED in {flaw.flaw for flaw in verdict.flaws}
+
+
+@given(place=st.integers(0, 4))
+def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
+    with _folder() as folder:
+        entries = _filled(folder / "a")
+    was = entries[place]
+    forged = entry(was.number, was.at, "somebody else", was.action, was.subject, was.details, was.previous)
+    verdict = _judge([encode(forged if one is was else one) for one in entries])
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(place + 1, Flaw.EDITED)]
+    # Put between two others, it is one entry of that number too many.
+    verdict = _judge([encode(one) for one in (*entries[:place], forged, *entries[place:])])
+    assert not verdict.holds
+
+
+def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path) -> None:
+    entries = _filled(tmp_path / "a")
+    content = b"".join(line + b"\n" for line in _lines(tmp_path / "a")[:4])
+    (tmp_path / "a").write_bytes(content)
+    assert verify(tmp_path / "a").holds
+    verdict = verify(tmp_path / "a", heads=[entries[2].sha256, entries[5].sha256])
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(5, Flaw.CUT_OFF)]
+    assert entries[5].sha256[:12] in verdict.flaws[0].says
+    assert verify(tmp_path / "none", heads=[entries[0].sha256]).broken == 1
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
+def test_what_killed_writers_leave_stays_and_is_told(cuts: list[float], data: st.DataObject) -> None:
+    """Each write is cut at any byte; whoever comes next begins a line of its own, and the chain holds throughout."""
+    with _folder() as folder:
+        path = folder / "a"
+        _filled(path, 1)
+        for cut in cuts:
+            before = path.read_bytes()
+            _filled(path, 1)
+            written = path.read_bytes()
+            assert written.startswith(before)
+            length = len(before) + round(cut * (len(written) - len(before)))
+            path.write_bytes(written[:length])
+            assert verify(path).holds
+        kept = path.read_bytes()
+        last = append(path, AuditAction.APPLIED, at=NOW, who="K.", subject="x", details={})
+        assert path.read_bytes().startswith(kept)
+        assert read(path)[-1] == last
+        verdict = verify(path)
+        assert verdict.holds
+        assert [one.number for one in verdict.entries] == list(range(1, len(verdict.entries) + 1))
+        # A fragment that somebody removes, or changes, after it was told of is missed.
+        lines = _lines(path)
+        for torn in verdict.torn:
+            assert not _judge(lines[: torn - 1] + lines[torn:]).holds
+            place = data.draw(st.integers(0, max(len(lines[torn - 1]) - 1, 0)))
+            changed = lines[torn - 1][:place] + b"#" + lines[torn - 1][place:]
+            assert not _judge([*lines[: torn - 1], changed, *lines[torn:]]).holds
+
+
+def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    _filled(path, 2)
+    with path.open("ab") as stream:
+        stream.write(bytes(100))
+    assert verify(path).torn == (3,)
+    _filled(path, 1)
+    verdict = verify(path)
+    assert verdict.holds
+    assert [one.action for one in verdict.entries][2:] == [AuditAction.TORN_LINE, AuditAction.PROPOSED]
+    assert verdict.entries[2].details["torn_bytes"] == 100
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"drives:\n  J1: {gain: 32.96}\n",
+        b"[2003]\nObjectType=0x9\n",
+        b'{\n  "gain": 1\n',
+        b"no line end",
+        b'{"actions": 1',
+        b"SQLite format 3\x00",
+        b"\xff\xfe",
+    ],
+)
+def test_nothing_is_appended_to_a_file_that_is_no_audit(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(content)
+    with pytest.raises(AuditUnusable, match=r"another file, correct `history\.audit`"):
+        _filled(path, 1)
+    assert path.read_bytes() == content
+    assert not verify(path).holds
+    # Behind entries it is nobody's unfinished line either.
+    path.unlink()
+    _filled(path, 1)
+    with path.open("ab") as stream:
+        stream.write(content)
+    assert not verify(path).holds
+
+
+def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
+    _filled(tmp_path / "whole", 1)
+    whole = (tmp_path / "whole").read_bytes()
+    for length in range(len(whole) - 1):
+        path = tmp_path / str(length)
+        path.write_bytes(whole[:length])
+        assert append(path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}).number == 1 + (length > 0)
+        assert verify(path).holds
+
+
+@pytest.mark.parametrize("spoil", [lambda line: line.replace(b"Ito", b"Itu"), lambda _: b"{}", lambda _: b"17"])
+def test_nothing_is_appended_to_a_last_line_that_was_changed(tmp_path: Path, spoil: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "a"
+    _filled(path, 2)
+    first, last = _lines(path)
+    path.write_bytes(first + b"\n" + spoil(last) + b"\n")
+    spoiled = path.read_bytes()
+    with pytest.raises(AuditUnusable, match="line 2 that is not"):
+        _filled(path, 1)
+    assert exit_code(AuditUnusable) == 3
+    assert path.read_bytes() == spoiled
+
+
+def _write(begun: AuditAction, path: Path, subject: Path, before: bytes, after: bytes) -> AuditEntry:
+    digests = {f"sha256_{name}": hashlib.sha256(b).hexdigest() for name, b in (("before", before), ("after", after))}
+    return append(path, begun, at=NOW, who="K.", subject=str(subject), details=digests)
+
+
+@pytest.mark.parametrize("begun", [AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN])
+@pytest.mark.parametrize(
+    ("now", "content"),
+    [(b"old", Content.BEFORE), (b"new", Content.AFTER), (b"edited", Content.OTHER), (None, Content.OTHER)],
+)
+def test_of_a_write_without_an_end_the_file_tells_which_it_is(
+    tmp_path: Path, begun: AuditAction, now: bytes | None, content: Content
+) -> None:
+    path, file = tmp_path / "a", tmp_path / "x.yaml"
+    if now is not None:
+        file.write_bytes(now)
+    first = _write(begun, path, file, b"old", b"new")
+    assert [(one.begun, one.content) for one in verify(path).open_writes] == [(first, content)]
+    # The next write on the same file saw what was there, whatever is there by now.
+    _write(begun, path, tmp_path / "y.yaml", b"other", b"file")
+    second = _write(begun, path, file, b"new", b"newest")
+    file.write_bytes(b"newest")
+    append(path, AuditAction.APPLIED, at=NOW, who="K.", subject=str(file), details={"begun": second.number})
+    found = {one.begun.number: one.content for one in verify(path).open_writes}
+    assert found == {1: Content.AFTER, 2: Content.OTHER}
+    (tmp_path / "y.yaml").mkdir()  # nobody can read it
+    assert {one.begun.number: one.content for one in verify(path).open_writes}[2] is Content.UNKNOWN
+
+
+@pytest.mark.parametrize("end", [AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED])
+def test_a_write_with_an_end_is_not_open(tmp_path: Path, end: AuditAction) -> None:
+    begun = _write(AuditAction.APPLY_BEGUN, tmp_path / "a", tmp_path / "x", b"old", b"new")
+    append(tmp_path / "a", end, at=NOW, who="K.", subject=begun.subject, details={"begun": begun.number})
+    assert verify(tmp_path / "a").open_writes == ()
+
+
+def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="JSON"):
+        append(tmp_path / "a", AuditAction.PROPOSED, at=NOW, who="", subject="", details={"gain": math.nan})
+    assert (tmp_path / "a").read_bytes() == b""
+
+
+def test_what_is_no_regular_file_is_refused_and_nobody_waits(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    for path in (tmp_path / "fifo", tmp_path, Path("/dev/zero")):
+        with pytest.raises(AuditUnusable):
+            read(path)
+        with pytest.raises((AuditUnusable, PermissionError)):
+            _filled(path, 1)
+    (tmp_path / "dangling").symlink_to(tmp_path / "gone" / "a")
+    with pytest.raises(OSError, match="No such file"):
+        _filled(tmp_path / "dangling", 1)
+
+
+def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed: list[str] = []
+
+    def noted(descriptor: int) -> None:
+        flushed.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    _filled(tmp_path / "a", 2)
+    assert flushed == [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
+
+
+def test_a_full_disk_is_told_and_leaves_a_line_that_the_next_entry_tells_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    _filled(path, 1)
+    write = os.write
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda descriptor, data: write(descriptor, data[:40]))
+        with pytest.raises(OSError, match="No space"):
+            _filled(path, 1)
+    _filled(path, 1)
+    verdict = verify(path)
+    assert verdict.holds
+    assert verdict.torn == (2,)
+
+
+def _append_many(path: Path, who: str) -> None:
+    for k in range(25):
+        append(path, AuditAction.PROPOSED, at=NOW, who=who, subject="x", details={"k": k})
+
+
+def test_many_writers_make_one_chain(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    writers = [context.Process(target=_append_many, args=(tmp_path / "a", str(k))) for k in range(4)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    verdict = verify(tmp_path / "a")
+    assert verdict.holds
+    assert len(verdict.entries) == 100
+    for who in "0123":
+        assert [one.details["k"] for one in verdict.entries if one.who == who] == list(range(25))
+
+
+def test_a_lock_that_is_never_given_back_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(audit, "_PAUSE_S", 0.0)
+    with (tmp_path / "a").open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(AuditUnusable, match="keeps it locked"):
+            _filled(tmp_path / "a", 1)
+
+
+def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
+    """An entry that tells of an unfinished line, and none is there: it was taken away."""
+    _filled(tmp_path / "a", 1)
+    with (tmp_path / "a").open("ab") as stream:
+        stream.write(b'{"action":')
+    _filled(tmp_path / "a", 1)
+    lines = _lines(tmp_path / "a")
+    assert verify(tmp_path / "a").torn == (2,)
+    assert [flaw.flaw for flaw in _judge([lines[0], *lines[2:]]).flaws] == [Flaw.EDITED]
+
+
+def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
+    (one,) = _filled(tmp_path / "a", 1)
+    assert one.holds
+    assert not replace(one, who="somebody else").holds
+
+
+@pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
+def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object) -> None:
+    """A chain that holds can be written by anybody."""
+    path, strangers = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
+    for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
+        append(path, action, at=NOW, who="", subject="x", details=strangers)
+    verdict = verify(path)
+    assert verdict.holds
+    assert len(verdict.open_writes) == 2

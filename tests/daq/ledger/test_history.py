@@ -1,0 +1,815 @@
+"""`drivegain history`: what a technician sees of drifts, of broken audits, and of nothing at all."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell_file import load_cell
+from daq.config.policy import HistoryPlace
+from daq.jobs.session import Basis, begin
+from daq.jobs.session import save as save_session
+from daq.jobs.verdict import Past
+from daq.ledger.audit import AuditAction, AuditEntry, append, read
+from daq.ledger.entry import Acknowledgement, Deed, Entry, Event, logs_of, recorded_at
+from daq.ledger.store import HistoryStore
+from daq.ledger.watch import Series, alarm_words, dispersions_of, questions, watch
+from daq.report.history import COLUMNS
+from daq.report.history_view import deed_words
+from daq.workflow.calibration_file import save
+from daq.writeback.drive_proposal import drives_of
+from daq.writeback.formats.document import decode as read_controller
+from daq.writeback.formats.scalar import respell
+from daq.writeback.gates.target import GainChange
+from ident.calibration import Calibration, Gain
+from ident.drift.change import DISPERSION, dispersions
+from tests.daq.calibrations import AXES, recorded, with_recordings
+from tests.daq.histories import BEGIN, calibration_of, digest_of, enter, fill
+
+FLAT = (1.0,) * 6
+RECALIBRATION = """
+recalibration:
+  runs:
+    - {name: bare, plan: {seed: 1}}
+    - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
+    - {name: unused, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
+  interlock: {file: interlock}
+  mount: {command: ["true"]}
+"""
+
+
+def drifting(week: int) -> tuple[float, ...]:
+    """J4 loses 6 % from the 14th calibration on, in twelve weeks."""
+    return (1.0, 1.0, 1.0, 1.0 - 0.06 * min(max(week - 13, 0) / 12.0, 1.0), 1.0, 1.0)
+
+
+def sloping(week: int) -> tuple[float, ...]:
+    """J4 loses 0.2 % a week from the first calibration on."""
+    return (1.0, 1.0, 1.0, 1.0 - 0.002 * week, 1.0, 1.0)
+
+
+def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
+    """All gains by their factors from the 15th calibration on."""
+    return lambda week: factors if week > 14 else FLAT
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """The demo cell in a folder of its own."""
+    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
+    return tmp_path / "configs" / "cells" / "demo.yaml"
+
+
+def _place(cell: Path) -> HistoryPlace:
+    place = load_cell(cell).history
+    assert place is not None
+    return place
+
+
+def _filled(cell: Path, weeks: int, true: Callable[[int], tuple[float, ...]]) -> tuple[str, ...]:
+    with HistoryStore(_place(cell).store) as store:
+        return fill(store, weeks, true)
+
+
+def _series(cell: Path) -> tuple[Series, ...]:
+    with HistoryStore(_place(cell).store) as store:
+        return watch(store.entries(), store.acknowledgements())
+
+
+def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert main(["history", *arguments, "--json"]) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def _entry(digest: str) -> Entry:
+    demo = calibration_of(0)
+    return Entry(digest, BEGIN, BEGIN, "", BEGIN, "demo", "", "ml", "", 3.0, None, 1, demo.gains, ())
+
+
+def _put(cell: Path, digest: str) -> str:
+    """The gains of a calibration into the cell's controller, past drivegain; its file."""
+    controller = load_cell(cell).controller_path
+    assert controller is not None
+    with HistoryStore(_place(cell).store) as store:
+        (entry,) = [one for one in store.entries() if one.digest == digest]
+    keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
+    document = read_controller(controller.read_bytes(), controller.name)
+    scalars = document.locate(tuple(keys.values()))
+    spelling = {s.key: respell(s, g.value, g.std).spelling for s, g in zip(scalars, entry.gains, strict=True)}
+    controller.write_bytes(document.with_values(spelling).content)
+    return str(controller.resolve())
+
+
+def test_an_empty_history_says_what_to_do(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["history", str(cell)]) == 0
+    assert "The history is empty" in capsys.readouterr().out
+    assert _json(capsys, str(cell))["axes"] == []
+    assert main(["history", str(cell), "--verify"]) == 0
+    assert "0 entries, chain unbroken" in capsys.readouterr().out
+    assert not _place(cell).store.exists()
+    assert main(["history", str(cell), "--axis", "J4"]) == 2
+    assert main(["history", str(cell), "--plot", str(cell.with_suffix(".png"))]) == 2
+
+
+def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = cell.parent / "calibration.yaml"
+    save(calibration_of(0), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    shown = capsys.readouterr()
+    assert "entered" in shown.err
+    assert "33.90 ± 0.14" in shown.out
+    assert "baseline: 1 of 12" in shown.out
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "already" in capsys.readouterr().err
+    save(replace(calibration_of(1), cell="another"), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 4
+    assert "another" in capsys.readouterr().err
+    assert main(["history", str(cell), "--add", str(cell)]) == 4
+    assert main(["history", str(cell), "--add", str(file) + ".none"]) == 4
+    assert len(_series(cell)[0].points) == 1
+
+
+def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    digests = _filled(cell, 26, drifting)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digests[8], at=BEGIN + timedelta(weeks=8), who="anna", target="x.yaml")
+    _put(cell, digests[8])
+    assert main(["history", str(cell)]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"ALARM: gain of J4 fell 5\.\d % since 2026-04-\d\d, \d\d\.\d σ", out)
+    assert out.count("ALARM:") == 1
+    assert "demagnetised" in out
+    assert "Worn teeth alone do not change a ratio" in out
+    assert "applied by anna, in force" in out
+    found = _json(capsys, str(cell), "--axis", "J4")
+    (axis,) = found["axes"]
+    assert found["pattern"] == "one axis"
+    assert axis["alarmed"]
+    assert axis["change_percent"] == pytest.approx(-5.7, abs=0.5)
+    # 6 % in twelve weeks with σ 0.4 % have cumulated 3 σ after three.
+    first = next(number for number, point in enumerate(axis["points"]) if point["alarm"])
+    assert 15 <= first <= 18
+    assert found["in_force"] == digests[8]
+    assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
+
+
+def test_a_drift_from_the_first_day_is_told_as_steady(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 9, sloping)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    told = re.search(r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until now, (\d\.\d) σ", out)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
+    assert "demagnetised" in out
+    found = _json(capsys, str(cell), "--axis", "J4")
+    point = found["axes"][0]["points"][-1]
+    assert point["alarm"] == "trend"
+    assert abs(point["trend_sigmas"]) == pytest.approx(float(told[2]), abs=0.05)
+    assert point["trend_sigmas"] < -found["chart"]["trend"]
+    picture = cell.parent / "history.svg"
+    assert main(["history", str(cell), "--plot", str(picture)]) == 0
+    assert b"steady change" in picture.read_bytes()
+
+
+def test_an_alarm_that_has_passed_has_no_date(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """5 % on one day, the fourth: its row keeps the alarm, and what is told of the gain is as of any other."""
+    _filled(cell, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
+    series = _series(cell)[3]
+    assert series.alarm_at(3) is not None
+    assert (series.alarmed, series.onset, alarm_words(series)) == (False, None, None)
+    (axis,) = _json(capsys, str(cell), "--axis", "J4")["axes"]
+    assert (axis["alarmed"], axis["alarm"], axis["since"]) == (False, None, None)
+    known = [point.gain.value for point in series.points[:12]]
+    stds = [point.gain.std for point in series.points[:12]]
+    assert axis["baseline"] == pytest.approx(np.average(known, weights=np.array(stds) ** -2.0))
+
+
+def test_without_a_drift_there_is_no_alarm(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 25, lambda _: FLAT)
+    assert main(["history", str(cell)]) == 0
+    out = capsys.readouterr().out
+    assert "No alarm." in out
+    assert "ALARM" not in out
+    assert _json(capsys, str(cell))["questions"] == []
+
+
+@pytest.mark.parametrize(
+    ("factors", "says"),
+    [
+        ((0.96,) * 6, "is the payload heavier than the mass that was entered"),
+        ((1.04,) * 6, "is the payload lighter than the mass that was entered"),
+        ((1.0, 1.0, 1.0, 1.05, 1.0, 1.0), "Magnets do not grow stronger"),
+        ((1.0, 0.95, 1.0, 1.05, 1.0, 1.0), "several axes, each by an amount of its own"),
+    ],
+)
+def test_each_pattern_has_its_question(cell: Path, factors: tuple[float, ...], says: str) -> None:
+    _filled(cell, 20, stepping(factors))
+    assert says in questions(_series(cell))[0]
+
+
+def test_a_configuration_that_changed_is_asked_for(cell: Path) -> None:
+    _filled(cell, 20, stepping((0.96,) * 6))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(calibration_of(20, (0.96,) * 6), configuration_sha256="d" * 64))
+    assert "configuration changed" in questions(_series(cell))[1]
+
+
+def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
+    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    series = _series(cell)[3]
+    assert series.points[-1].gain.value < 0
+    words = alarm_words(series)
+    assert words is not None
+    assert words.startswith("gain of J4 fell 9.6 %")
+
+
+def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
+    """Twelve fits of one session are one calibration: the newest that was applied, else the newest."""
+    logs = calibration_of(0).sources
+    fits = [
+        replace(calibration_of(week, (1.0 + 0.001 * week,) * 6), sources=logs[::-1] if week % 2 else logs)
+        for week in range(12)
+    ]
+    with HistoryStore(_place(cell).store) as store:
+        digests = [enter(store, fit) for fit in fits]
+        assert len(store.entries()) == 12
+        (point,) = watch(store.entries(), ())[3].points
+        assert point.entry.digest == digests[-1]
+        assert point.entry.recorded == BEGIN
+        store.applied(digests[4], at=BEGIN, who="anna", target="x.yaml")
+        enter(store, calibration_of(1))
+        points = watch(store.entries(), ())[3].points
+        assert [point.entry.digest for point in points] == [digests[4], digest_of(calibration_of(1))]
+        held = tuple(replace(gain, std=0.0) for gain in fits[0].gains)
+        enter(store, replace(fits[0], gains=held, sources=calibration_of(1).sources))  # knows no gain, hides none
+        assert watch(store.entries(), ())[3].points[1].entry.digest == digest_of(calibration_of(1))
+    # Another log held out is another question to the same recordings.
+    other = replace(fits[0], sources=(*logs[:2], replace(logs[2], sha256="9" * 64)))
+    assert logs_of(other, "") == logs_of(fits[0], "")
+    assert logs_of(replace(fits[0], sources=()), "its own") == "its own"
+
+
+def test_old_logs_fitted_today_tell_of_their_own_time(cell: Path) -> None:
+    """A gain that was another one a year ago has not changed today."""
+    _filled(cell, 20, lambda _: FLAT)
+    year_ago = recorded(calibration_of(30, (0.9,) * 6), BEGIN - timedelta(days=400))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, year_ago)
+        assert store.entries()[-1].digest == digest_of(year_ago)  # fitted last
+    series = _series(cell)[3]
+    assert series.points[0].entry.digest == digest_of(year_ago)
+    assert [point.entry.recorded for point in series.points[:2]] == [BEGIN - timedelta(days=400), BEGIN]
+    assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
+
+
+@pytest.mark.parametrize("told", [None, float("nan"), 1e300])
+def test_a_log_without_its_time_has_that_of_the_fit(told: float | None) -> None:
+    assert recorded_at(with_recordings(calibration_of(3), recorded_s=told), BEGIN) == BEGIN
+
+
+def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    fixed = calibration_of(5)
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:])))
+    assert [len(series.points) for series in _series(cell)] == [3, 4, 4, 4, 4, 4]
+    assert main(["history", str(cell)]) == 0
+    assert "J1" in capsys.readouterr().out
+
+
+def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, float]:
+    """Those that a job judges by, which has kept its own calibration where one is given."""
+    declared = load_cell(cell)
+    controller = declared.controller_path
+    assert controller is not None
+    with Past(declared, _place(cell), controller, lambda: BEGIN, "job") as past:
+        if own is not None:
+            file = cell.parent / "own.yaml"
+            save(own, file)
+            past.keep(own, file)
+        changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
+        return dict(past.known(changes).dispersions)
+
+
+def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
+    """Also where a session was fitted again with a gain held fixed, and where that is its only fit."""
+    _filled(cell, 12, lambda week: (1.0 + 0.012 * (-1) ** week,) * 6)
+    before = {series.axis: series.dispersion for series in _series(cell)}
+    assert min(before.values()) > 1.5
+    assert _job_s_dispersions(cell) == before
+    fitted = calibration_of(5, (1.0 - 0.012,) * 6)
+    again = replace(fitted, gains=(replace(fitted.gains[0], std=0.0), *fitted.gains[1:]))
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, again)
+    charts = _series(cell)
+    assert [len(series.points) for series in charts] == [12] * 6
+    refitted = {series.axis: series.dispersion for series in charts}
+    assert _job_s_dispersions(cell) == refitted
+    assert refitted == pytest.approx(before, rel=0.05)  # the same recordings of all axes as before
+    alone = calibration_of(12)
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:])))
+    charts = _series(cell)
+    assert [len(series.points) for series in charts] == [12, 13, 13, 13, 13, 13]
+    found = {series.axis: series.dispersion for series in charts}
+    assert _job_s_dispersions(cell) == found
+    # What a session has found itself is not what it is judged by.
+    assert _job_s_dispersions(cell, calibration_of(13, (1.2,) * 6)) == found
+    assert {series.axis: series.dispersion for series in _series(cell)} != found
+
+
+def test_the_scatter_of_axes_is_told_together_where_the_same_recordings_know_them() -> None:
+    rng = np.random.default_rng(12)
+    names = tuple(f"J{number}" for number in range(1, 4))
+    values = rng.normal(10.0, 0.3, (9, 3))
+    entries = [
+        replace(
+            _entry(str(week)),
+            logs=str(week),
+            recorded=BEGIN + timedelta(weeks=week),
+            # J3 was held fixed once.
+            gains=tuple(
+                Gain(axis, float(value), 0.0 if (axis, week) == ("J3", 4) else 0.1, "Nm/A", 10.0)
+                for axis, value in zip(names, row, strict=True)
+            ),
+        )
+        for week, row in enumerate(values)
+    ]
+    found = dispersions_of(entries, names)
+    assert tuple(found) == names
+    np.testing.assert_allclose([found["J1"], found["J2"]], dispersions(values[:, :2].T, np.full((2, 9), 0.1)))
+    alone = np.delete(values[:, 2], 4)
+    np.testing.assert_allclose(found["J3"], dispersions([alone], np.full((1, 8), 0.1))[0])
+    assert dispersions_of(entries[:4], names) == dict.fromkeys(names, DISPERSION)
+    assert dispersions_of((), names) == dict.fromkeys(names, DISPERSION)
+    assert dispersions_of(entries, ("J9",)) == {"J9": DISPERSION}
+    assert dispersions_of(entries, ()) == {}
+
+
+def test_an_axis_has_a_table_of_its_own(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 5, lambda _: FLAT)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("2026-0") == 5
+    assert "CUSUM" in out
+    assert "No alarm" in out
+    assert main(["history", str(cell), "--axis", "J9"]) == 2
+    assert "one of J1" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_change_that_is_explained_begins_a_new_baseline(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 26, drifting)
+    explain = ["history", str(cell), "--acknowledge", "J4", "--by", "anna", "--why", "gearbox changed"]
+    assert main(explain) == 0
+    capsys.readouterr()
+    series = _series(cell)[3]
+    assert not series.alarmed
+    assert series.began == 25
+    assert [stretch.began for stretch in series.stretches] == [0, 25]
+    assert series.alarm_at(24) is not None  # what was told stays told
+    assert not any(other.acknowledged for other in _series(cell) if other.axis != "J4")
+    (entry,) = read(_place(cell).audit)
+    assert entry.action is AuditAction.ACKNOWLEDGED
+    assert entry.who.startswith("anna")
+    assert entry.details["why"] == "gearbox changed"
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+    assert "gearbox changed" in capsys.readouterr().out
+    assert main(["history", str(cell), "--verify"]) == 0
+    # The next calibrations at the new level are compared with that level.
+    with HistoryStore(_place(cell).store) as store:
+        for week in range(26, 30):
+            enter(store, calibration_of(week, drifting(week)))
+    assert not _series(cell)[3].alarmed
+
+
+def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
+    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    explain = ["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged", "--since"]
+    assert main([*explain, "someday"]) == 2
+    assert main([*explain, (BEGIN + timedelta(weeks=15)).date().isoformat()]) == 0
+    series = _series(cell)[3]
+    assert series.began == 15
+    assert not series.alarmed
+    # A baseline that is still to come would silence the axis until then.
+    with HistoryStore(_place(cell).store) as store:
+        store.acknowledge(Acknowledgement("J4", BEGIN.replace(year=2130), BEGIN, "anna", "x", "0" * 64))
+    series = _series(cell)[3]
+    assert (series.began, series.drift, series.onset, alarm_words(series)) == (20, None, None, None)
+    assert main(["history", str(cell), "--axis", "J4"]) == 0
+
+
+def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    explain = ["history", str(cell), "--acknowledge", "J4", "--why", "planned", "--since"]
+    assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "2130-01-02 02:04:05 UTC" in told
+    assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in told
+    assert not _place(cell).audit.exists()
+    assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
+
+
+def test_a_log_of_tomorrow_begins_its_baseline_now(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The clock of whoever recorded it was ahead."""
+    weeks = (datetime.now(UTC) - BEGIN).days // 7 + 2
+    with HistoryStore(_place(cell).store) as store:
+        enter(store, calibration_of(weeks))
+    assert main(["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged"]) == 0
+    assert _series(cell)[3].began == 0
+    assert main(["history", str(cell), "--verify"]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--acknowledge", "J4"],
+        ["--acknowledge", "J4", "--why", "  "],
+        ["--acknowledge", "J9", "--why", "x"],
+        ["--why", "x"],
+        ["--by", "anna"],
+        ["--since", "2026-01-01"],
+    ],
+)
+def test_an_explanation_without_its_parts_is_refused(cell: Path, arguments: list[str]) -> None:
+    _filled(cell, 3, lambda _: FLAT)
+    assert main(["history", str(cell), *arguments]) == 2
+    assert not _place(cell).audit.exists()
+
+
+def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 15, drifting)
+    out = cell.parent / "history.csv"
+    assert main(["history", str(cell), "--csv", str(out)]) == 0
+    assert main(["history", str(cell), "--csv", str(out)]) == 0  # an earlier one is replaced
+    with out.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert tuple(rows[0]) == COLUMNS
+    assert [row["axis"] for row in rows[::15]] == list(AXES)
+    found = {series.axis: series for series in _series(cell)}
+    for row, point in zip(rows[45:60], found["J4"].points, strict=True):
+        assert float(row["gain"]) == point.gain.value
+        assert datetime.fromisoformat(row["created"]) == point.entry.created
+        assert row["unit"] == "Nm/A"
+    assert rows[0]["change_percent"] == ""
+    capsys.readouterr()
+    assert main(["history", str(cell), "--csv", str(cell)]) == 2
+    assert cell.read_bytes().startswith(b"#") or b"axes" in cell.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+@pytest.mark.parametrize("arguments", [[], ["--axis", "J4"]])
+def test_the_picture_is_drawn_the_same_each_time(cell: Path, suffix: str, arguments: list[str]) -> None:
+    _filled(cell, 26, drifting)
+    out = cell.parent / f"history{suffix}"
+    draw = ["history", str(cell), "--plot", str(out), *arguments]
+    assert main(draw) == 0
+    first = out.read_bytes()
+    assert len(first) > 10_000
+    assert first.startswith({".png": b"\x89PNG", ".svg": b"<?xml"}[suffix])
+    assert main(draw) == 0
+    assert out.read_bytes() == first
+
+
+def test_a_picture_has_its_kind_and_replaces_only_its_like(cell: Path) -> None:
+    _filled(cell, 1, lambda _: FLAT)
+    assert main(["history", str(cell), "--plot", str(cell.parent / "history.pdf")]) == 2
+    notes = cell.parent / "notes.png"
+    notes.write_text("my notes")
+    assert main(["history", str(cell), "--plot", str(notes)]) == 2
+    assert notes.read_text() == "my notes"
+    assert main(["history", str(cell), "--plot", str(cell.parent / "none" / "history.png")]) == 1
+
+
+def test_a_broken_audit_is_told_by_its_first_line(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    audit = _place(cell).audit
+    for number in range(4):
+        append(audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number})
+    verify = ["history", str(cell), "--verify"]
+    assert main(verify) == 0
+    assert "4 entries, chain unbroken" in capsys.readouterr().out
+    audit.write_bytes(audit.read_bytes().replace(b'"k":2', b'"k":7'))
+    assert main(verify) == 4
+    shown = capsys.readouterr()
+    assert "line 3" in shown.err
+    assert "BROKEN" in shown.out
+    assert "keep this file" in shown.err
+    assert main([*verify, "--json"]) == 4
+    assert json.loads(capsys.readouterr().out)["audit"]["broken_line"] == 3
+
+
+def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A chain cannot tell that by itself: the history knows which entries there must be."""
+    place = _place(cell)
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    entries = [
+        append(place.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={}) for _ in range(3)
+    ]
+    with HistoryStore(place.store) as store:
+        store.applied(digest, at=BEGIN, who="anna", target="x", audit=entries[2].sha256)
+    assert main(["history", str(cell), "--verify"]) == 0
+    place.audit.write_bytes(b"".join(place.audit.read_bytes().splitlines(keepends=True)[:2]))
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert entries[2].sha256[:12] in capsys.readouterr().err
+
+
+def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A session keeps the digest of the entry that tells of its end."""
+    cell.write_text(cell.read_text() + RECALIBRATION)
+    declared = load_cell(cell)
+    assert declared.recalibration is not None
+    ended = append(_place(cell).audit, AuditAction.RECALIBRATION_ENDED, at=BEGIN, who="job", subject="x", details={})
+    session = begin(declared.recalibration.folder, Basis(declared.name, declared.digest, ""), BEGIN)
+    assert main(["history", str(cell), "--verify"]) == 0
+    save_session(replace(session, state=session.state.with_(audit_sha256=ended.sha256)))
+    assert main(["history", str(cell), "--verify"]) == 0
+    _place(cell).audit.unlink()
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert ended.sha256[:12] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")])
+def test_a_write_that_never_ended_is_told_with_what_the_file_is(
+    cell: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str
+) -> None:
+    file = cell.parent / "controller.yaml"
+    file.write_bytes(content)
+    digests = {"sha256_before": hashlib.sha256(b"old").hexdigest(), "sha256_after": hashlib.sha256(b"new").hexdigest()}
+    append(_place(cell).audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="anna", subject=str(file), details=digests)
+    assert main(["history", str(cell), "--verify"]) == 0
+    assert says in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_broken_history_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = _place(cell)
+    place.store.write_bytes(b"no history" * 1000)
+    assert main(["history", str(cell)]) == 4
+    assert "restore the last good one" in " ".join(capsys.readouterr().err.split())
+    place.store.unlink()
+    _filled(cell, 2, lambda _: FLAT)
+    with closing(sqlite3.connect(place.store)) as other:
+        other.execute("PRAGMA foreign_keys = OFF")
+        other.execute("DELETE FROM calibration WHERE created < '2026-01-08'")
+        other.commit()
+    assert main(["history", str(cell), "--verify"]) == 4
+    assert "without its calibration" in " ".join(capsys.readouterr().err.split())
+
+
+def _write_down(cell: Path, digest: str, *, back: bool = False, at: datetime = BEGIN) -> AuditEntry:
+    """A write to the cell's controller as the audit tells of it; the history is not told. Its end."""
+    controller, audit = load_cell(cell).controller_path, _place(cell).audit
+    begun, ended = AuditAction.APPLY_BEGUN, AuditAction.APPLIED
+    if back:
+        begun, ended = AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK
+    details: dict[str, object] = {"sha256_before": "0" * 64, "sha256_after": "1" * 64 if back else digest[::-1]}
+    if not back:
+        details["calibration"] = {"sha256": digest}
+    first = append(audit, begun, at=at, who="anna", subject=str(controller), details=details)
+    return append(audit, ended, at=at, who="anna", subject=str(controller), details={"begun": first.number})
+
+
+def _enter_write(cell: Path, digest: str, ended: AuditEntry, who: str = "anna") -> None:
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN, who=who, target=ended.subject, audit=ended.sha256, sha256_after=digest[::-1])
+
+
+def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What --verify finds, in one line; empty where all is well."""
+    capsys.readouterr()
+    code = main(["history", str(cell), "--verify"])
+    told = " ".join(capsys.readouterr().err.split())
+    assert code == (4 if told else 0)
+    return told
+
+
+def test_a_write_of_which_the_history_does_not_know_is_told_and_entered_by_hand(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    save(calibration, file)
+    digest = digest_of(calibration)
+    first, back = _write_down(cell, digest), _write_down(cell, digest, back=True)
+    # Of another target the history of this cell need not know.
+    append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="/other.yaml", details={"begun": 1})
+    told = _verified(cell, capsys)
+    for part in (f"entry {first.number} of", "applied by anna", digest[:12], f"entry {back.number} of", "--add"):
+        assert part in told
+    assert main(["history", str(cell), "--verify", "--json"]) == 4
+    found = json.loads(capsys.readouterr().out)["audit"]
+    assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [(2, digest), (4, None)]
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert capsys.readouterr().err.count("Entered too") == 2
+    assert _verified(cell, capsys) == ""
+    with HistoryStore(_place(cell).store) as store:
+        assert [(event.deed, event.at, event.who, event.audit) for event in store.events()] == [
+            (Deed.APPLIED, BEGIN, "anna", first.sha256),
+            (Deed.ROLLED_BACK, BEGIN, "anna", back.sha256),
+        ]
+        assert store.in_force() is None
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+
+
+def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second = _filled(cell, 2, lambda _: FLAT)
+    lost, known = _write_down(cell, first), _write_down(cell, second)
+    _enter_write(cell, second, known)
+    told = _verified(cell, capsys)
+    assert f"entry {lost.number} of" in told
+    assert "it knows of a later write" in told
+    file = cell.parent / "calibration.yaml"
+    save(calibration_of(5), file)
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+    assert f"entry {lost.number} of" in _verified(cell, capsys)
+
+
+def test_nothing_is_entered_from_an_audit_that_somebody_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    save(calibration, file)
+    _write_down(cell, digest_of(calibration))
+    audit = _place(cell).audit
+    audit.write_bytes(audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"'))
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    assert "Entered too" not in capsys.readouterr().err
+    with HistoryStore(_place(cell).store) as store:
+        assert store.events() == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("event SET who = 'kim'", "event 1: found who 'kim', expected 'anna' as entry 2"),
+        ("event SET target = '/other.yaml'", "event 1: found target /other.yaml, expected"),
+        ("event SET at = '2026-02-02T00:00:00.000000+00:00'", "event 1: found time 2026-02-02T00:00:00"),
+        ("event SET deed = 'rolled back'", "event 1: found rolled back, expected applied"),
+        ("event SET digest = NULL", "event 1: found calibration None, expected"),
+        ("event SET sha256_after = 'ab'", "event 1: found sha256_after ab…, expected"),
+        ("event SET audit = NULL", "no event of entry 2 of the audit, applied by anna"),
+        ("event SET number = 7", "event 1, 2, 3, 4, 5: found no such row, expected all from 1 to 7"),
+        ("acknowledgement SET who = 'kim'", "found who 'kim', expected 'anna (login"),
+        ("acknowledgement SET axis = 'J2'", "found axis 'J2', expected 'J4' as entry 3"),
+        ("acknowledgement SET why = 'x'", "found why 'x', expected 'gearbox changed'"),
+        ("acknowledgement SET since = '2026-01-01T00:00:00.000000+00:00'", "found since '2026-01-01T00:00:00"),
+        ("acknowledgement SET at = '2026-03-01T00:00:00.000000+00:00'", "found time '2026-03-01T00:00:00"),
+        ("acknowledgement SET audit = (SELECT audit FROM event)", "tells of applied, expected acknowledged"),
+        ("gain SET value = value * 1.01 WHERE axis = 'J4'", "gain of J4 in calibration"),
+    ],
+)
+def test_a_row_that_is_not_what_the_audit_tells_is_told(
+    cell: Path, capsys: pytest.CaptureFixture[str], change: str, says: str
+) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    _enter_write(cell, digest, _write_down(cell, digest))
+    assert main(["history", str(cell), "--acknowledge", "J4", "--by", "anna", "--why", "gearbox changed"]) == 0
+    assert _verified(cell, capsys) == ""
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute(f"UPDATE {change}")
+        other.commit()
+    assert says in _verified(cell, capsys)
+
+
+def test_a_row_that_was_taken_away_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    _enter_write(cell, digest, _write_down(cell, digest))
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute("DELETE FROM event")
+        other.commit()
+    told = _verified(cell, capsys)
+    assert "event 1: found no such row" in told
+    assert "no event of entry 2" in told
+
+
+def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whoever wrote was killed before the history knew; the next command says in the audit who it is."""
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    ended = _write_down(cell, digest)
+    begun, later = read(_place(cell).audit)[0], BEGIN + timedelta(hours=1)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=later, who="kim", target=ended.subject, audit=begun.sha256)
+    assert "found who 'kim', expected 'anna'" in _verified(cell, capsys)
+    append(_place(cell).audit, AuditAction.NOTHING_TO_DO, at=later, who="kim", subject=ended.subject, details={})
+    assert _verified(cell, capsys) == ""
+
+
+def test_a_write_that_a_job_entered_stands_within_the_job(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    audit = _place(cell).audit
+
+    def job(action: AuditAction, hours: float) -> None:
+        append(audit, action, at=BEGIN + timedelta(hours=hours), who="job", subject="x", details={})
+
+    job(AuditAction.RECALIBRATION_BEGUN, -1)  # and was killed
+    ended = _write_down(cell, digest)
+    begun = read(audit)[1]
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN + timedelta(hours=1), who="job", target=ended.subject, audit=begun.sha256)
+    assert _verified(cell, capsys) == ""
+    job(AuditAction.RECALIBRATION_BEGUN, 2)
+    job(AuditAction.RECALIBRATION_ENDED, 3)
+    assert _verified(cell, capsys) == ""
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute("UPDATE event SET at = '2026-02-02T00:00:00.000000+00:00'")
+        other.commit()
+    assert "found time 2026-02-02" in _verified(cell, capsys)
+
+
+def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`apply --drives` writes what stands there already once more, to let the drives save it."""
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    subject, evidence = drives_of("demo"), {"calibration": {"sha256": digest}}
+    ends = []
+    for before in ("0" * 64, "1" * 64):
+        begun = append(
+            _place(cell).audit,
+            AuditAction.APPLY_BEGUN,
+            at=BEGIN,
+            who="anna",
+            subject=subject,
+            details={"sha256_before": before, "sha256_after": "1" * 64, **evidence},
+        )
+        told = {"begun": begun.number}
+        ended = append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details=told)
+        ends.append(ended)
+        assert f"entry {ends[0].number} of" in _verified(cell, capsys)
+    with HistoryStore(_place(cell).store) as store:
+        store.applied(digest, at=BEGIN, who="anna", target=subject, audit=ends[1].sha256, sha256_after="1" * 64)
+    assert _verified(cell, capsys) == ""
+
+
+def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, second, third = _filled(cell, 3, lambda _: FLAT)
+    own = _put(cell, first)
+
+    def applied(digest: str, target: str) -> None:
+        with HistoryStore(_place(cell).store) as store:
+            store.applied(digest, at=BEGIN, who="anna", target=target)
+
+    def told() -> str | None:
+        return str(found) if (found := _json(capsys, str(cell))["in_force"]) else None
+
+    applied(first, own)
+    applied(second, "/another/controller.yaml")
+    assert told() == first
+    applied(third, own)
+    assert told() == first  # whatever the history says: the backup was copied back by hand
+    _put(cell, third)
+    assert told() == third
+    edited = Path(own).read_text().replace("loop:", "lopp:")
+    Path(own).write_text(edited + "# K.\n")
+    assert told() == third  # the gains are the same
+    capsys.readouterr()
+    assert main(["history", str(cell)]) == 0
+    assert " ".join(capsys.readouterr().out.split()).count("in force") == 1
+    _put(cell, third)
+    Path(own).write_text(re.sub("gain: -9[.0-9]*", "gain: -9.5", Path(own).read_text()))
+    assert told() is None
+    Path(own).unlink()
+    assert told() is None
+
+
+def test_what_was_done_is_told_in_the_words_of_who_did_it() -> None:
+    def event(digest: str | None, deed: Deed, who: str, target: str = "x") -> Event:
+        return Event(digest, deed, BEGIN, who, target)
+
+    entries = tuple(_entry(name) for name in ("a", "b", "c"))
+    done = [event("a", Deed.APPLIED, "anna")]
+    assert deed_words(entries, done, "a") == {"a": "applied by anna, in force", "b": "-", "c": "-"}
+    done += [event("b", Deed.APPLIED, "ben"), event("c", Deed.APPLIED, "cem", "y")]
+    assert deed_words(entries, done, "b") == {
+        "a": "applied by anna",
+        "b": "applied by ben, in force",
+        "c": "applied by cem",
+    }
+    done += [event("a", Deed.ROLLED_BACK, "dora")]
+    assert deed_words(entries, done, "a") == {
+        "a": "restored by dora, in force",
+        "b": "applied by ben, taken back by dora",
+        "c": "applied by cem",
+    }
+    done += [event(None, Deed.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
+    assert deed_words(entries, done, None)["c"] == "applied by cem, taken back by eva"
+    assert deed_words(entries, done, "c")["c"] == "applied by cem, taken back by eva, in force"
+
+
+def test_nobody_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
+    os.mkfifo(cell.parent / "pipe")
+    for path in (cell.parent / "pipe", Path("/dev/zero"), cell.parent):
+        assert main(["history", str(cell), "--add", str(path)]) == 4

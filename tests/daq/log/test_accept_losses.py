@@ -1,0 +1,60 @@
+"""A log that is invalid because frames were lost: refused, unless somebody says in so many words to use it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.errors import RunInvalid
+from daq.log.conversion import load_run
+from daq.log.reader import MASKED, LossyLogs, tells_losses_alone
+from daq.workflow.record import _verdict
+from drivers.stream.stream import StreamStatistics
+from tests.daq.logs import demo_content, samples, write
+
+
+@given(st.lists(st.tuples(st.integers(1, 10**9), st.sampled_from(MASKED)), min_size=1, max_size=6))
+def test_counted_losses_may_be_accepted(losses: list[tuple[int, str]]) -> None:
+    assert tells_losses_alone(", ".join(f"{count} {kind}" for count, kind in losses))
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "",
+        "not concluded",
+        "2 answers twice",
+        "3 missing answers, 1 periods without SYNC",
+        "stopped after 3 of 20 moves: 12 MB",
+        "3 missing answers, emergency (EMCY 3220h)",
+        "missing answers",
+    ],
+)
+def test_nothing_else_may(reason: str) -> None:
+    assert not tells_losses_alone(reason)
+
+
+def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(checkout: Path, tmp_path: Path) -> None:
+    rows = samples([[k, k, k, k, k, k] for k in range(40)])
+    path = write(tmp_path / "lossy.mcap", demo_content(checkout), rows, verdict=(False, "3 missing answers"))
+    with pytest.raises(RunInvalid, match="--accept-losses"):
+        load_run(path)
+    run, _ = load_run(path, lossy=LossyLogs.ACCEPTED)
+    assert run.partial
+    doubled = write(tmp_path / "doubled.mcap", demo_content(checkout), rows, verdict=(False, "3 answers twice"))
+    with pytest.raises(RunInvalid):
+        load_run(doubled, lossy=LossyLogs.ACCEPTED)
+
+
+def test_the_recorder_counts_them_by_these_names() -> None:
+    counted = StreamStatistics(
+        missing=1, late=2, wrong_length=3, kernel_dropped=4, interface_dropped=5, backlog_dropped=6
+    )
+    valid, reason = _verdict(counted)
+    assert not valid
+    assert tells_losses_alone(reason)
+    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == set(MASKED)
+    assert not tells_losses_alone(_verdict(StreamStatistics(missing=1, skipped_periods=1))[1])

@@ -1,0 +1,185 @@
+"""Raw counts to SI: by the cell in the log, and refused where they cannot be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.config.cell_file import load_cell
+from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
+from daq.log.conversion import load_run, scaling, unwrapped
+from daq.log.message import AxisReadback, Readback, readback_of_drives
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from tests.conftest import CHECKOUT
+from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
+
+CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
+DEMO_SCALING = scaling(CELL, Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)))
+Recorder = Callable[..., Path]
+
+
+@pytest.fixture
+def record(checkout: Path, tmp_path: Path) -> Recorder:
+    """Writes a log of the demo cell."""
+
+    def _record(rows: list[Sample], **options: object) -> Path:
+        events = options.get("events", ())
+        verdict = options.get("verdict", (True, ""))
+        payload = DISC if options.get("loaded") else None
+        assert isinstance(events, tuple)
+        assert isinstance(verdict, tuple)
+        return write(tmp_path / "a.mcap", demo_content(checkout, payload), rows, events, verdict)
+
+    return _record
+
+
+@given(st.lists(st.integers(-(2**31), 2**31 - 1), min_size=6, max_size=6))
+def test_joint_positions_are_those_of_the_drive_train(counts: list[int]) -> None:
+    """q_motor = R q_joint (eq. 24), so R q must give the counts back."""
+    joint_rad = DEMO_SCALING.joint_position(np.array(counts))
+    np.testing.assert_allclose(CELL.ratio @ joint_rad / (2 * pi) * 65536, counts, rtol=1e-9, atol=1e-3)
+
+
+def test_motor_six_also_turns_with_joint_five() -> None:
+    turn_of_motor_6 = DEMO_SCALING.joint_position(np.array([0, 0, 0, 0, 0, 65536]))
+    np.testing.assert_allclose(turn_of_motor_6, [0, 0, 0, 0, 0, 2 * pi / 32], atol=1e-12)
+    turn_of_motor_5 = DEMO_SCALING.joint_position(np.array([0, 0, 0, 0, 65536, 0]))
+    np.testing.assert_allclose(turn_of_motor_5, [0, 0, 0, 0, 2 * pi / 45, -2 * pi / 45], atol=1e-12)
+
+
+def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
+    events = (
+        CellEvent(START_NS + 20_000_000, None, EventKind.MOVE_START, 4, ""),
+        CellEvent(START_NS + 50_000_000, None, EventKind.MOVE_END, 4, ""),
+        CellEvent(START_NS + 60_000_000, None, EventKind.MOVE_START, 5, ""),
+    )
+    run, cell = load_run(record(samples([[1000 * k] * 6 for k in range(100)]), events=events, loaded=True))
+    assert cell.digest == CELL.digest
+    assert run.payload == DISC
+    assert run.rate_hz == pytest.approx(1000.0)
+    assert run.time_s[0] == 0.0
+    np.testing.assert_allclose(run.current_a[3], [-6.0] * 6)
+    np.testing.assert_allclose(run.position_rad[1, :4], 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48]))
+    assert run.move is not None
+    assert run.move.tolist() == [4] * 60 + [5] * 40
+    assert run.valid is not None
+    assert run.valid.all()
+    assert len(run.digest) == 64
+
+
+def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:
+    """And what is printed of the payload is what was used."""
+    log = record(samples([[1000 * k] * 6 for k in range(100)]), loaded=True)
+    heavier = replace(CELL, payloads=tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads))
+    run, _ = load_run(log, heavier)
+    assert run.payload is not None
+    assert run.payload.known == {"m": 5.049}
+    other = replace(CELL, payloads=tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads))
+    assert load_run(log, other)[0].payload == DISC
+
+
+def test_no_moves_written_down_is_none(record: Recorder) -> None:
+    assert load_run(record(samples([[0] * 6] * 3)))[0].move is None
+
+
+def test_missing_and_saturated_samples_are_masked(record: Recorder) -> None:
+    rows = samples([[0] * 6] * 20)
+    rows[3] = Sample(13, rows[3].time_ns, (0,) * 6, (0,) * 6, (0x1237,) * 6, missing=0b100100)
+    rows[7] = Sample(17, rows[7].time_ns, (0,) * 6, (0,) * 6, (0x1A37,) + (0x1237,) * 5)
+    valid = load_run(record(rows))[0].valid
+    assert valid is not None
+    assert np.argwhere(~valid).tolist() == [[3, 2], [3, 5], [7, 0]]
+
+
+def test_a_run_at_the_limit_is_refused(record: Recorder) -> None:
+    rows = samples([[0] * 6] * 17) + samples([[0] * 6] * 20, status=0x1A37)[17:]
+    with pytest.raises(CurrentSaturated, match=r"axis J1: found a limit acting in 15\.0 %"):
+        load_run(record(rows))
+
+
+def test_a_gap_is_refused(record: Recorder) -> None:
+    rows = samples([[0] * 6] * 20)
+    with pytest.raises(CyclesLost, match="cycle 16 after 14 "):
+        load_run(record(rows[:5] + rows[6:]))
+
+
+def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
+    rows = [Sample(k, START_NS + k * 1_100_000, (0,) * 6, (0,) * 6, (0,) * 6) for k in range(20)]
+    with pytest.raises(ClockImplausible, match=r"909\.091 Hz; expected 1000 Hz"):
+        load_run(record(rows))
+
+
+def test_one_late_sync_is_refused(record: Recorder) -> None:
+    """The mean rate of such a run is right, and its derivatives are not."""
+    rows = samples([[0] * 6] * 400)
+    late = replace(rows[7], time_ns=rows[7].time_ns + 510_000)
+    with pytest.raises(ClockImplausible, match=r"cycle 17 1\.51 ms after cycle 16 \(2 such steps\); expected 1 ms"):
+        load_run(record([*rows[:7], late, *rows[8:]]))
+
+
+def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
+    rows = samples([[0] * 6] * 400)
+    early = replace(rows[7], time_ns=rows[7].time_ns - 490_000)
+    assert load_run(record([*rows[:7], early, *rows[8:]]))[0].rate_hz == 1000.0
+
+
+@given(
+    st.integers(-(2**31), 2**31 - 1),
+    st.lists(st.one_of(st.integers(-(2**31) + 1, 2**31 - 1), st.integers(-1000, 1000)), max_size=30),
+)
+def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: list[int]) -> None:
+    way = np.cumsum([start, *steps], dtype=np.int64)
+    counter = ((way + 2**31) % 2**32 - 2**31).astype(np.int32)
+    np.testing.assert_array_equal(unwrapped(np.stack((counter, np.full_like(counter, 7)), axis=1))[:, 0], way)
+
+
+def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
+    """With an offset that puts the end of the counter in the middle of the joint's range."""
+    end_rad = 2**31 / 65536 * 2 * pi / 32
+    axes = (replace(CELL.axes[0], zero_offset_rad=-end_rad), *CELL.axes[1:])
+    counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
+    rows = [replace(row, current_raw=(0,) * 6) for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])]
+    run, _ = load_run(record(rows), replace(CELL, axes=axes))
+    np.testing.assert_allclose(run.position_rad[:, 0], np.arange(-3, 3) * 2 * pi / 65536 / 32, atol=1e-9)
+
+
+def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
+    start = demo_content(checkout)
+    top = 2**31 - 1
+    quantum = 1.0 / top
+    readback = Readback(tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes))
+    rows = [Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6) for k, sign in enumerate((1, -1))]
+    run, _ = load_run(write(tmp_path / "i.mcap", replace(start, readback=readback), rows))
+    np.testing.assert_allclose(run.position_rad[:, 0], [1 / 32, -1 / 32])
+
+
+def test_an_invalid_run_is_refused(record: Recorder) -> None:
+    with pytest.raises(RunInvalid, match="heartbeat of node 3"):
+        load_run(record(samples([[0] * 6] * 20), verdict=(False, "heartbeat of node 3 lost")))
+
+
+def test_positions_outside_the_limits_are_refused(record: Recorder) -> None:
+    turned = round(65536 * 32 * 0.8)
+    with pytest.raises(PositionImplausible, match=r"axis J1: found joint positions from 0 to 288 deg; .*radians"):
+        load_run(record(samples([[0] * 6, [turned, 0, 0, 0, 0, 0]])))
+
+
+def test_a_log_of_another_cell_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "b.mcap", content(2), samples([[0, 0]] * 3))
+    with pytest.raises(LogIncomplete, match="a readback of J1, J2; expected one of J1, J2, J3"):
+        load_run(path, CELL)
+
+
+def test_the_readback_of_drives_keeps_their_answers() -> None:
+    readback = readback_of_drives(("J1", "J2"), (0.1, 0.2), {"J2": {"serial": 2}, "J1": {"serial": 1}})
+    assert [(a.name, a.current_per_unit, a.drive) for a in readback.axes] == [
+        ("J1", 0.1, {"serial": 1}),
+        ("J2", 0.2, {"serial": 2}),
+    ]

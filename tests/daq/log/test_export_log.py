@@ -1,0 +1,141 @@
+"""`drivegain export log`: a table with the numbers of the log, whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.errors import ExitCode
+from daq.log.conversion import load_run
+from daq.log.export import TableFormat, export_log
+from daq.log.reader import BLOCK_SAMPLES
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from tests.daq.logs import START_NS, demo_content, samples, write
+
+ROWS = 2 * BLOCK_SAMPLES + 100
+"""Three blocks."""
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Path:
+    """Slow motion of six axes, two moves, one answer missing."""
+    rng = np.random.default_rng(3)
+    steps = rng.integers(-20, 20, size=(ROWS, 6))
+    counts = np.cumsum(steps, axis=0)
+    rows = samples(counts.tolist())
+    rows[7] = replace(rows[7], missing=0b100)
+    moves = [
+        CellEvent(START_NS + at * 1_000_000, None, EventKind.MOVE_START, number, "")
+        for number, at in ((0, 5), (1, 5000))
+    ]
+    return write(tmp_path_factory.mktemp("log") / "bare.mcap", demo_content(checkout), rows, moves)
+
+
+def _table(path: Path) -> dict[str, list[str]]:
+    with path.open(encoding="utf-8", newline="") as stream:
+        header, *rows = csv.reader(stream)
+    return dict(zip(header, map(list, zip(*rows, strict=True)), strict=True))
+
+
+def _numbers(column: Sequence[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([float(text) for text in column])
+
+
+def test_csv_has_the_numbers_that_a_fit_gets(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "bare.csv"
+    assert main(["export", "log", str(log), "--csv", "--out", str(out), "--json"]) == ExitCode.OK
+    said = json.loads(capsys.readouterr().out)
+    table = _table(out)
+    run, _ = load_run(log)
+    assert (said["rows"], said["columns"], said["valid"]) == (ROWS, list(table), True)
+    assert list(table)[:4] == ["cycle", "time_ns", "time_s", "move"]
+    assert list(table)[4:10] == [
+        f"J1.{name}" for name in ("position_rad", "current_A", "motor_counts", "current_raw", "statusword", "answered")
+    ]
+    # repr gives back the very numbers.
+    for index in range(6):
+        assert (_numbers(table[f"J{index + 1}.position_rad"]) == run.position_rad[:, index]).all()
+        assert (_numbers(table[f"J{index + 1}.current_A"]) == run.current_a[:, index]).all()
+    assert run.move is not None
+    assert (_numbers(table["move"]) == run.move).all()
+    assert [row for row, text in enumerate(table["J3.answered"]) if text == "0"] == [7]
+    assert set(table["J2.answered"]) == {"1"}
+    assert [int(text) for text in table["time_ns"][:2]] == [START_NS, START_NS + 1_000_000]
+    assert set(table["J6.statusword"]) == {str(0x1237)}
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checkout: Path) -> None:
+    step = 2**20
+    true = [step * row for row in range(ROWS)]
+    rows = [[(count + 2**31) % 2**32 - 2**31] * 6 for count in true]
+    bare = [Sample(10 + k, START_NS + k * 1_000_000, tuple(row), (0,) * 6, (0,) * 6, 0) for k, row in enumerate(rows)]
+    log = write(tmp_path / "wrapping.mcap", demo_content(checkout), bare)
+    export_log(log, tmp_path / "out.csv", TableFormat.CSV)
+    assert [int(text) for text in _table(tmp_path / "out.csv")["J4.motor_counts"]] == true
+
+
+def test_parquet_has_the_same_columns(log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="the optional extra `parquet`")
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    export_log(log, tmp_path / "bare.csv", TableFormat.CSV)
+    export_log(log, tmp_path / "bare.parquet", TableFormat.PARQUET)
+    read = parquet.read_table(tmp_path / "bare.parquet")
+    table = _table(tmp_path / "bare.csv")
+    assert read.column_names == list(table)
+    for name, column in table.items():
+        assert (read[name].to_numpy() == _numbers(column)).all()
+
+
+def test_without_its_package_parquet_says_what_to_install(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("daq.log.export.find_spec", lambda _name: None)
+    assert main(["export", "log", str(log), "--parquet", "--out", str(tmp_path / "x")]) == ExitCode.CONFIGURATION
+    assert "drivegain[parquet]" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kinds", [[], ["--csv", "--parquet"]])
+def test_one_kind_of_table_must_be_chosen(
+    log: Path, tmp_path: Path, kinds: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", "log", str(log), *kinds, "--out", str(tmp_path / "x")]) == ExitCode.USAGE
+    assert "one of them" in capsys.readouterr().err
+
+
+def test_a_damaged_log_leaves_nothing_behind_and_nothing_is_overwritten(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 1
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    out = tmp_path / "out.csv"
+    assert main(["export", "log", str(damaged), "--csv", "--out", str(out)]) == ExitCode.DATA_UNFIT
+    assert sorted(tmp_path.iterdir()) == [damaged]
+    out.write_text("mine")
+    assert main(["export", "log", str(log), "--csv", "--out", str(out)]) == ExitCode.USAGE
+    assert out.read_text() == "mine"
+    missing = tmp_path / "absent" / "out.csv"
+    assert main(["export", "log", str(log), "--csv", "--out", str(missing)]) == ExitCode.UNEXPECTED
+    assert "folder that can be written" in capsys.readouterr().err
+
+
+def test_an_invalid_log_is_exported_and_called_invalid(
+    tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write(
+        tmp_path / "bad.mcap", demo_content(checkout), samples([[0] * 6] * 3), verdict=(False, "2 late answers")
+    )
+    assert main(["export", "log", str(log), "--csv", "--out", str(tmp_path / "bad.csv")]) == ExitCode.OK
+    assert "INVALID: 2 late answers" in capsys.readouterr().err

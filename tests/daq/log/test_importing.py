@@ -1,0 +1,387 @@
+"""CSV files of other controllers: the same numbers in a log, or an error and nothing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from daq.cli import main
+from daq.config.yaml_file import parse_yaml
+from daq.errors import ConfigurationInconsistent, OutputExists, TimeNotUniform
+from daq.log.conversion import load_run
+from daq.log.csv_import import import_csv, quantise
+
+NAMES = [f"q{i}" for i in range(1, 7)] + [f"i{i}" for i in range(1, 7)]
+
+
+class Bench:
+    """A folder with the demo cell, a recording of it and its description, for a test to spoil."""
+
+    def __init__(self, checkout: Path, folder: Path) -> None:
+        """Store the folders."""
+        self.checkout = checkout
+        self.folder = folder
+        self.data = folder / "data"
+        self.out = folder / "out" / "run.mcap"
+        self.joint_deg = 20.0 * np.sin(np.arange(300)[:, None] / 40.0 + np.arange(6))
+        self.current_a = np.cos(np.arange(300)[:, None] / 7.0 + np.arange(6))
+
+    def prepare(self) -> Bench:
+        """Make all files."""
+        shutil.copytree(self.checkout / "configs", self.folder / "configs")
+        self.data.mkdir()
+        self.out.parent.mkdir()
+        self.write_csv(np.hstack((self.joint_deg, self.current_a)))
+        self.describe()
+        return self
+
+    def write_csv(self, values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], delimiter: str = ",") -> None:
+        """The recording, positions before currents."""
+        lines = [delimiter.join(NAMES), *(delimiter.join(map(repr, row)) for row in values.tolist())]
+        (self.data / "run.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def spoil_csv(self, old: str, new: str) -> None:
+        """Replace something in the recording."""
+        path = self.data / "run.csv"
+        text = path.read_text(encoding="utf-8")
+        assert old in text
+        path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+    @property
+    def description(self) -> Path:
+        """The description's path."""
+        return self.folder / "configs/imports/run.yaml"
+
+    def describe(self, **changes: object) -> None:
+        """The description, with some values replaced; None removes."""
+        document: dict[str, object] = {
+            "name": "run",
+            "cell": "../cells/demo.yaml",
+            "position": {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"},
+            "current": {"file": "run.csv", "columns": NAMES[6:], "unit": "A"},
+            "rate_hz": 1000,
+        }
+        document.update(changes)
+        self.description.write_text(
+            json.dumps({key: value for key, value in document.items() if value is not None}), encoding="utf-8"
+        )
+
+    def run(self) -> int:
+        """The command; its exit code."""
+        return main(["import", str(self.description), "--data", str(self.data), "--out", str(self.out)])
+
+    @property
+    def left(self) -> list[str]:
+        """What is in the folder of the log."""
+        return sorted(path.name for path in self.out.parent.iterdir())
+
+
+@pytest.fixture
+def bench(checkout: Path, tmp_path: Path) -> Bench:
+    """A bench with good files."""
+    return Bench(checkout, tmp_path).prepare()
+
+
+def test_joint_degrees_come_back_as_radians(bench: Bench) -> None:
+    assert bench.run() == 0
+    run, cell = load_run(bench.out)
+    assert cell.name == "demo"
+    assert run.rate_hz == pytest.approx(1000.0)
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
+    assert run.payload is None
+    assert bench.left == ["run.mcap"]
+
+
+def test_motor_radians_counts_and_joint_degrees_are_the_same_run(bench: Bench) -> None:
+    cell = load_run_of(bench)
+    motor_rad = np.radians(bench.joint_deg) @ cell.T
+    counts = np.rint(motor_rad / (2 * pi) * 65536)
+    for unit, values in (("rad", motor_rad), ("counts", counts)):
+        bench.write_csv(np.hstack((values, bench.current_a)))
+        bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": unit, "side": "motor"})
+        bench.out.unlink(missing_ok=True)
+        assert bench.run() == 0
+        np.testing.assert_allclose(load_run(bench.out)[0].position_rad, np.radians(bench.joint_deg), atol=3e-6)
+
+
+def load_run_of(bench: Bench) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """R of the bench's cell."""
+    tree = parse_yaml((bench.folder / "configs/cells/demo.yaml").read_bytes(), "cell").tree
+    return np.array(tree["drive_train"]["ratio"], dtype=np.float64)
+
+
+def test_column_numbers_semicolons_and_decimal_commas(bench: Bench) -> None:
+    bench.write_csv(np.hstack((bench.joint_deg, 1000.0 * bench.current_a)), delimiter=";")
+    path = bench.data / "run.csv"
+    path.write_text("exported by X\n" + path.read_text(encoding="utf-8").replace(".", ","), encoding="utf-8-sig")
+    bench.describe(
+        table={"delimiter": ";", "decimal": ",", "skip_rows": 1},
+        position={"file": "run.csv", "columns": [1, 2, 3, 4, 5, 6], "unit": "deg", "side": "joint"},
+        current={"file": "run.csv", "columns": [7, 8, 9, 10, 11, 12], "unit": "A", "factor": 0.001},
+        payload="disc",
+    )
+    assert bench.run() == 0
+    run = load_run(bench.out)[0]
+    np.testing.assert_allclose(run.position_rad, np.radians(bench.joint_deg), atol=2e-9)
+    np.testing.assert_allclose(run.current_a, bench.current_a, atol=1e-9)
+    assert run.payload is not None
+    assert run.payload.known == {"m": 4.59}
+
+
+def test_the_same_files_give_the_same_log(bench: Bench) -> None:
+    assert bench.run() == 0
+    first = bench.out.read_bytes()
+    bench.out.unlink()
+    assert bench.run() == 0
+    assert bench.out.read_bytes() == first
+
+
+@given(arrays(np.float64, (5, 2), elements=st.floats(-1e12, 1e12)))
+def test_nothing_is_lost_by_counting(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    raw, quantum = quantise(values)
+    largest = np.abs(values).max(axis=0)
+    assert np.abs(raw).max() <= 2**31 - 1
+    assert (np.abs(values - raw * quantum) <= quantum / 2).all()
+    assert (quantum[largest > 1e-200] <= 1e-9 * largest[largest > 1e-200]).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("q1,q2", "q1,qq", ("columns q1, qq", "one column 'q2'")),
+        ("\n20.0,", "\n", ()),
+        ("q1,", "", ("expected: 11, as in the header",)),
+    ],
+)
+def test_wrong_columns(
+    bench: Bench, capsys: pytest.CaptureFixture[str], old: str, new: str, said: tuple[str, ...]
+) -> None:
+    if old == "\n20.0,":
+        rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+        old, new, said = rows[7], rows[7].partition(",")[2], ("run.csv:8", "11 columns", "12, as in the header")
+    bench.spoil_csv(old, new)
+    _refused(bench, capsys, 4, *said)
+
+
+def _refused(bench: Bench, capsys: pytest.CaptureFixture[str], code: int, *said: str) -> None:
+    assert bench.run() == code
+    output = capsys.readouterr()
+    assert output.out == ""
+    for label in ("error:", "found:", "expected:", "do:"):
+        assert label in output.err
+    for text in said:
+        assert text in output.err
+    assert bench.left == []
+
+
+@pytest.mark.parametrize("word", ["nan", "inf", "-inf", "", "n/a", "1.2.3", "1e999"])
+def test_a_field_that_is_no_finite_number(bench: Bench, capsys: pytest.CaptureFixture[str], word: str) -> None:
+    rows = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    fields = rows[41].split(",")
+    fields[8] = word
+    bench.spoil_csv(rows[41], ",".join(fields))
+    _refused(bench, capsys, 4, "run.csv:42, column i3", repr(word), "a finite number")
+
+
+def test_a_missing_file(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    (bench.data / "run.csv").unlink()
+    _refused(bench, capsys, 4, "run.csv", "no such file", "--data")
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", ",".join(NAMES), ",".join(NAMES) + "\n"])
+def test_an_empty_file(bench: Bench, capsys: pytest.CaptureFixture[str], text: str) -> None:
+    (bench.data / "run.csv").write_text(text, encoding="utf-8")
+    _refused(bench, capsys, 4, "before the numbers", "a line of numbers for each sample")
+
+
+def test_every_truncation_that_shows_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    data = (bench.data / "run.csv").read_bytes().rstrip(b"\n")
+    last = data.rpartition(b"\n")[2]
+    for keep in (3, len(last) // 2, last.rindex(b","), last.rindex(b",") + 1):
+        (bench.data / "run.csv").write_bytes(data[: len(data) - len(last) + keep])
+        _refused(bench, capsys, 4, "run.csv:301", "the file ends early")
+
+
+def test_binary_is_no_csv(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    (bench.data / "run.csv").write_bytes(b"q1\n\xff\xfe\x00")
+    _refused(bench, capsys, 4, "no UTF-8")
+
+
+def test_degrees_declared_as_radians(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "rad", "side": "joint"})
+    _refused(bench, capsys, 4, "degrees were taken for radians")
+
+
+def test_radians_declared_as_degrees(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.write_csv(np.hstack((np.radians(bench.joint_deg), bench.current_a)))
+    _refused(bench, capsys, 4, "radians were taken for degrees")
+
+
+def test_fractional_counts(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"})
+    _refused(bench, capsys, 4, "run.csv:2, column q2", "a whole number of encoder counts")
+
+
+def test_files_of_different_length(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    (bench.data / "short.csv").write_text("\n".join(lines[:-5]) + "\n", encoding="utf-8")
+    bench.describe(current={"file": "short.csv", "columns": NAMES[6:], "unit": "A"})
+    _refused(bench, capsys, 4, "300 rows in run.csv and 295 rows in short.csv")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"rat_hz": 1000, "rate_hz": None}, ("unknown key 'rat_hz'", "rate_hz (did you mean that?)")),
+        ({"rate_hz": None}, ("neither rate_hz nor time",)),
+        ({"time": {"file": "run.csv", "column": "q1", "unit": "s"}}, ("both rate_hz and time",)),
+        ({"rate_hz": "1000"}, ("rate_hz", 'text "1000"', "a valid number")),
+        ({"payload": "brick"}, ("'brick'", "disc at flange-a")),
+        ({"cell": "../cells/none.yaml"}, ("none.yaml", "no such file")),
+        ({"position": {"file": "run.csv", "columns": NAMES[:6], "unit": "grad", "side": "joint"}}, ("position.unit",)),
+        ({"position": {"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "joint"}}, ("motor",)),
+        ({"current": {"file": "run.csv", "columns": NAMES[6:], "unit": "mA"}}, ("'mA'", "current in 'A'", "factor")),
+        ({"current": {"file": "run.csv", "columns": NAMES[6:11], "unit": "A"}}, ("5 columns", "6, as many")),
+    ],
+)
+def test_a_wrong_description(
+    bench: Bench, capsys: pytest.CaptureFixture[str], changes: dict[str, object], said: tuple[str, ...]
+) -> None:
+    bench.describe(**changes)
+    _refused(bench, capsys, 6, *said)
+
+
+def test_a_duplicate_key_in_the_description(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.description.write_text(bench.description.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    text = bench.description.read_text(encoding="utf-8").replace('"rate_hz": 1000', '"rate_hz": 1000,\n"rate_hz": 500')
+    bench.description.write_text(text, encoding="utf-8")
+    _refused(bench, capsys, 6, "run.yaml:2", "duplicate key 'rate_hz', first on line 1")
+
+
+def test_a_missing_description(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.description.unlink()
+    _refused(bench, capsys, 6, "run.yaml", "no such file")
+
+
+def test_an_existing_log_stays(bench: Bench) -> None:
+    bench.out.write_bytes(b"precious")
+    with pytest.raises(OutputExists):
+        import_csv(bench.description, bench.data, bench.out, software="x")
+    assert bench.out.read_bytes() == b"precious"
+    assert bench.left == ["run.mcap"]
+
+
+def test_a_full_disk_leaves_nothing(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    assert bench.run() == 1
+    assert bench.left == []
+
+
+def test_a_rate_that_makes_the_joints_too_fast(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.describe(rate_hz=100_000.0)
+    _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+
+
+@pytest.mark.parametrize("wrong", [0.1, 1.0, 10.0])
+def test_a_rate_that_is_ten_times_off_is_noticed(
+    bench: Bench, wrong: float, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """At 1 kHz the joints reach 80 to 90 % of the slowest limit."""
+    seconds = np.arange(1000)[:, None] / 1000.0
+    bench.joint_deg = 30.0 * np.sin(2.0 * np.pi * seconds + np.arange(6))
+    bench.current_a = np.cos(seconds * 140.0 + np.arange(6))
+    bench.joint_deg[500, 2] += 1.0  # one outlier is not taken for a wrong rate
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    bench.describe(rate_hz=1000.0 * wrong)
+    if wrong > 1.0:
+        _refused(bench, capsys, 4, "deg/s", "rate_hz is too high")
+    else:
+        assert bench.run() == 0
+    assert ("no joint is faster than" in caplog.text) is (wrong < 1.0)
+
+
+def test_a_number_that_is_no_current(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.current_a[120, 3] = 1e300
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(bench, capsys, 4, "run.csv:122, column i4", "1e+300")
+
+
+def test_a_dead_channel(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.current_a[:, 2] = 0.0
+    bench.write_csv(np.hstack((bench.joint_deg, bench.current_a)))
+    _refused(bench, capsys, 4, "column i3", "zero in every row")
+
+
+def test_a_last_number_that_may_lack_digits(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bench.data / "run.csv"
+    path.write_bytes(path.read_bytes()[:-3])
+    _refused(bench, capsys, 4, "without an end of line")
+
+
+@pytest.mark.parametrize("change", [{"rate_hz": 1e-9}, {"rate_hz": 1e9}])
+def test_rates_beyond_reason(bench: Bench, capsys: pytest.CaptureFixture[str], change: dict[str, object]) -> None:
+    bench.describe(**change)
+    _refused(bench, capsys, 6, "rate_hz")
+
+
+def _with_time(bench: Bench, time_s: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> None:
+    lines = (bench.data / "run.csv").read_text(encoding="utf-8").splitlines()
+    timed = ["t," + lines[0], *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True))]
+    (bench.data / "run.csv").write_text("\n".join(timed) + "\n", encoding="utf-8")
+    bench.describe(rate_hz=None, time={"file": "run.csv", "column": "t", "unit": "ms"})
+
+
+def test_the_rate_of_a_time_column(bench: Bench) -> None:
+    _with_time(bench, 5000.0 + 4.0 * np.arange(300) + 0.3 * np.sin(np.arange(300)) * (np.arange(300) % 299 != 0))
+    assert bench.run() == 0
+    assert load_run(bench.out)[0].rate_hz == pytest.approx(250.0)
+
+
+@pytest.mark.parametrize(("index", "shift"), [(100, 4.0), (100, -4.0), (299, 3.0)])
+def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
+    _with_time(bench, 4.0 * np.arange(300) + shift * (np.arange(300) >= index))
+    with pytest.raises(TimeNotUniform, match=rf"run\.csv:{index + 2}, column t"):
+        import_csv(bench.description, bench.data, bench.out, software="x")
+    assert bench.left == []
+
+
+def test_counts_need_an_encoder(bench: Bench) -> None:
+    cell = bench.folder / "configs/cells/tx40.yaml"
+    bench.describe(
+        cell=str(cell),
+        position={"file": "run.csv", "columns": NAMES[:6], "unit": "counts", "side": "motor"},
+        current={"file": "run.csv", "columns": NAMES[6:], "unit": "Nm(motor, a priori)"},
+    )
+    with pytest.raises(ConfigurationInconsistent, match="counts_per_revolution"):
+        import_csv(bench.description, bench.data, bench.out, software="x")
+
+
+def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> None:
+    """Nine seconds of a real arm: every number of the files is in the log to half a count."""
+    out = tmp_path / "tx40.mcap"
+    description = checkout / "configs/imports/tx40.yaml"
+    assert main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(out)]) == 0
+    run, cell = load_run(out)
+    motor_rad = np.loadtxt(shared_data / "tx40/pos_read_data.csv", delimiter=",", skiprows=1)
+    current = np.loadtxt(shared_data / "tx40/curr_data.csv", delimiter=",", skiprows=1)
+    assert run.position_rad.shape == (45000, 6)
+    assert run.rate_hz == pytest.approx(5000.0)
+    offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
+    np.testing.assert_allclose(
+        (run.position_rad - offset_rad) @ cell.ratio.T, motor_rad, atol=1e-9 * np.abs(motor_rad).max()
+    )
+    np.testing.assert_allclose(run.current_a, current, atol=1e-9 * np.abs(current).max())
+    # NOTICE: q2 has an offset of −π/2, q3 of +π/2; the arm starts stretched up, both URDF angles near zero.
+    np.testing.assert_allclose(run.position_rad[0, 1:3], 0.0, atol=1e-3)

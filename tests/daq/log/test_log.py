@@ -1,0 +1,260 @@
+"""What goes into a log comes out of it, and any MCAP reader can read it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+
+from daq.errors import LogIncomplete, OutputExists, OutputFailed
+from daq.log.container import RecordFile
+from daq.log.reader import LogReader, read_log
+from daq.log.writer import LogWriter
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from tests.daq.logs import DISC, START_NS, content, joints, samples, write
+
+I32 = st.integers(-(2**31), 2**31 - 1)
+
+
+@st.composite
+def _recordings(draw: st.DrawFn) -> tuple[int, list[Sample]]:
+    axes = draw(st.integers(1, 8))
+    rows = draw(
+        st.lists(
+            st.builds(
+                Sample,
+                st.integers(0, 2**63),
+                st.integers(0, 2**31 * 10**9 - 1),
+                st.tuples(*[I32] * axes),
+                st.tuples(*[I32] * axes),
+                st.tuples(*[st.integers(0, 0xFFFF)] * axes),
+                st.integers(0, 2**axes - 1),
+            ),
+            min_size=1,
+            max_size=20,
+        )
+    )
+    return axes, rows
+
+
+EVENTS = st.lists(
+    st.builds(
+        CellEvent,
+        st.integers(0, 2**31 * 10**9 - 1),
+        st.none() | st.integers(0, 31),
+        st.sampled_from(EventKind),
+        st.integers(0, 2**32 - 1),
+        st.text(st.characters(blacklist_characters="\0", blacklist_categories=["Cs"]), max_size=30),
+    ),
+    max_size=5,
+)
+
+
+@settings(deadline=None, max_examples=60)
+@given(_recordings(), EVENTS)
+def test_round_trip(recording: tuple[int, list[Sample]], events: list[CellEvent]) -> None:
+    axes, rows = recording
+    with TemporaryDirectory() as folder:
+        log = read_log(write(Path(folder) / "a.mcap", content(axes), rows, events))
+    assert log.samples.cycle.tolist() == [s.cycle for s in rows]
+    assert log.samples.time_ns.tolist() == [s.time_ns for s in rows]
+    assert log.samples.position_counts.tolist() == [list(s.position_counts) for s in rows]
+    assert log.samples.current_raw.tolist() == [list(s.current_raw) for s in rows]
+    assert log.samples.statusword.tolist() == [list(s.statusword) for s in rows]
+    assert log.samples.missing.tolist() == [s.missing for s in rows]
+    assert log.events == tuple(events)
+
+
+@pytest.mark.parametrize("axes", [1, 2, 5, 6])
+def test_the_start_and_the_end_come_back(tmp_path: Path, axes: int) -> None:
+    start = content(axes, DISC)
+    rows = [Sample(k, k, (1,) * axes, (2,) * axes, (3,) * axes, missing) for k, missing in ((3, 0), (4, 1), (9, 1))]
+    log = read_log(write(tmp_path / "a.mcap", start, rows, verdict=(False, "emergency stop")))
+    assert log.head.run == start.run
+    assert log.head.readback == start.readback
+    assert log.head.files["cell.yaml"] == start.files["cell.yaml"]
+    statistics = log.statistics
+    assert (statistics.samples, statistics.lost_cycles, statistics.missing) == (3, 4, (2,) + (0,) * (axes - 1))
+    assert (statistics.valid, statistics.reason) == (False, "emergency stop")
+    assert not (tmp_path / "a.mcap.part").exists()
+
+
+@pytest.mark.parametrize("axes", [1, 2, 5, 6])
+def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
+    rows = samples([[k * (i + 1) for i in range(axes)] for k in range(45)], missing=1)
+    event = CellEvent(START_NS, 0, EventKind.EMCY, 0x8130, "Lebenszeichen fehlt: Ä")
+    path = write(tmp_path / "a.mcap", content(axes), rows, [event])
+    decoded: dict[str, list[Any]] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        for schema, channel, _, message in reader.iter_decoded_messages():
+            assert (schema.encoding if schema else "", channel.message_encoding) == ("ros2msg", "cdr")
+            decoded.setdefault(channel.topic, []).append(message)
+    assert len(decoded["/cell/samples"]) == len(rows)
+    for message, sample in zip(decoded["/cell/samples"], rows, strict=True):
+        assert message.stamp.sec * 10**9 + message.stamp.nanosec == sample.time_ns
+        assert (message.cycle, message.missing) == (sample.cycle, sample.missing)
+        assert tuple(message.position_counts) == sample.position_counts
+        assert tuple(message.current_raw) == sample.current_raw
+        assert tuple(message.statusword) == sample.statusword
+    emergency = decoded["/cell/events"][0]
+    assert (emergency.axis, emergency.kind, emergency.code) == (0, "emcy", 0x8130)
+    assert emergency.text == event.text
+    assert len(decoded["/joint_states"]) == 3  # 45 ms at 50 Hz
+    state = decoded["/joint_states"][1]
+    assert state.name == [f"J{i + 1}" for i in range(axes)]
+    assert list(state.position) == pytest.approx(joints(rows[20].position_counts))
+
+
+def test_samples_are_on_disk_within_200_ms_of_recorded_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
+    rows = samples([[k] for k in range(1000)])
+    reader = LogReader(tmp_path / "a.mcap")
+    blocks = [len(block.cycle) for block in LogReader(write(tmp_path / "a.mcap", content(1), rows))]
+    assert max(blocks) <= 150
+    assert sum(blocks) == 1000
+    assert reader.digest == ""
+
+
+def test_samples_are_on_disk_within_200_ms_of_wall_time(tmp_path: Path) -> None:
+    now_ns = 0
+    rows = samples([[k] for k in range(20)])
+    with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: now_ns) as log:
+        sizes = []
+        for sample in rows:
+            now_ns += 50_000_000
+            log.write(sample)
+            sizes.append(log.part.stat().st_size)
+    assert all(sizes[k + 5] > sizes[k] for k in range(len(sizes) - 5))
+
+
+def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with pytest.raises(RuntimeError, match="bus gone"), LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
+        for sample in samples([[k] for k in range(7)]):
+            log.write(sample)
+        raise RuntimeError("bus gone")
+    assert not path.exists()
+    part = tmp_path / "a.mcap.part"
+    data = part.read_bytes()
+    found: list[McapRecord] = []
+    with part.open("rb") as stream, pytest.raises(EndOfFile):
+        found.extend(StreamReader(stream).records)
+    sequences = [record.sequence for record in found if isinstance(record, Message)]
+    assert sequences == [10, 0, *range(11, 17)]  # seven samples, and after the first of them the first JointState
+    with pytest.raises(OutputExists, match="unfinished"):
+        write(path, content(1), samples([[0]]))
+    assert part.read_bytes() == data
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
+    before = path.read_bytes()
+    with pytest.raises(OutputExists):
+        write(path, content(1), samples([[1]]))
+    assert path.read_bytes() == before
+    with pytest.raises(OutputFailed, match="no such file"):
+        write(tmp_path / "none" / "a.mcap", content(1), samples([[0]]))
+
+
+@pytest.mark.parametrize("links", [True, False], ids=["hard links", "none"])
+def test_a_file_that_appeared_meanwhile_is_not_replaced(
+    tmp_path: Path, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not links:
+        _without_hard_links(monkeypatch)
+    path = tmp_path / "a.mcap"
+
+    def record() -> None:
+        with LogWriter(path, content(1), joints, clock_ns=lambda: 0) as log:
+            for sample in samples([[number] for number in range(5)]):
+                log.write(sample)
+            log.conclude(True)
+            path.write_bytes(b"somebody else's")
+
+    with pytest.raises(OutputExists, match=r"a\.mcap\.part") as told:
+        record()
+    assert path.read_bytes() == b"somebody else's"
+    assert "which was not there" in told.value.found
+    path.unlink()
+    (tmp_path / "a.mcap.part").rename(path)
+    log = read_log(path)
+    assert (len(log.samples.cycle), log.partial) == (5, False)
+
+
+def test_a_file_system_without_hard_links_gives_the_name_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _without_hard_links(monkeypatch)
+    path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
+    assert len(read_log(path).samples.cycle) == 1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def _without_hard_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_self: Path, _target: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")  # as FAT says it (link(2), EPERM)
+
+    monkeypatch.setattr(Path, "hardlink_to", refused)
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [Sample(0, 0, (1, 2), (1, 2), (0, 0)), Sample(0, 0, (2**31,), (0,), (0,)), Sample(-1, 0, (0,), (0,), (0,))],
+)
+def test_a_sample_that_does_not_fit_is_refused(tmp_path: Path, sample: Sample) -> None:
+    with pytest.raises(ValueError, match="does not fit a log of 1 axes"):
+        write(tmp_path / "a.mcap", content(1), [sample])
+
+
+def test_a_log_without_samples_is_incomplete(tmp_path: Path) -> None:
+    with pytest.raises(LogIncomplete, match="no samples"):
+        read_log(write(tmp_path / "a.mcap", content(1), []))
+
+
+def test_samples_have_chunks_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What makes a chunk one `frombuffer`."""
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
+    events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
+    file = RecordFile(write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events))
+    sizes = [chunk.uncompressed_size for offset, chunk in file if isinstance(chunk, Chunk)]
+    blocks = list(LogReader(tmp_path / "a.mcap"))
+    assert [len(block.cycle) for block in blocks] == [1, *[150] * 5, 149]
+    assert len(sizes) == 2 * len(blocks)
+    np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+
+
+@pytest.mark.parametrize("size", [1, 7, 149, 151, 10_000])
+def test_the_size_of_a_block_changes_nothing_but_the_blocks(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", size)
+    path = write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]))
+    blocks = list(LogReader(path))
+    assert max(len(block.cycle) for block in blocks) <= size + 149
+    np.testing.assert_array_equal(np.concatenate([b.position_counts for b in blocks])[:, 1], np.arange(900))
+    whole = LogReader(path)
+    assert (len(list(whole.until_damage())), whole.damage) == (len(blocks), None)
+    path.write_bytes(path.read_bytes()[: whole.whole_bytes - 5])
+    cut = LogReader(path)
+    saved = np.concatenate([b.position_counts for b in cut.until_damage()])[:, 1]
+    assert cut.damage is not None
+    np.testing.assert_array_equal(saved, np.arange(900))
+
+
+def test_a_log_of_which_nobody_said_how_it_went_is_not_valid(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: 0) as log:
+        log.write(samples([[1]])[0])
+    told = read_log(tmp_path / "a.mcap").statistics
+    assert (told.valid, told.reason) == (False, "not concluded")

@@ -1,0 +1,77 @@
+"""Which changes of a cell's files make another recording of it, and which do not."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell_file import bundle, cell_from_bundle, load_cell
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+DEMO = "cells/demo.yaml"
+
+
+@pytest.fixture
+def configs(tmp_path: Path) -> Path:
+    """A copy that may be changed."""
+    return Path(shutil.copytree(CONFIGS, tmp_path / "configs"))
+
+
+def _said(configs: Path, text: str) -> None:
+    file = configs / DEMO
+    file.write_text(file.read_text() + text)
+
+
+@pytest.mark.parametrize(
+    "afterwards",
+    [
+        "policy: {motion: allowed}\n",
+        "policy: {apply: {max_age_days: 7, by: job, max_change: {J4: 2.0}}}\n",
+        "history: {store: elsewhere.sqlite}\n",
+        "# K. has looked at it.\n",
+    ],
+)
+def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(configs: Path, afterwards: str) -> None:
+    before = load_cell(configs / DEMO)
+    _said(configs, afterwards)
+    after = load_cell(configs / DEMO)
+    assert after.digest != before.digest
+    assert after.recording_digest == before.recording_digest
+
+
+def test_neither_do_comments_and_line_breaks_of_a_drive_profile(configs: Path) -> None:
+    before = load_cell(configs / DEMO)
+    profile = configs / "drives" / "generic-cia402.yaml"
+    profile.write_text("# Seen.\r\n\n" + profile.read_text())
+    after = load_cell(configs / DEMO)
+    assert after.digest != before.digest
+    assert after.recording_digest == before.recording_digest
+
+
+@pytest.mark.parametrize(
+    ("file", "was", "becomes"),
+    [
+        (DEMO, "mass_kg: 4.59", "mass_kg: 4.60"),
+        (DEMO, "decimation_cutoff_hz: 20.0", "decimation_cutoff_hz: 21.0"),
+        (DEMO, "nameplate_gain_nm_per_a: 25.65", "nameplate_gain_nm_per_a: 25.66"),
+        (DEMO, "serial: 1003", "serial: 1013"),
+        ("robots/tx40.urdf", "<robot", "<!-- measured again --><robot"),
+        ("drives/generic-cia402.yaml", "amplitude: rms", "amplitude: peak"),
+    ],
+)
+def test_whatever_else_changes_is_another_recording(configs: Path, file: str, was: str, becomes: str) -> None:
+    files = bundle(configs / DEMO)
+    before = cell_from_bundle(files)
+    member = {DEMO: "cell.yaml", "robots/tx40.urdf": "robot.urdf"}.get(file, file)
+    text = files[member].decode()
+    assert was in text
+    after = cell_from_bundle({**files, member: text.replace(was, becomes, 1).encode()})
+    assert after.recording_digest != before.recording_digest
+
+
+def test_a_log_tells_the_same_as_the_files(configs: Path) -> None:
+    _said(configs, "policy: {motion: allowed}\n")
+    cell = load_cell(configs / DEMO)
+    assert cell_from_bundle(bundle(configs / DEMO)).recording_digest == cell.recording_digest

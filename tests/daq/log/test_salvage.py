@@ -1,0 +1,283 @@
+"""What a killed recorder leaves behind is saved, labelled, and never written to a controller."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import logging
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from daq.cli.app import main
+from daq.config.policy import ApplyPolicy
+from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, OutputExists, UsageError
+from daq.log.conversion import load_run
+from daq.log.metadata import SEAL, sealed, unsealed
+from daq.log.reader import LogReader, SampleBlock, read_log
+from daq.log.salvage import salvage
+from daq.log.writer import LogWriter
+from daq.workflow.calibration_file import as_document, decode, encode, save
+from daq.workflow.fit import Reading
+from daq.writeback.gates.logs import source_refusals
+from daq.writeback.gates.table import Circumstances, Gate
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.calibrations import demo_calibration
+from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
+
+ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(700)])
+MOVES = [CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"move {k}") for k in range(3)]
+
+
+@pytest.fixture
+def part(tmp_path: Path, checkout: Path) -> Path:
+    """What is left of a recording of 700 samples that failed: all of it, as the writer saw the error coming."""
+    return _broken_off(tmp_path / "run.mcap", checkout)
+
+
+def _broken_off(path: Path, checkout: Path, *events: CellEvent) -> Path:
+    with (
+        pytest.raises(RuntimeError),
+        LogWriter(path, demo_content(checkout, DISC), joints, clock_ns=lambda: 0) as log,
+    ):
+        for event in (*MOVES, *events):
+            log.event(event)
+        for sample in ROWS:
+            log.write(sample)
+        raise RuntimeError("gone")
+    return log.part
+
+
+def _same(found: SampleBlock, count: int) -> bool:
+    wanted = SampleBlock(
+        np.array([s.cycle for s in ROWS[:count]], dtype=np.uint64),
+        np.array([s.time_ns for s in ROWS[:count]]),
+        np.array([s.position_counts for s in ROWS[:count]], dtype=np.int32),
+        np.array([s.current_raw for s in ROWS[:count]], dtype=np.int32),
+        np.array([s.statusword for s in ROWS[:count]], dtype=np.uint16),
+        np.array([s.missing for s in ROWS[:count]], dtype=np.uint32),
+    )
+    return all(np.array_equal(getattr(found, name), getattr(wanted, name)) for name in SampleBlock.__slots__)
+
+
+def test_what_was_recorded_comes_back_and_is_labelled(part: Path, tmp_path: Path) -> None:
+    before = part.read_bytes()
+    saved = salvage(part, tmp_path / "saved.mcap")
+    assert part.read_bytes() == before
+    log = read_log(saved.log)
+    assert _same(log.samples, 700)
+    assert log.events == tuple(MOVES)
+    assert log.partial
+    assert (log.statistics.valid, log.statistics.samples) == (True, 700)
+    assert log.head.run.payload == DISC
+    assert log.head.run.origin == "recorded; salvaged from run.mcap.part"
+    assert log.head.files["robot.urdf"]
+    assert saved.left_out_bytes == 0
+
+
+def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(tmp_path: Path, checkout: Path) -> None:
+    """Whatever the writer has been given, the file alone gives back all but less than 150 samples of 1 ms."""
+    content = demo_content(checkout)
+    with LogWriter(tmp_path / "run.mcap", content, joints, clock_ns=lambda: 0) as log:
+        for number, sample in enumerate(ROWS, start=1):
+            log.write(sample)
+            if number in {2, 3, 151, 152, 153, 400, 699}:
+                copy = shutil.copy(log.part, tmp_path / f"{number}.mcap.part")
+                saved = salvage(Path(copy), tmp_path / f"{number}.mcap.saved")
+                assert number - 150 <= saved.statistics.samples < number
+                assert _same(read_log(saved.log).samples, saved.statistics.samples)
+
+
+def test_a_process_that_is_killed_loses_no_more(tmp_path: Path, checkout: Path) -> None:
+    """The promise itself: SIGKILL, from the process's own hand so that what it had written is known."""
+    out = tmp_path / "run.mcap"
+    script = (
+        "import os, signal, sys; from pathlib import Path; from daq.log.writer import LogWriter\n"
+        "from tests.daq.logs import demo_content, joints, samples\n"
+        f"log = LogWriter(Path({str(out)!r}), demo_content(Path({str(checkout)!r})), joints, clock_ns=lambda: 0)\n"
+        "log.__enter__()\n"
+        "for row in samples([[100 * k + axis for axis in range(6)] for k in range(437)]): log.write(row)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], cwd=checkout, check=False)
+    assert done.returncode == -9
+    saved = salvage(tmp_path / "run.mcap.part", tmp_path / "saved.mcap")
+    assert 437 - 150 <= saved.statistics.samples <= 437
+    assert _same(read_log(saved.log).samples, saved.statistics.samples)
+
+
+def test_every_cut_gives_a_beginning_or_a_named_error(part: Path, tmp_path: Path) -> None:
+    data = part.read_bytes()
+    counts = []
+    for size in range(0, len(data), 997):
+        cut, out = tmp_path / "cut.mcap.part", tmp_path / "saved.mcap"
+        cut.write_bytes(data[:size])
+        out.unlink(missing_ok=True)
+        try:
+            counts.append(salvage(cut, out).statistics.samples)
+        except LogUnreadable:
+            counts.append(0)
+            assert not out.exists()
+            continue
+        assert _same(read_log(out).samples, counts[-1])
+    assert counts == sorted(counts)
+    assert {0, 1, 151} <= set(counts)
+    assert not (tmp_path / "saved.mcap.part").exists()
+
+
+def test_the_damaged_end_of_a_finished_log_is_left_out(tmp_path: Path, checkout: Path) -> None:
+    data = bytearray(write(tmp_path / "whole.mcap", demo_content(checkout), ROWS).read_bytes())
+    reader = LogReader(tmp_path / "whole.mcap")
+    list(reader.until_damage())
+    data[reader.whole_bytes * 3 // 4] ^= 1
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(data)
+    with pytest.raises(LogCorrupt):
+        read_log(broken)
+    saved = salvage(broken, tmp_path / "saved.mcap")
+    assert 0 < saved.statistics.samples < 700
+    assert _same(read_log(saved.log).samples, saved.statistics.samples)
+    assert 0 < saved.left_out_bytes < len(data)
+    assert "checksum" in saved.damage
+
+
+def test_a_whole_log_needs_no_salvage(tmp_path: Path, checkout: Path) -> None:
+    with pytest.raises(UsageError, match="a whole log"):
+        salvage(write(tmp_path / "whole.mcap", demo_content(checkout), ROWS[:5]), tmp_path / "saved.mcap")
+
+
+def test_a_recorder_that_died_before_it_gave_the_log_its_name(tmp_path: Path, checkout: Path) -> None:
+    """Its own verdict is kept; that the log is partial is kept too, because nobody knows why it died."""
+    part = tmp_path / "run.mcap.part"
+    write(tmp_path / "whole.mcap", demo_content(checkout), ROWS, verdict=(False, "3 late answers")).rename(part)
+    assert read_log(part).partial
+    log = read_log(salvage(part, tmp_path / "saved.mcap").log)
+    assert (log.partial, log.statistics.valid, log.statistics.reason) == (True, False, "3 late answers")
+
+
+def test_a_running_recording_is_left_alone(part: Path, tmp_path: Path) -> None:
+    with part.open("rb") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        with pytest.raises(UsageError, match="still runs"):
+            salvage(part, tmp_path / "saved.mcap")
+    salvage(part, tmp_path / "saved.mcap")
+
+
+def test_the_writer_holds_that_lock(tmp_path: Path, checkout: Path) -> None:
+    with LogWriter(tmp_path / "run.mcap", demo_content(checkout), joints, clock_ns=lambda: 0) as log:
+        log.write(ROWS[0])
+        log.flush()
+        with pytest.raises(UsageError, match="still runs"):
+            salvage(log.part, tmp_path / "saved.mcap")
+
+
+def test_the_name_of_the_whole_recording_is_not_taken(part: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"run-partial\.mcap"):
+        salvage(part, tmp_path / "run.mcap")
+    (tmp_path / "there.mcap").touch()
+    with pytest.raises(OutputExists):
+        salvage(part, tmp_path / "there.mcap")
+
+
+def test_nothing_can_be_saved_of_nothing(tmp_path: Path, checkout: Path) -> None:
+    empty = tmp_path / "empty.mcap.part"
+    empty.touch()
+    with pytest.raises(LogTruncated):
+        salvage(empty, tmp_path / "saved.mcap")
+    write(tmp_path / "none.mcap", demo_content(checkout), []).rename(tmp_path / "none.mcap.part")
+    with pytest.raises(LogIncomplete, match="no samples"):
+        salvage(tmp_path / "none.mcap.part", tmp_path / "saved.mcap")
+
+
+@pytest.mark.parametrize(
+    ("kind", "valid"), [(EventKind.EMCY, False), (EventKind.HEARTBEAT_LOST, False), (EventKind.STOP, True)]
+)
+def test_a_recording_that_ended_in_a_fault_is_invalid_too(
+    kind: EventKind, valid: bool, tmp_path: Path, checkout: Path
+) -> None:
+    fault = CellEvent(START_NS, 2, kind, 0x8130, "node 3")
+    saved = salvage(_broken_off(tmp_path / "run.mcap", checkout, fault), tmp_path / "saved.mcap")
+    assert saved.statistics.valid is valid
+    assert ("node 3" in saved.statistics.reason) is not valid
+
+
+@pytest.mark.parametrize("key", ["payload_known", "started_wall_ns", "operator", SEAL])
+def test_metadata_of_a_log_without_its_end_stand_under_a_seal_of_their_own(
+    key: str, part: Path, tmp_path: Path
+) -> None:
+    """The payload's mass scales every gain, and no chunk covers it."""
+    record: dict[str, str] = {"payload_known": '{"m": 4.59}', "started_wall_ns": "1", "operator": "Ada"}
+    whole = sealed(record)
+    assert unsealed(whole) == record
+    with pytest.raises(ValueError, match="sealed with"):
+        unsealed({**whole, key: whole[key] + "1"})
+    data = part.read_bytes()
+    part.write_bytes(data.replace(b'{"m": 4.59}', b'{"m": 5.59}'))
+    assert part.read_bytes() != data
+    with pytest.raises(LogUnreadable):
+        salvage(part, tmp_path / "saved.mcap")
+    part.write_bytes(data.replace(SEAL.encode(), b"crc33"))
+    with pytest.raises(LogUnreadable, match="without a seal"):
+        salvage(part, tmp_path / "saved.mcap")
+
+
+def test_whoever_reads_it_is_told_and_the_calibration_says_so(
+    part: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    saved = salvage(part, tmp_path / "saved.mcap").log
+    with caplog.at_level(logging.WARNING, logger="drivegain"):
+        run, _ = load_run(saved)
+    assert run.partial
+    assert "saved.mcap is PARTIAL" in caplog.text
+    reading = Reading([saved], None)
+    list(reading.runs([saved], "fit"))
+    assert [(source.name, source.partial) for source in reading.sources] == [("saved", True)]
+
+
+def test_nothing_of_it_reaches_a_controller() -> None:
+    good = demo_calibration()
+    partial = replace(good, sources=(good.sources[0], replace(good.sources[1], partial=True)))
+    again = decode(encode(partial), "calibration.yaml")
+    assert again == partial
+    policy = ApplyPolicy()
+    assert not source_refusals(good, policy, Circumstances())
+    assert [refusal.gate for refusal in source_refusals(again, policy, Circumstances())] == [Gate.PARTIAL]
+    assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
+
+
+def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
+    document = yaml.safe_load(encode(demo_calibration()))
+    for source in document["sources"]:
+        del source["partial"]
+    document["digests"]["sources"] = hashlib.sha256(
+        json.dumps(document["sources"], sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
+    assert decode(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml") == demo_calibration()
+
+
+def test_apply_ends_with_3(tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = demo_calibration()
+    save(replace(good, sources=(replace(good.sources[0], partial=True),)), tmp_path / "calibration.yaml")
+    cell = str(checkout / "configs/cells/demo.yaml")
+    command = ["apply", str(tmp_path / "calibration.yaml"), "--cell", cell, "--configuration-changed"]
+    assert main(command) == ExitCode.CALIBRATION_REFUSED
+    assert "never finished" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "saved.mcap"
+    assert main(["info", str(part)]) == ExitCode.DATA_UNFIT
+    assert "drivegain salvage" in capsys.readouterr().err
+    assert main(["salvage", str(part), "--out", str(out), "--json"]) == ExitCode.OK
+    told = json.loads(capsys.readouterr().out)
+    assert (told["samples"], told["partial"], told["valid"], told["left_out_bytes"]) == (700, True, True, 0)
+    assert main(["info", str(out), "--json"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["partial"] is True
+    assert main(["salvage", str(part), "--out", str(out)]) == ExitCode.USAGE

@@ -1,0 +1,102 @@
+"""A log decoded as Foxglove and PlotJuggler decode it: by the definitions inside it, with software that is not ours."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from drivers.stream.sample import CellEvent, EventKind
+from tests.daq.logs import START_NS, demo_content, samples, write
+
+VIEWERS = Path(__file__).parents[3] / "configs" / "viewers"
+AXES = 6
+ROWS = 60
+
+
+@pytest.fixture(scope="module")
+def decoded(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> dict[str, list[Any]]:
+    """Messages of a log by topic."""
+    event = CellEvent(START_NS, 2, EventKind.EMCY, 0x8611, "node 3: following error")
+    rows = samples([[100 * row + axis for axis in range(AXES)] for row in range(ROWS)])
+    log = write(tmp_path_factory.mktemp("log") / "bare.mcap", demo_content(checkout), rows, [event])
+    messages: dict[str, list[Any]] = defaultdict(list)
+    with log.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        for _schema, channel, _message, content in reader.iter_decoded_messages():
+            messages[channel.topic].append(content)
+    return dict(messages)
+
+
+def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]]) -> None:
+    assert set(decoded) == {"/cell/samples", "/cell/events", "/joint_states"}
+    assert [list(message.position_counts) for message in decoded["/cell/samples"]] == [
+        [100 * row + axis for axis in range(AXES)] for row in range(ROWS)
+    ]
+    first = decoded["/cell/samples"][0]
+    assert first.stamp.sec * 10**9 + first.stamp.nanosec == START_NS
+    (event,) = decoded["/cell/events"]
+    assert (event.axis, event.kind, event.code, event.text) == (2, "emcy", 0x8611, "node 3: following error")
+    assert list(decoded["/joint_states"][0].name) == [f"J{number}" for number in range(1, AXES + 1)]
+
+
+def _foxglove_paths() -> list[str]:
+    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
+    found = []
+    for panel in layout["configById"].values():
+        found += [path["value"] for path in panel.get("paths", ())] + [
+            panel[key] for key in ("topicPath",) if key in panel
+        ]
+    return found
+
+
+def _plotjuggler_curves() -> list[str]:
+    root = ElementTree.parse(VIEWERS / "plotjuggler.xml").getroot()
+    return [curve.attrib["name"] for curve in root.iter("curve")]
+
+
+@pytest.mark.parametrize("path", _foxglove_paths())
+def test_every_path_of_the_foxglove_layout_leads_to_something(decoded: dict[str, list[Any]], path: str) -> None:
+    topic, _, rest = path.partition(".")
+    assert _walk(decoded[topic][0], re.findall(r"\w+|\[\d+\]", rest)) is not None
+
+
+@pytest.mark.parametrize("curve", _plotjuggler_curves())
+def test_every_curve_of_the_plotjuggler_layout_is_a_number(decoded: dict[str, list[Any]], curve: str) -> None:
+    """A curve is topic, slash, fields; PlotJuggler spreads a JointState out by the names of its joints."""
+    topic = next(topic for topic in decoded if curve.startswith(f"{topic}/"))
+    steps = re.findall(r"\w+|\[\d+\]", curve.removeprefix(topic))
+    message = decoded[topic][0]
+    if topic == "/joint_states":
+        joint, quantity = steps
+        steps = [quantity, f"[{list(message.name).index(joint)}]"]
+    assert isinstance(_walk(message, steps), int | float)
+
+
+def _walk(value: Any, steps: list[str]) -> Any:
+    for step in steps:
+        value = value[int(step[1:-1])] if step.startswith("[") else getattr(value, step)
+    return value
+
+
+def test_every_panel_of_the_foxglove_layout_is_placed_once() -> None:
+    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
+
+    def leaves(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+
+    assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
+
+
+def test_the_layouts_show_all_axes_and_nothing_twice() -> None:
+    for named, samples_of in ((_foxglove_paths(), "/cell/samples."), (_plotjuggler_curves(), "/cell/samples/")):
+        assert len(set(named)) == len(named)
+        for field in ("position_counts", "current_raw", "statusword"):
+            assert {f"{samples_of}{field}[{axis}]" for axis in range(AXES)} <= set(named)

@@ -1,0 +1,149 @@
+"""Pictures and tables: whole files, the same bytes for the same data, and no peak lost on the way to the pixels."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rich.console import Console
+
+from daq.report.fit import plot_torques
+from daq.report.gains import gain_table, plot_gains, with_deviation
+from daq.report.picture import thinned
+from daq.report.residual_plots import plot_residual
+from tests.daq.calibrations import AXES, demo_calibration
+
+FloatArray = NDArray[np.float64]
+
+
+def _torques(samples: int = 3000) -> tuple[FloatArray, FloatArray, FloatArray]:
+    rng = np.random.default_rng(3)
+    time_s = np.arange(samples) / 200.0
+    predicted_nm = np.sin(time_s[:, None] * np.arange(1, 7)) * np.array([40, 60, 30, 8, 6, 3])
+    measured_nm = predicted_nm + rng.normal(size=predicted_nm.shape)
+    measured_nm[400:500] = np.nan
+    return time_s, measured_nm, predicted_nm
+
+
+def _draw(kind: str, path: Path) -> None:
+    time_s, measured_nm, predicted_nm = _torques()
+    if kind == "torque":
+        plot_torques(path, time_s, measured_nm, predicted_nm, AXES, title="demo, run loaded-1")
+    elif kind == "residual":
+        plot_residual(
+            path,
+            time_s,
+            measured_nm[:, 2] - 0.5 * predicted_nm[:, 2],
+            measured_nm[:, 2] - predicted_nm[:, 2],
+            variable=predicted_nm[:, 2],
+            variable_label="load torque [Nm]",
+            velocity_rad_s=np.cos(3 * time_s),
+            title="J3: load-friction",
+        )
+    else:
+        plot_gains(path, demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+
+
+@pytest.mark.parametrize("kind", ["torque", "residual", "gains"])
+def test_a_picture_is_whole_and_the_same_twice(kind: str, tmp_path: Path) -> None:
+    _draw(kind, tmp_path / "a.png")
+    _draw(kind, tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "b.png"]
+    pixels = matplotlib.image.imread(tmp_path / "a.png")
+    assert pixels.shape[0] > 400
+    assert pixels.shape[1] > 900
+    # Something is drawn: a blank sheet has one colour.
+    assert len(np.unique(pixels.reshape(-1, pixels.shape[-1]), axis=0)) > 20
+
+
+def test_a_disk_that_fails_leaves_the_old_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "gains.png"
+    path.write_bytes(b"the old one")
+
+    def fail(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="No space"):
+        _draw("gains", path)
+    assert path.read_bytes() == b"the old one"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("axes", [1, 2, 5, 7])
+def test_any_number_of_axes_has_its_panels(axes: int, tmp_path: Path) -> None:
+    time_s = np.arange(50) / 10.0
+    torque_nm = np.ones((50, axes))
+    plot_torques(tmp_path / "t.png", time_s, torque_nm, torque_nm, tuple(f"J{i}" for i in range(axes)), title="t")
+    assert matplotlib.image.imread(tmp_path / "t.png").size > 0
+
+
+def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same(tmp_path: Path) -> None:
+    nothing = np.full((50, 2), np.nan)
+    plot_torques(tmp_path / "t.png", np.arange(50) / 10.0, nothing, nothing, ("J1", "J2"), title="t")
+    assert (tmp_path / "t.png").exists()
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=400),
+    st.integers(4, 40),
+)
+def test_thinning_keeps_every_extreme_and_every_gap(values: list[float], points: int) -> None:
+    column = np.array(values)
+    time_s = np.arange(len(column), dtype=np.float64)
+    thin_s, thin = thinned(time_s, column, points)
+    stretch = -(-2 * len(column) // points)
+    assert len(thin_s) == len(thin) <= max(points + stretch, 4)
+    assert (np.diff(thin_s) >= 0).all()
+    assert np.isnan(column).any() == np.isnan(thin).any()
+    shown = np.isin(thin[~np.isnan(thin)], column)
+    assert shown.all()
+    if not np.isnan(column).any():
+        assert thin.min() == column.min()
+        assert thin.max() == column.max()
+
+
+def test_the_table_says_error_and_truth_within_80_columns() -> None:
+    gains = demo_calibration().gains
+    out = io.StringIO()
+    Console(file=out, width=80).print(gain_table(gains, {gain.axis: gain.value / 1.01 for gain in gains}))
+    text = out.getvalue()
+    assert "…" not in text
+    assert text.count("+1.00") == 6
+    assert "-9.210 ± 0.037" in text
+    assert "-20.1" in text
+    without = io.StringIO()
+    Console(file=without, width=80).print(gain_table(gains))
+    assert "truth" not in without.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (33.9, 0.1356, "33.90 ± 0.14"),
+        (-9.2134, 0.0304, "-9.213 ± 0.030"),
+        (1234.5, 56.7, "1234 ± 57"),
+        (32.96, 0.0, "32.96 (fixed)"),
+        (1.0, float("nan"), "1 ± nan"),
+    ],
+)
+def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: str) -> None:
+    assert with_deviation(value, std) == text
+
+
+def test_pictures_need_no_screen_and_no_global_state() -> None:
+    modules = "daq.report.torque, daq.report.residual, daq.report.gains"
+    code = f"import sys, {modules}; print('matplotlib.pyplot' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

@@ -1,0 +1,374 @@
+"""The report of `residual`: it stands for itself, escapes what files say, and its numbers are those of the rows."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.cli.residual import DOCUMENT, PAGE, check_report, save_report
+from daq.cli.verb import json_text
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import ExitCode, OutputExists, OutputFailed
+from daq.report.effect_names import WORDS, in_words, other_axis, placed_name
+from daq.report.residual_document import fell, residual_document, summary
+from daq.report.residual_page import page, paragraph, residual_page, table
+from daq.workflow import fit as fit_module
+from daq.workflow.fit import Fit, calibration_of, fit
+from ident.discovery.before_after import Account, account
+from ident.discovery.loop import Step, with_effects
+from ident.discovery.search import Finding
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Abscissa, PlacedEffect
+from ident.effects.friction import Coupling, LoadFriction
+from ident.effects.position import Spring
+from ident.effects.unnamed import Periodic, Smooth
+from tests.daq.workflow.test_fit import Shelf
+from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
+
+CREATED = datetime(2025, 1, 2, tzinfo=UTC)
+SPRING = PlacedEffect(Spring(), 2)
+NAMES = ("run0", "run1", "run2", "run3")
+HOSTILE = '<script>alert("$x$")</script>&<img src=http://example.org/x>'
+VOID = {"meta", "img", "br", "link"}
+
+
+def _finding(placed: PlacedEffect, *, passed: bool = True, rivals: tuple[PlacedEffect, ...] = ()) -> Finding:
+    return Finding(
+        effect=placed.effect,
+        axis=placed.axis,
+        coefficients=np.ones(len(placed.effect.coefficients)),
+        deviations=np.ones(len(placed.effect.coefficients)),
+        probability=0.001,
+        folds_better=1.0,
+        explained=0.4,
+        error_before_percent=9.0,
+        error_after_percent=6.0,
+        error_fall=1.0 / 3.0,
+        held_out_fall=100.0 if passed else 3.0,
+        passed=passed,
+        fold_errors=np.ones(8),
+        ambiguity=rivals,
+    )
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A fit whose loop was closed by hand: a spring on J3 that is there."""
+
+    fitted: Fit
+    account: Account
+
+    def page(self) -> str:
+        return residual_page(self.fitted, self.account, calibration_of(self.fitted, CREATED))
+
+    def document(self) -> dict[str, Any]:
+        made = residual_document(self.fitted, self.account, calibration_of(self.fitted, CREATED))
+        told: dict[str, Any] = json.loads(json_text(made))
+        return told
+
+
+@pytest.fixture(scope="module")
+def shelf() -> Shelf:
+    """Three runs to fit and one to hold out, all with a spring on J3."""
+    truth, rng = tx40_truth(), np.random.default_rng(3)
+    runs = {}
+    for index, name in enumerate(NAMES):
+        run = record(truth, name, rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
+        current = run.current_a.copy()
+        current[:, 2] += 4.0 * run.position_rad[:, 2] / GAINS[2]
+        runs[name] = replace(run, current_a=current, digest=f"{index:064x}")
+    return Shelf(load_cell(shipped_configurations() / "cells" / "demo.yaml"), runs)
+
+
+@pytest.fixture(scope="module")
+def shelved(shelf: Shelf) -> Iterator[Shelf]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", shelf.load)
+        yield shelf
+
+
+@pytest.fixture(scope="module")
+def closed(shelved: Shelf) -> Closed:
+    fitted = fit([Path(name) for name in NAMES[:3]], holdout=[Path(NAMES[3])])
+    start = fitted.evidence()
+    after = with_effects(start, (SPRING,))
+    rival = PlacedEffect(LoadFriction(0), 1)
+    limits_nm = np.array([0.5, 1.25, 0.25, 0.1, 0.2, 0.05])
+    first = Step(
+        (_finding(SPRING, rivals=(rival,)), _finding(rival, passed=False)), (), limits_nm, _finding(SPRING), after
+    )
+    first = replace(first, accepted=first.findings[0])
+    last = Step(
+        (_finding(rival, passed=False),),
+        (_finding(PlacedEffect(Periodic(0), 3), passed=False),),
+        limits_nm,
+        None,
+        after,
+    )
+    steps = (first, last)
+    return Closed(replace(fitted, steps=steps), account(start, steps))
+
+
+@dataclass(frozen=True)
+class Element:
+    """A tag with its attributes."""
+
+    tag: str
+    attributes: dict[str, str | None]
+
+
+class Reader(HTMLParser):
+    """Takes a page apart; unbalanced tags fail at once."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.elements: list[Element] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append(Element(tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(self.texts)
+
+
+def test_the_page_stands_for_itself(closed: Closed) -> None:
+    page = Reader(closed.page())
+    tags = {element.tag for element in page.elements}
+    assert not tags & {"script", "link", "iframe", "object", "embed", "base", "form", "a"}
+    for element in page.elements:
+        assert not any(name.startswith("on") for name in element.attributes)
+        for name in ("src", "href", "srcset", "action", "data", "poster"):
+            value = element.attributes.get(name)
+            assert value is None or value.startswith("data:image/png;base64,")
+    style = page.texts[[text.startswith("\nbody") for text in page.texts].index(True)]
+    assert "url(" not in style
+    assert "@import" not in style
+    assert all(element.attributes.get("alt") for element in page.elements if element.tag == "img")
+    assert sum(element.tag == "img" for element in page.elements) == 5  # effect, torques, gains, two turns
+
+
+def test_the_page_says_the_outcome_first(closed: Closed) -> None:
+    told = closed.account.total
+    assert told.before.holdout is not None
+    assert told.after.holdout is not None
+    before, after = told.before.holdout.axes[2], told.after.holdout.axes[2]
+    page = Reader(closed.page())
+    first = next(text for text in page.texts if text.startswith("J3 has"))
+    assert first.startswith(
+        f"J3 has a spring: the error of J3 on runs that were not used falls from {before:.1f} to {after:.1f} % ("
+    )
+    assert page.texts.index(first) < page.texts.index("Before and after")
+    assert "These data cannot tell it from: load-friction on J2." in page.text
+    assert "1.2 Nm on J2" in page.text
+    for error in (told.before.in_sample, told.after.cross_validated, told.after.holdout):
+        assert f"{error.total:.2f}" in page.texts
+    assert "scales all gains alike" in page.text
+
+
+def test_what_files_say_is_escaped(closed: Closed) -> None:
+    fitted = closed.fitted
+    axes = tuple(replace(axis, name=f"{axis.name}{HOSTILE}") for axis in fitted.cell.axes)
+    after = fitted.steps[-1].after
+    datasets = tuple(replace(data, name=HOSTILE) for data in after.datasets)
+    hostile = replace(
+        fitted,
+        cell=replace(fitted.cell, name=HOSTILE, axes=axes),
+        sources=tuple(replace(source, name=HOSTILE, partial=True) for source in fitted.sources),
+        steps=tuple(replace(step, after=replace(step.after, datasets=datasets)) for step in fitted.steps),
+    )
+    text = Closed(hostile, closed.account).page()
+    assert "<script" not in text
+    page = Reader(text)
+    assert all((element.attributes.get("src") or "data:").startswith("data:") for element in page.elements)
+    assert f"Residual of cell {HOSTILE}" in page.texts
+
+
+def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
+    told, document = closed.account.total, closed.document()
+    for key, errors in (("before", told.before), ("after", told.after)):
+        assert document[key]["relative_error_percent"]["axes"] == pytest.approx(errors.in_sample.axes)
+        assert document[key]["cross_validated_error_percent"]["total"] == pytest.approx(errors.cross_validated.total)
+        assert errors.holdout is not None
+        assert document[key]["holdout_error_percent"]["axes"] == pytest.approx(errors.holdout.axes)
+        assert document[key]["left_out_runs"] is None
+    final = closed.fitted.steps[-1].after.estimate
+    for motor, change in enumerate(document["gain_changes"]):
+        assert change["axis"] == f"J{motor + 1}"
+        assert change["before"] == pytest.approx(closed.fitted.identification.estimate.gains[motor])
+        assert change["after"] == pytest.approx(final.gains[motor])
+        assert change["after_std"] == pytest.approx(final.gains_std[motor])
+    first, last = document["turns"]
+    (added,) = first["added"]
+    assert (added["effect"], added["axis"]) == ("spring", "J3")
+    stiffness = added["coefficients"][0]
+    index = [column.name for column in final.unknowns].index(SPRING.columns[0].name)
+    assert stiffness["value"] == pytest.approx(final.parameters[index])
+    assert stiffness["std"] == pytest.approx(final.parameters_std[index])
+    assert stiffness["unit"] == SPRING.columns[0].unit
+    assert first["accepted"]["ambiguity"] == ["load-friction on J2"]
+    assert first["findings"][1]["ambiguity"] is None
+    assert (last["accepted"], last["added"], last["before"]) == (None, [], None)
+    assert last["structures"][0]["effect"] == "periodic-motor-angle"
+    assert last["detection_limits"][1] == {"axis": "J2", "rms": 1.25, "unit": "Nm"}
+
+
+def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) -> None:
+    document = closed.document()
+    finding, turn = document["turns"][0]["findings"][0], document["turns"][0]
+    described = (checkout / "docs" / "residual.md").read_text(encoding="utf-8")
+    named = (document, turn, finding, document["before"], document["gain_changes"][0], document["noise_floor"])
+    for key in {key for part in named for key in part}:
+        assert f"`{key}`" in described, key
+    assert document["filter"]["position_cutoff_hz"] == closed.fitted.cell.conditioning.position_cutoff_hz
+    assert set(document["before"]) == set(document["after"]) == set(turn["before"])
+
+
+def test_silence_is_told_with_its_size(closed: Closed) -> None:
+    last = closed.fitted.steps[-1]
+    start = closed.fitted.evidence()
+    silent = replace(closed.fitted, steps=(replace(last, after=start),))
+    outcome, limits = summary(silent, account(start, silent.steps))
+    assert outcome.startswith("No structure found")
+    assert "1.2 Nm on J2" in limits
+    nothing_tried = replace(silent, steps=(replace(silent.steps[0], findings=(), structures=()),))
+    text = Closed(nothing_tried, account(start, silent.steps)).page()
+    assert "No structure found" in Reader(text).text
+    assert "No candidate could be tried." in Reader(text).text
+
+
+def test_what_rises_is_not_said_to_fall() -> None:
+    assert fell(6.94, 2.8) == "falls from 6.9 to 2.8 %"
+    assert fell(2.8, 6.9) == "rises from 2.8 to 6.9 %"
+    assert fell(2.81, 2.79) == "stays at 2.8 %"
+
+
+def test_effects_are_called_by_words_and_axes_by_names() -> None:
+    axes = ("base", "arm", "wrist")
+    assert placed_name(PlacedEffect(Coupling(3, 1), 0), axes) == "coupling on base with wrist"
+    assert in_words(Coupling(3, 1), axes) == "friction shared with wrist"
+    term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
+    assert in_words(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"
+    assert other_axis(Spring()) is None
+    assert set(WORDS) <= {family[0].name for family in EFFECTS}
+
+
+def test_a_folder_that_holds_something_else_is_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    check_report(None)
+    check_report(tmp_path / "new" / "folder")
+    assert (tmp_path / "new" / "folder").is_dir()
+    for name in (PAGE, DOCUMENT):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text("the user's own", encoding="utf-8")
+        with pytest.raises(OutputExists, match=name):
+            check_report(folder)
+        # Nothing of the logs is looked at: they do not exist.
+        assert main(["residual", "no.mcap", "--report", str(folder)]) == ExitCode.USAGE
+        assert name in capsys.readouterr().err
+        assert (folder / name).read_text(encoding="utf-8") == "the user's own"
+    occupied = tmp_path / "file"
+    occupied.write_text("", encoding="utf-8")
+    with pytest.raises(OutputFailed, match="file"):
+        check_report(occupied)
+
+
+def test_a_folder_that_takes_no_file_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    # As a file system says it to everybody but root, who may write anywhere.
+    monkeypatch.setattr("daq.cli.residual.TemporaryFile", refused)
+    assert main(["residual", "no.mcap", "--report", str(tmp_path)]) == ExitCode.UNEXPECTED
+    assert "permission denied" in capsys.readouterr().err
+    monkeypatch.undo()
+    check_report(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("unseen", ["\x1b", "\u202e", "\u2066", "\u200b", "\x00", "\x85", "\u2028", "\ud800"])
+def test_what_is_not_seen_is_spelt_out(unseen: str) -> None:
+    text = page(f"a{unseen}b", [paragraph(f"{unseen}"), table(unseen, [unseen], [[unseen, unseen]])])
+    assert unseen not in text
+    assert f"<h1>a\\u{ord(unseen):04x}b</h1>" in text
+    text.encode()
+
+
+def test_what_is_seen_stays_as_it_is() -> None:
+    assert paragraph("‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext") == "<p>‖ρ‖/‖Y‖ ± σ, 3 µm, 机械手, naïve\nnext</p>"
+
+
+def test_a_disk_that_fails_leaves_the_old_report(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calibration = calibration_of(closed.fitted, CREATED)
+    save_report(closed.fitted, closed.account, calibration, tmp_path)
+    old = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(old) == {PAGE, DOCUMENT}
+    check_report(tmp_path)
+    save_report(closed.fitted, closed.account, calibration, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == old
+
+    def fail(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OutputFailed, match="no space"):
+        save_report(closed.fitted, closed.account, calibration, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == old
+
+
+def test_the_verb_writes_the_report_and_says_the_same(
+    shelved: Shelf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "report"
+    command = ["residual", *NAMES[:3], "--holdout", NAMES[3], "--report", str(folder)]
+    assert main(command) == ExitCode.OK
+    text = capsys.readouterr().out
+    document = json.loads((folder / DOCUMENT).read_text(encoding="utf-8"))
+    assert (document["format"], document["version"]) == ("drivegain-residual", 1)
+    assert "axis 3" not in text
+    assert "J3 has a spring" in text
+    for sentence in document["summary"]:
+        assert sentence in text
+    rows = {line.rsplit(maxsplit=7)[0].strip(): line.split()[-7:] for line in text.splitlines() if ", " in line[:30]}
+    for name, key in (("fit", "relative_error_percent"), ("unused", "holdout_error_percent")):
+        for when in ("before", "after"):
+            error = document[when][key]
+            assert [float(value) for value in rows[f"{name}, {when}"]] == pytest.approx(
+                [*error["axes"], error["total"]], abs=0.005
+            )
+    assert text.splitlines()[-1] == f"Written: {folder}/"
+    assert document["noise_floor"]["relative_error_percent"]["total"] is None or math.isfinite(
+        document["noise_floor"]["relative_error_percent"]["total"]
+    )
+    Reader((folder / PAGE).read_text(encoding="utf-8"))

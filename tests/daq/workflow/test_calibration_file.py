@@ -1,0 +1,157 @@
+"""calibration.yaml: what goes in comes out, and nothing else does."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+
+from daq.errors import CalibrationEdited, CalibrationMissing, CalibrationUnreadable, exit_code
+from daq.workflow.calibration_file import as_document, decode, encode, load, save
+from ident.calibration import Calibration
+from tests.daq.calibrations import calibrations, demo_calibration
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A calibration file as `save` wrote it."""
+    path = tmp_path / "calibration.yaml"
+    save(demo_calibration(), path)
+    return path
+
+
+@settings(max_examples=150, deadline=None)
+@given(calibrations)
+def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration) -> None:
+    assert decode(encode(calibration), "calibration.yaml") == calibration
+
+
+def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
+    assert load(path) == demo_calibration()
+    assert list(path.parent.iterdir()) == [path]
+
+
+@settings(max_examples=60, deadline=None)
+@given(calibrations)
+def test_the_document_is_json_without_nan(calibration: Calibration) -> None:
+    json.dumps(as_document(calibration), allow_nan=False)
+
+
+def test_the_document_has_what_fit_json_promises() -> None:
+    document = json.loads(json.dumps(as_document(demo_calibration())))
+    assert {"method", "gains", "parameters", "relative_error_percent", "condition", "rows", "filter", "effects"} <= set(
+        document
+    )
+    fourth = document["gains"][3]
+    assert {"axis", "value", "std_percent", "unit", "nameplate", "change_percent"} <= set(fourth)
+    assert fourth["change_percent"] == pytest.approx(100 * (-9.21 / -11.52 - 1))
+    assert fourth["std_percent"] == pytest.approx(0.4)
+    assert {"name", "value", "unit", "std_percent"} <= set(document["parameters"][0])
+    assert document["parameters"][1]["std_percent"] is None
+    assert set(document["relative_error_percent"]) == {"axes", "total"}
+
+
+def test_one_entry_stands_on_one_line(path: Path) -> None:
+    assert len(re.findall(r"^- \{axis: J\d, value: .* change_percent: \S+\}$", path.read_text(), re.MULTILINE)) == 6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "section"),
+    [
+        ("value: 33.9,", "value: 33.8,", "gains"),
+        ("method: ml", "method: tls", "method"),
+        ("name: unloaded", "name: other", "sources"),
+        ("condition: 812.0", "condition: 12.0", "condition"),
+    ],
+)
+def test_an_edit_by_hand_is_noticed_and_named(path: Path, old: str, new: str, section: str) -> None:
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    with pytest.raises(CalibrationEdited, match=rf"by hand in {section};"):
+        load(path)
+
+
+def test_a_comment_added_by_hand_is_no_edit(path: Path) -> None:
+    path.write_text(path.read_text() + "# checked by K.\n")
+    assert load(path) == demo_calibration()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("method: ml", "methode: ml", "methode"),
+        ("method: ml", "method: ml\nmethod: ls", "duplicate"),
+        ("rows: 14400", "rows: many", "rows"),
+        ("rows: 14400", "rows: 14400.5", "rows"),
+        ("condition: 812.0", "condition: .nan", "condition"),
+        ("condition: 812.0", "condition: .inf", "condition"),
+        ("std: 0.1356", "std: -0.1356", "std"),
+        ("version: 1", "version: 2", "version 2"),
+        ("format: drivegain-calibration", "format: something", "format"),
+        ("- {axis: J1,", "- {axis: J1, colour: red,", "colour"),
+        ("cell: demo", "cell: *other", "alias"),
+        ("rows: 14400", "rows: [14400", r"calibration\.yaml:\d+"),
+    ],
+)
+def test_what_does_not_belong_is_refused_with_its_place(path: Path, old: str, new: str, says: str) -> None:
+    text = path.read_text()
+    assert text.count(old) == 1
+    path.write_text(text.replace(old, new))
+    with pytest.raises(CalibrationUnreadable, match=says) as caught:
+        load(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\xff", b"[]", b"gains: 3", b"a: \t- b", b"%PDF-1.4"])
+def test_another_file_is_refused(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    with pytest.raises(CalibrationUnreadable):
+        load(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationMissing, match=r"none\.yaml: found no such file"):
+        load(tmp_path / "none.yaml")
+
+
+def test_a_truncated_file_is_never_taken_for_a_whole_one(path: Path) -> None:
+    content = path.read_bytes()
+    for length in range(0, len(content) - 1, 97):
+        path.write_bytes(content[:length])
+        with pytest.raises((CalibrationUnreadable, CalibrationEdited)):
+            load(path)
+
+
+def test_a_number_that_is_not_finite_is_not_saved(path: Path) -> None:
+    before = path.read_bytes()
+    with pytest.raises(CalibrationUnreadable, match="condition"):
+        save(dataclasses.replace(demo_calibration(), condition=float("nan")), path)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_the_exit_codes_tell_data_from_refusal() -> None:
+    assert exit_code(CalibrationUnreadable) == 4
+    assert exit_code(CalibrationMissing) == 4
+    assert exit_code(CalibrationEdited) == 3
+
+
+@pytest.mark.parametrize("call", ["open", "fchmod", "fsync", "replace"])
+def test_a_failing_disk_leaves_the_old_calibration(path: Path, call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = path.read_bytes()
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OSError, match="No space"):
+        save(dataclasses.replace(demo_calibration(), method="tls"), path)
+    monkeypatch.undo()
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]

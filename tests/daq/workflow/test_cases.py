@@ -1,0 +1,310 @@
+"""The paper's cases, and the tables of their validation: on recordings whose truth the tests know."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.cli import main
+from daq.config.cell import Cell, WeighedPayload
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import LogsDiffer
+from daq.log.reader import LossyLogs
+from daq.report.paper_tables import condition_table, error_table, gain_table, mass_tables, parameter_table
+from daq.workflow import cross_validation as cross_validation_module
+from daq.workflow import fit as fit_module
+from daq.workflow.calibration_file import load, save
+from daq.workflow.cases import CASES, Known, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.workflow.cross_validation import CrossValidation, Failure, Mass, cross_validate
+from daq.workflow.fit import fit
+from ident.calibration import Calibration
+from ident.data.run import Run
+from ident.errors import DataUnfit
+from ident.estimators.estimate import Method
+from ident.model.bodies import LINK_PARAMETERS, Payload
+from tests.ident.recordings import GAINS, MOUNTED, PAYLOAD_TRUTH, record, tx40_truth
+
+CREATED = datetime(2025, 1, 2, tzinfo=UTC)
+PLATE = Payload("plate", "b")
+"""The same body as the disc, of which the log says nothing: whoever finds its mass finds 4.59 kg."""
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Runs by the name of a log, in the place of files."""
+
+    cell: Cell
+    runs: dict[str, Run]
+
+    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        return self.runs[path.name], cell or self.cell
+
+
+@pytest.fixture(scope="module")
+def shelf() -> Shelf:
+    """Two runs without load, two with the disc, one of each unseen, and two with an unweighed plate."""
+    truth, rng = tx40_truth(), np.random.default_rng(5)
+    drawn = {name: value for name, value in PAYLOAD_TRUTH.items() if name != "m"}
+    cell = replace(
+        load_cell(shipped_configurations() / "cells" / "demo.yaml"),
+        payloads=(WeighedPayload("disc", "a", 4.59, 0.005, drawn), WeighedPayload("plate", "z", 4.5, 0.005, {})),
+    )
+    mounted = {"bare1": None, "disc1": MOUNTED, "bare2": None, "disc2": MOUNTED, "bare3": None, "disc3": MOUNTED}
+    runs = {}
+    for index, (name, payload) in enumerate({**mounted, "plate1": PLATE, "plate2": PLATE}.items()):
+        runs[name] = replace(record(truth, name, rng, payload, noise_a=0.1), digest=f"{index:064x}")
+    return Shelf(cell, runs)
+
+
+@pytest.fixture(autouse=True)
+def _shelved(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    monkeypatch.setattr(cross_validation_module, "load_run", shelf.load)
+
+
+@pytest.fixture(scope="module")
+def reduced(shelf: Shelf) -> ReducedLogs:
+    """Read once for all cases."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", shelf.load)
+        return reduce_logs(_paths("bare1", "disc1", "bare2", "disc2"), _paths("disc3"))
+
+
+@pytest.fixture(scope="module")
+def calibrations(reduced: ReducedLogs) -> dict[str, Calibration]:
+    """One a case."""
+    return {
+        case.name: calibration_of_case(
+            fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=20.0), CREATED
+        )
+        for case in CASES
+    }
+
+
+def _paths(*names: str) -> list[Path]:
+    return [Path(name) for name in names]
+
+
+def _error(calibration: Calibration) -> float:
+    return float(np.max(np.abs(np.array([gain.value for gain in calibration.gains]) / GAINS - 1.0)))
+
+
+def test_every_case_is_what_it_says(calibrations: dict[str, Calibration]) -> None:
+    nameplate = [gain.nameplate for gain in calibrations["ml"].gains]
+    assert [gain.value for gain in calibrations["manufacturer"].gains] == nameplate
+    for name, own in {"manufacturer": 10, "case-1": 0, "case-2": 9, "case-3": 0, "case-4": 9, "ml": 9}.items():
+        of_payload = [parameter for parameter in calibrations[name].parameters if ":" in parameter.name]
+        assert sum(parameter.std > 0.0 for parameter in of_payload) == own
+        assert {parameter.name for parameter in of_payload} == {f"{p}:a" for p in LINK_PARAMETERS}
+    assert [calibrations[f"case-{n}"].method for n in (1, 2, 3, 4)] == ["wls", "wls", "tls", "tls"]
+
+
+def test_a_right_drawing_helps_wls_and_ml_needs_none(calibrations: dict[str, Calibration]) -> None:
+    errors = {name: _error(calibration) for name, calibration in calibrations.items()}
+    assert errors["case-1"] < errors["case-2"]
+    assert errors["case-4"] < errors["case-2"]
+    assert errors["ml"] < errors["case-2"]
+    assert errors["ml"] < 0.01
+
+
+def test_a_wrong_drawing_spoils_what_relies_on_it(reduced: ReducedLogs) -> None:
+    disc, plate = reduced.cell.payloads
+    wrong = replace(disc, known={name: 1.1 * value for name, value in disc.known.items()})
+    spoilt = replace(reduced, cell=replace(reduced.cell, payloads=(wrong, plate)))
+    found = [
+        calibration_of_case(fit_case(logs, Method.ML, known), CREATED)
+        for logs, known in ((reduced, Known.CAD), (spoilt, Known.CAD), (spoilt, Known.MASS))
+    ]
+    right, drawn, weighed = map(_error, found)
+    assert right < 0.01
+    assert drawn > 0.02
+    assert weighed < 0.01
+
+
+def test_one_reading_gives_what_fit_gives(reduced: ReducedLogs) -> None:
+    other = fit(reduced.logs, holdout=reduced.holdout)
+    found = fit_case(reduced, Method.ML, Known.MASS).fitted
+    assert found.final.estimate.gains == pytest.approx(other.final.estimate.gains, rel=1e-9)
+    assert found.sources == other.sources
+    one, two = found.identification.holdout_error, other.identification.holdout_error
+    assert one is not None
+    assert two is not None
+    assert one.axes == pytest.approx(two.axes)
+
+
+def test_essential_parameters_leave_no_trace_in_the_file(reduced: ReducedLogs, tmp_path: Path) -> None:
+    found = essential_fit(fit_case(reduced, Method.WLS, Known.MASS).fitted, 20.0)
+    calibration = calibration_of_case(found, CREATED)
+    assert found.essential is not None
+    removed = {step.name for step in found.essential.removed}
+    assert len(removed) > 5
+    assert not removed & {parameter.name for parameter in calibration.parameters}
+    save(calibration, tmp_path / "c.yaml")
+    assert load(tmp_path / "c.yaml") == calibration
+    error = calibration.holdout_error_percent
+    assert error is not None
+    found_again = cross_validate({"c": calibration}, _paths("disc3")).runs[0].errors["c"]
+    assert found_again.axes == pytest.approx(error.axes, rel=1e-6)
+
+
+def test_a_run_held_out_must_carry_what_the_fit_has_met() -> None:
+    with pytest.raises(DataUnfit, match="'b', which no run of the fit carries"):
+        reduce_logs(_paths("bare1", "disc1"), _paths("plate1"))
+
+
+@pytest.fixture(scope="module")
+def found(shelf: Shelf, calibrations: dict[str, Calibration]) -> CrossValidation:
+    """All cases on runs of all three kinds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cross_validation_module, "load_run", shelf.load)
+        return cross_validate(calibrations, _paths("disc2", "bare3", "disc3", "plate1", "plate2"))
+
+
+def test_cross_validation_tells_good_gains_from_bad(found: CrossValidation) -> None:
+    """Tables 7 and 8: mass errors follow the gains' errors; the mean of Table 6 is least for the best."""
+    errors: dict[str, list[float]] = {label: [] for label in found.calibrations}
+    for run in found.weighed:
+        for label, mass in run.masses.items():
+            assert isinstance(mass, Mass)
+            assert mass.error_percent is not None
+            if run.payload.name == "disc":
+                assert mass.error_percent == pytest.approx(100.0 * abs(mass.mass_kg / 4.59 - 1.0))
+                errors[label].append(mass.error_percent)
+            else:
+                assert mass.error_percent == pytest.approx(100.0 * abs(mass.mass_kg / 4.5 - 1.0))  # the cell's word
+            assert 0.0 < mass.std_percent <= mass.std_with_gains_percent < 10.0
+    means = {label: float(np.mean(values)) for label, values in errors.items()}
+    assert means["ml"] < 1.0
+    assert means["ml"] < means["case-2"]
+    assert means["ml"] < means["manufacturer"]
+    of = {label: np.mean([run.errors[label].total for run in found.runs if run.errors]) for label in means}
+    assert of["ml"] < of["manufacturer"]
+
+
+def test_what_was_seen_and_what_cannot_be_predicted_is_said(found: CrossValidation) -> None:
+    runs = {run.run: run for run in found.runs}
+    assert runs["disc2"].seen_by == tuple(found.calibrations)
+    assert runs["disc3"].seen_by == ()
+    assert runs["plate1"].errors == {}
+    assert "leaves its mass open" in runs["plate1"].left_out
+    assert all(run.condition is not None and 10.0 < run.condition < 1e5 for run in found.runs)
+    assert [validation.run for validation in found.validations] == ["disc2", "bare3", "disc3"]
+
+
+def test_without_bare_runs_the_calibrations_robot_serves(calibrations: dict[str, Calibration]) -> None:
+    found = cross_validate({"ml": calibrations["ml"], "case-2": calibrations["case-2"]}, _paths("disc3", "plate1"))
+    assert not found.with_bare_runs
+    for run in found.weighed:
+        assert list(run.masses) == ["ml", "case-2"]  # no robot was identified with the nameplate gains
+        mass = run.masses["ml"]
+        assert isinstance(mass, Mass)
+        assert mass.mass_kg == pytest.approx(4.59, rel=0.01)
+    (table, other) = mass_tables(found)
+    assert "on the robot of the calibration" in table.notes[0]
+    assert other.title.startswith("Table 8: payload mass of plate (b), 4.5 kg")
+
+
+def test_an_unknown_mounting_is_weighed_and_not_predicted(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
+    elsewhere = replace(shelf.runs["disc3"], payload=replace(MOUNTED, mounting="c"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cross_validation_module, "load_run", lambda *_: (elsewhere, shelf.cell))
+        found = cross_validate({"ml": calibrations["ml"]}, _paths("x"))
+    assert "nothing is known of mounting 'c'" in found.runs[0].left_out
+    assert isinstance(found.weighed[0].masses["ml"], Mass)
+
+
+def test_another_weight_in_the_same_mounting_is_refused(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
+    other = replace(shelf.runs["disc3"], payload=replace(MOUNTED, known={"m": 2.0}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cross_validation_module, "load_run", lambda *_: (other, shelf.cell))
+        with pytest.raises(DataUnfit, match=r"carries 2 kg .* was told 4\.59 kg"):
+            cross_validate({"case-4": calibrations["case-4"]}, _paths("x"))
+
+
+def test_a_run_too_short_to_weigh_says_why(shelf: Shelf, calibrations: dict[str, Calibration]) -> None:
+    short = record(tx40_truth(), "short", np.random.default_rng(1), MOUNTED, seconds=4.0, noise_a=0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cross_validation_module, "load_run", lambda *_: (short, shelf.cell))
+        found = cross_validate({"ml": calibrations["ml"]}, _paths("short"))
+    failure = found.weighed[0].masses["ml"]
+    assert isinstance(failure, Failure)
+    assert "record longer" in failure.reason
+    assert "record longer" in mass_tables(found)[0].markdown()
+
+
+def test_filters_must_be_the_same(calibrations: dict[str, Calibration]) -> None:
+    ml = calibrations["ml"]
+    other = replace(ml, filter={**ml.filter, "decimation_cutoff_hz": 5.0})
+    with pytest.raises(LogsDiffer, match="calibration other"):
+        cross_validate({"ml": ml, "other": other}, _paths("bare3"))
+
+
+def test_the_tables_have_the_papers_form(calibrations: dict[str, Calibration], found: CrossValidation) -> None:
+    one = parameter_table(3, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
+    rows = {row[0]: row for row in one.rows}
+    assert rows["m:a"] == ("m:a", "4.59", "—", "4.59", "—", "0.00")
+    assert rows["mx:a"][2] == "—"  # given in case 3
+    assert rows["mx:a"][4] != "—"  # found in case 4
+    assert rows["‖ρ‖/‖Y‖"][1].endswith(" %")
+    gains = gain_table(4, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
+    assert [row[:2] for row in gains.rows[:2]] == [("J1", "32.96"), ("J2", "32.96")]
+    expected = np.mean([abs(gain.change_percent) for gain in calibrations["case-4"].gains])
+    assert float(gains.rows[-1][-1]) == pytest.approx(expected, abs=0.006)
+    assert len(condition_table(found).headings) == 1 + 5
+    errors = error_table(found)
+    assert len(errors.rows) == 3 * 6 + 1
+    of_ml = [run.errors["ml"].axes for run in found.runs if run.errors]
+    assert float(errors.rows[-1][errors.headings.index("ml")]) == pytest.approx(np.mean(of_ml), abs=0.006)
+    assert [table.title[:7] for table in mass_tables(found)] == ["Table 7", "Table 8"]
+    for table in (one, gains, condition_table(found), errors, *mass_tables(found)):
+        assert all(len(row) == len(table.headings) for row in table.rows)
+        assert table.markdown().count("\n| ") == len(table.rows) + 2
+
+
+def test_the_command_line_writes_cases_and_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "cases"
+    logs = ["bare1", "disc1", "bare2", "disc2"]
+    assert main(["fit", *logs, "--cases", str(folder), "--essential", "20", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert set(printed["cases"]) == {case.name for case in CASES}
+    assert printed["cases"]["case-2"]["removed"]
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        [*(f"{case.name}.yaml" for case in CASES), "tables.md"]
+    )
+    page = (folder / "tables.md").read_text(encoding="utf-8")
+    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [f"Table {n}" for n in (1, 2, 3, 4)]
+    out, ml = tmp_path / "validation", str(folder / "ml.yaml")
+    runs = ["bare3", "disc3", "plate1"]
+    assert main(["validate", ml, *runs, "--beside", str(folder), "--out", str(out), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["calibrations"] == ["ml", "case-1", "case-2", "case-3", "case-4", "manufacturer"]
+    assert checked["logs"][0]["log"] == "bare3"
+    assert checked["runs"][2]["relative_error_percent"] == {}
+    assert checked["payloads"][0]["masses"]["ml"]["error_percent"] < 1.0
+    page = (out / "tables.md").read_text(encoding="utf-8")
+    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [f"Table {n}" for n in (5, 6, 7, 8)]
+    assert main(["validate", ml, *runs]) == 0
+    text = capsys.readouterr().out
+    assert "Table 7: payload mass of disc (a), 4.59 kg" in text
+    assert "leaves its mass open" in text
+    assert main(["fit", *logs, "--known", "cad", "--method", "tls", "--json"]) == 0
+    gains = [gain["value"] for gain in json.loads(capsys.readouterr().out)["gains"]]
+    assert gains == pytest.approx([gain.value for gain in load(folder / "case-3.yaml").gains], rel=0.02)
+
+
+def test_what_does_not_go_together_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "bare1", "disc1", "--cases", str(tmp_path), "--method", "wls"]) == 2
+    assert "--cases" in capsys.readouterr().err
+    (tmp_path / "tables.md").write_text("my own notes", encoding="utf-8")
+    assert main(["fit", "bare1", "disc1", "--cases", str(tmp_path)]) == 2
+    assert "tables.md" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    found = main(["validate", str(tmp_path / "none.yaml"), "bare1", "--beside", str(tmp_path / "empty")])
+    assert found == 4
+    assert "empty" in capsys.readouterr().err

@@ -1,0 +1,283 @@
+"""What a log tells of its making: written at the recording, carried by the calibration, there for the gates."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.cli.app import main
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.policy import ApplyPolicy
+from daq.environment import shipped_configurations
+from daq.errors import ExitCode, UsageError
+from daq.log.conversion import load_run
+from daq.log.metadata import run_from_record, run_record
+from daq.log.reader import LossyLogs, read_log
+from daq.workflow import fit as fit_module
+from daq.workflow.calibration_file import as_document, decode, encode
+from daq.workflow.fit import ALL_AXES, Fit, Reading, axis_of, calibration_of, close_loop, fit
+from daq.workflow.plan_file import load_plan
+from daq.workflow.record import Clocks, record
+from daq.workflow.safeguards import check_entered_mass
+from daq.writeback.gates.fit import fit_refusals
+from daq.writeback.gates.table import Gate
+from ident.calibration import Calibration
+from ident.data.run import Recording, Run
+from ident.discovery.loop import close_the_loop
+from ident.effects.effect import PlacedEffect
+from ident.effects.friction import Stribeck
+from ident.effects.timing import Lag, TimeSkew
+from ident.estimators.estimate import Method
+from ident.estimators.identify import estimate_with
+from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
+from tests.daq.workflow.test_record import WALL_NS, Rig
+from tests.ident.recordings import GAINS, MOUNTED, tx40_truth
+from tests.ident.recordings import record as invented
+
+NOW = datetime(2025, 1, 2, tzinfo=UTC)
+LIMIT = 0x1237 | 0x0800
+"""Statusword with bit 11, internal limit active (CiA 402)."""
+
+
+@given(
+    entered=st.none() | st.floats(1e-6, 1e6),
+    digest=st.none() | st.text("0123456789abcdef", min_size=64, max_size=64),
+)
+def test_metadata_carries_second_weighing_and_controller(entered: float | None, digest: str | None) -> None:
+    run = replace(content(6, DISC).run, entered_kg=entered, controller_sha256=digest)
+    assert run_from_record(run_record(run)) == run
+
+
+def test_logs_of_earlier_versions_tell_neither() -> None:
+    record_of = run_record(content(6, DISC).run)
+    del record_of["payload_entered_kg"], record_of["controller_sha256"]
+    run = run_from_record(record_of)
+    assert (run.entered_kg, run.controller_sha256) == (None, None)
+
+
+@pytest.mark.parametrize("entered", ["0", "-1", "nan", "inf", "heavy"])
+def test_a_mass_that_is_none_is_no_metadata(entered: str) -> None:
+    with pytest.raises(ValueError):
+        run_from_record({**run_record(content(6, DISC).run), "payload_entered_kg": entered})
+
+
+def test_a_run_knows_how_its_log_came_to_be(tmp_path: Path, checkout: Path) -> None:
+    start = demo_content(checkout, DISC)
+    start = replace(start, run=replace(start.run, entered_kg=4.592, controller_sha256="c" * 64))
+    rows = samples([[0] * 6] * 100)
+    rows[7] = replace(rows[7], statusword=(0x1237, LIMIT, 0x1237, 0x1237, 0x1237, 0x1237))
+    run, _ = load_run(write(tmp_path / "a.mcap", start, rows))
+    assert run.recording == Recording(
+        recorded_s=START_NS * 1e-9,
+        entered_kg=4.592,
+        serials=(7,) * 6,
+        saturated_percent=(0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
+        lost_cycles=0,
+        missing=(0,) * 6,
+        controller_sha256="c" * 64,
+    )
+    undated = replace(start, run=replace(start.run, started_wall_ns=0))
+    run, _ = load_run(write(tmp_path / "imported.mcap", undated, rows))
+    assert run.recording is not None
+    assert run.recording.recorded_s is None
+
+
+def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) -> None:
+    turning = [[100 * k + axis for axis in range(6)] for k in range(50)]
+    bare = write(tmp_path / "bare.mcap", demo_content(checkout), samples(turning))
+    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), samples(turning[::-1]))
+    reading = Reading([bare, loaded], None)
+    runs = list(reading.runs([bare, loaded], "fit"))
+    first, second = reading.sources
+    assert (first.payload, first.mass_kg, first.recording) == (None, None, runs[0].recording)
+    assert (second.payload, second.mass_kg, second.recording) == ("disc", 4.59, runs[1].recording)
+    assert second.recording is not None
+
+
+@pytest.fixture(scope="module")
+def truth_runs() -> dict[str, Run]:
+    """Two runs without load, two with, one of them to be held out."""
+    truth, rng = tx40_truth(), np.random.default_rng(3)
+    names = ("bare-1", "loaded-1", "bare-2", "loaded-2", "unused")
+    made = [
+        invented(
+            truth, name, rng, MOUNTED if name.startswith(("loaded", "unused")) else None, noise_a=0.3, seconds=22.0
+        )
+        for name in names
+    ]
+    return {run.name: replace(run, digest=f"{index:064x}") for index, run in enumerate(made)}
+
+
+@pytest.mark.parametrize("nameplate_is_true", [False, True])
+def test_a_hold_out_is_told_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(
+    truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch, nameplate_is_true: bool
+) -> None:
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    if nameplate_is_true:
+        axes = (replace(axis, nameplate_gain=float(g)) for axis, g in zip(cell.axes, GAINS, strict=True))
+        cell = replace(cell, axes=tuple(axes))
+
+    def load(path: Path, _cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        return truth_runs[path.name], cell
+
+    monkeypatch.setattr(fit_module, "load_run", load)
+    logs = [Path(name) for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
+    found = calibration_of(fit(logs, holdout=[Path("unused")]), datetime(2025, 1, 2, tzinfo=UTC))
+    held, nameplate = found.holdout_error_percent, found.nameplate_holdout_error_percent
+    assert held is not None
+    assert nameplate is not None
+    ratio = held.total / nameplate.total
+    assert (0.99 < ratio < 1.005) if nameplate_is_true else (ratio < 0.97)
+    assert all(math.isfinite(axis) for axis in nameplate.axes)
+    assert decode(encode(found), "c.yaml") == found
+    assert as_document(found)["nameplate_holdout_error_percent"] is not None
+    assert found.recording_configuration_sha256 == cell.recording_digest
+    assert _refused(found) == []
+
+
+def _sticking(run: Run) -> Run:
+    """With low-speed friction in axis 2 that the declared model lacks."""
+    speed = np.gradient(run.position_rad[:, 1]) * run.rate_hz
+    added = np.zeros_like(run.current_a)
+    added[:, 1] = 5.0 * np.sign(speed) * np.exp(-((speed / 0.35) ** 2)) / GAINS[1]
+    return replace(run, current_a=run.current_a + added)
+
+
+@pytest.fixture(scope="module")
+def with_effect(truth_runs: dict[str, Run]) -> Fit:
+    """A loop that has found that friction, on a cell whose nameplate is some per cent off."""
+    runs = {name: _sticking(run) for name, run in truth_runs.items()}
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+        patch.setattr(fit_module, "close_the_loop", partial(close_the_loop, families=((Stribeck(0.3),),)))
+        start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("unused")])
+        found = close_loop(start, 0)
+    assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]
+    return found
+
+
+def _effects(fitted: Fit) -> tuple[PlacedEffect, ...]:
+    return fitted.steps[-1].after.effects
+
+
+def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
+    """What comes of other gains with all the rest refitted to them, as if they had been identified."""
+    after = fitted.steps[-1].after
+    other = estimate_with(Method.ML, after.training.system(), after.estimate.gains * np.array(factors))
+    other = replace(other, gains_fixed=False, covariance=after.estimate.covariance)
+    step = replace(fitted.steps[-1], after=replace(after, estimate=other))
+    return calibration_of(replace(fitted, steps=(*fitted.steps[:-1], step)), NOW)
+
+
+def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
+    return [(one.gate, one.subject) for one in fit_refusals(calibration, "demo", None, ApplyPolicy())]
+
+
+def test_what_an_effect_tells_is_not_credited_to_the_gains(with_effect: Fit) -> None:
+    """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
+    nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
+    gains = with_effect.final.estimate.gains
+    same = _with_gains(with_effect, tuple(nameplate / gains))
+    held, compared = same.holdout_error_percent, same.nameplate_holdout_error_percent
+    assert held is not None
+    assert compared is not None
+    assert held.axes == pytest.approx(compared.axes, rel=1e-6)
+    assert held.total == pytest.approx(compared.total, rel=1e-6)
+    bare = with_effect.identification.holdout_error
+    assert bare is not None
+    assert held.axes[1] < 0.97 * bare.axes[1]
+
+
+def test_one_wrong_gain_among_good_ones_is_refused_in_spite_of_an_effect(with_effect: Fit) -> None:
+    assert _refused(calibration_of(with_effect, NOW)) == []
+    assert _refused(_with_gains(with_effect, (1.0,) * 6)) == []
+    found = _refused(_with_gains(with_effect, (1.0, 1.0, 1.0, 0.7, 1.0, 1.0)))
+    assert (Gate.HOLDOUT, "J4") in found
+    assert {gate for gate, _ in found} == {Gate.HOLDOUT}
+
+
+def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
+    truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (truth_runs[path.name], cell))
+    logs, now = [Path("bare-1"), Path("loaded-1")], datetime(2025, 1, 2, tzinfo=UTC)
+    assert calibration_of(fit(logs), now).nameplate_holdout_error_percent is None
+    fixed = fit(logs, holdout=[Path("unused")], gains_fixed=True)
+    assert calibration_of(fixed, now).nameplate_holdout_error_percent is None
+
+
+def test_an_effect_on_all_motors_is_not_called_the_first_axis_s(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    assert ALL_AXES not in cell.axis_names
+    assert axis_of(PlacedEffect(TimeSkew(), 0), cell) == ALL_AXES
+    assert axis_of(PlacedEffect(Lag(), 0), cell) == "J1"
+
+
+@pytest.mark.parametrize("entered", [4.584, 4.596, 9.0, 0.1])
+def test_a_mass_off_the_cell_s_is_refused_before_anything_is_asked_of_the_bus(
+    entered: float, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
+    declared = load_cell(rig.cell_file)
+    with pytest.raises(UsageError, match=r"4\.59 kg within 0\.005 kg"):
+        record(
+            rig.cell_file,
+            declared,
+            load_plan(rig.plan, declared),
+            rig.out,
+            payload=DISC,
+            operator="Ada",
+            granted_by="the test",
+            run_id="1",
+            entered_kg=entered,
+        )
+    assert not rig.bus.sent
+    command = ["record", str(rig.cell_file), str(rig.plan), "--out", str(rig.out), "--enable-motion"]
+    assert main([*command, "--payload", "disc", "--mass", str(entered)]) == ExitCode.USAGE
+    assert not rig.bus.sent
+    assert not rig.out.exists()
+
+
+def test_the_log_has_the_second_weighing_and_the_controller_s_digest(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(checkout, tmp_path, monkeypatch, "lockstep")
+    rig.cell_file.write_text(rig.cell_file.read_text().replace("../controllers/demo.yaml", "controller.yaml"))
+    (tmp_path / "controller.yaml").write_bytes(b"drives: {}\n")
+    declared = load_cell(rig.cell_file)
+    record(
+        rig.cell_file,
+        declared,
+        load_plan(rig.plan, declared),
+        rig.out,
+        payload=DISC,
+        operator="Ada",
+        granted_by="the test",
+        run_id="1",
+        clocks=Clocks(lambda: WALL_NS, rig.bus.clock),
+        entered_kg=4.595,
+    )
+    run = read_log(rig.out).head.run
+    assert run.entered_kg == 4.595
+    assert run.controller_sha256 == hashlib.sha256(b"drives: {}\n").hexdigest()
+
+
+def test_a_mass_needs_a_payload(checkout: Path) -> None:
+    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    check_entered_mass(cell, None, None)
+    check_entered_mass(cell, DISC, None)
+    check_entered_mass(cell, DISC, 4.59)
+    with pytest.raises(UsageError, match="no payload"):
+        check_entered_mass(cell, None, 4.59)

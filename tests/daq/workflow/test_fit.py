@@ -1,0 +1,128 @@
+"""From logs to a fit: one log after the other, each once, of one cell, and the one that contradicts is named."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from daq.cli.fit import error_table
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.environment import shipped_configurations
+from daq.errors import LogRepeated, LogsDiffer, ModelContradicted
+from daq.log.reader import LossyLogs
+from daq.workflow import fit as fit_module
+from daq.workflow.fit import calibration_of, check_explained, fit
+from ident.data.run import Run
+from ident.errors import PayloadUnseen
+from ident.estimators.estimate import Method, RelativeError
+from tests.ident.recordings import MOUNTED, record, tx40_truth
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """Runs by the name of a log, in the place of files."""
+
+    cell: Cell
+    runs: dict[str, Run]
+
+    def load(self, path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        return self.runs[path.name], cell or self.cell
+
+
+@pytest.fixture(scope="module")
+def shelf() -> Shelf:
+    """Two runs without load, two with."""
+    truth, rng = tx40_truth(), np.random.default_rng(3)
+    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    runs = {}
+    for index in range(4):
+        payload = MOUNTED if index % 2 else None
+        run = record(truth, f"run{index}", rng, payload, noise_a=0.3, seconds=22.0)
+        runs[run.name] = replace(run, digest=f"{index:064x}")
+    undeclared = record(truth, "undeclared", rng, MOUNTED, noise_a=0.3, seconds=22.0)
+    runs["undeclared"] = replace(undeclared, payload=None, digest="f" * 64)
+    return Shelf(cell, runs)
+
+
+def _paths(*names: str) -> list[Path]:
+    return [Path(name) for name in names]
+
+
+def test_logs_become_sources_with_their_roles(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    found = fit(_paths("run0", "run1", "run2"), holdout=_paths("run3"))
+    assert [(source.name, source.role) for source in found.sources] == [
+        ("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout"),
+    ]  # fmt: skip
+    assert found.identification.holdout_error is not None
+
+
+def test_the_log_that_contradicts_the_others_is_named(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(PayloadUnseen, match="without undeclared they do"):
+        fit(_paths("undeclared", "run1", "run2", "run3"))
+
+
+def test_a_recording_counts_once(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(LogRepeated):
+        fit(_paths("run0", "run1"), holdout=_paths("run1"))
+
+
+def test_logs_of_two_configurations_are_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path, cell: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+        run, described = shelf.load(path, cell)
+        return run, replace(described, digest="0" * 64) if path.name == "run1" else described
+
+    monkeypatch.setattr(fit_module, "load_run", load)
+    with pytest.raises(LogsDiffer, match="as in the first log"):
+        fit(_paths("run0", "run1"))
+
+
+def test_a_model_that_contradicts_its_data_is_refused(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two current channels exchanged: small deviations, and nothing is right."""
+    order = [0, 1, 2, 4, 3, 5]
+    crossed = {name: replace(run, current_a=run.current_a[:, order]) for name, run in shelf.runs.items()}
+    monkeypatch.setattr(fit_module, "load_run", Shelf(shelf.cell, crossed).load)
+    for method in (Method.WLS, Method.TLS):
+        with pytest.raises((ModelContradicted, PayloadUnseen)):
+            fit(_paths("run0", "run1", "run2", "run3"), method=method)
+
+
+@pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS])
+def test_every_method_hears_of_a_payload_that_was_not_there(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch, method: Method
+) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    with pytest.raises(PayloadUnseen):
+        fit(_paths("undeclared", "run1", "run2", "run3"), method=method)
+
+
+def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    found = fit(_paths("run0", "run1"))
+    calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
+    rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
+    out = io.StringIO()
+    Console(file=out, width=100).print(error_table(found, replace(calibration, holdout_error_percent=rested)))
+    (unused,) = (line.split() for line in out.getvalue().splitlines() if "unused" in line)
+    assert unused == ["unused", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
+
+
+@given(total=st.floats(0.0, 200.0), axis=st.floats(0.0, 1000.0))
+def test_what_is_refused_is_what_the_limits_say(total: float, axis: float) -> None:
+    error = RelativeError((axis, 1.0), total)
+    if total > 50.0 or axis > 100.0:
+        with pytest.raises(ModelContradicted, match="J1" if axis > 1.0 else "total"):
+            check_explained(error, ("J1", "J2"))
+    else:
+        check_explained(error, ("J1", "J2"))

@@ -1,0 +1,94 @@
+"""The `workspace` and `clearance` sections of a cell file, and the arm that is guessed without them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.config.cell import model_of
+from daq.config.cell_file import load_cell
+from daq.errors import ConfigurationInconsistent, SchemaMismatch
+from daq.workflow.experiment import guessed_capsules, scene_of
+from ident.planning.clearance import BASE
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+DECLARED = """
+workspace: {lower_m: [-0.8, -0.8, 0.0], upper_m: [0.8, 0.8, 1.2]}
+clearance:
+  minimum_m: 0.03
+  capsules:
+    - {name: column, link: base, from_m: [0, 0, 0], to_m: [0, 0, 0.2], radius_m: 0.08}
+    - {name: forearm, link: J3, from_m: [0, 0, 0.04], to_m: [0, -0.15, 0.04], radius_m: 0.06}
+    - {name: disc, link: J6, from_m: [0, 0, 0.08], to_m: [0, 0, 0.12], radius_m: 0.1}
+  obstacles:
+    - {name: table, lower_m: [-1.0, -1.0, -0.1], upper_m: [1.0, 1.0, -0.02]}
+"""
+
+
+@pytest.fixture
+def cell_file(tmp_path: Path) -> Path:
+    """A copy of the demonstration's cell that may be written to."""
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    return tmp_path / "configs" / "cells" / "demo.yaml"
+
+
+def test_what_is_declared_is_what_is_checked(cell_file: Path) -> None:
+    cell_file.write_text(cell_file.read_text() + DECLARED)
+    cell = load_cell(cell_file)
+    found = scene_of(cell, model_of(cell).robot, 4.59)
+    scene = found.checker.scene
+    assert [(capsule.name, capsule.link) for capsule in scene.capsules] == [
+        ("column", BASE),
+        ("forearm", 2),
+        ("disc", 5),
+    ]
+    assert not found.guessed
+    assert (scene.minimum_m, scene.confined, scene.boxes[0].name) == (0.03, (2,), "table")
+    assert {(0, 1), (0, 2)} <= set(scene.pairs)
+    assert scene.workspace is not None
+    assert "as declared" in found.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "message"),
+    [
+        ("link: J3", "link: J9", ConfigurationInconsistent, "J9"),
+        ("lower_m: [-0.8, -0.8, 0.0]", "lower_m: [0.8, -0.8, 0.0]", ConfigurationInconsistent, "workspace"),
+        ("upper_m: [1.0, 1.0, -0.02]", "upper_m: [1.0, 1.0, -0.2]", ConfigurationInconsistent, "obstacles"),
+        ("radius_m: 0.06", "radius_m: 0", SchemaMismatch, "radius_m"),
+        ("radius_m: 0.06", "radius_m: 60", SchemaMismatch, "radius_m"),
+        ("minimum_m: 0.03", "minimum_m: -0.03", SchemaMismatch, "minimum_m"),
+        ("from_m: [0, 0, 0.04]", "from_m: [0, 0]", SchemaMismatch, "from_m"),
+    ],
+)
+def test_a_room_that_cannot_be_is_refused(
+    cell_file: Path, old: str, new: str, error: type[Exception], message: str
+) -> None:
+    assert old in DECLARED
+    cell_file.write_text(cell_file.read_text() + DECLARED.replace(old, new, 1))
+    with pytest.raises(error, match=message):
+        load_cell(cell_file)
+
+
+@pytest.mark.parametrize("name", ["demo", "seven-axis", "gantry"])
+def test_a_guessed_arm_has_a_payload_and_room_to_move(name: str) -> None:
+    cell = load_cell(CONFIGS / "cells" / f"{name}.yaml")
+    found = scene_of(cell, model_of(cell).robot, 4.59)
+    assert found.guessed
+    assert found.checker.scene.capsules[-1].name == "payload"
+    assert any("guess" in line for line in found.remarks)
+    assert any("no obstacles" in line for line in found.remarks)
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
+    postures = np.random.default_rng(3).uniform(lower, upper, (300, len(lower))).T
+    assert float((found.checker.margins(postures) > 0.0).mean()) > 0.3
+
+
+def test_links_that_change_their_length_are_not_guessed() -> None:
+    cell = load_cell(CONFIGS / "cells" / "gantry.yaml")
+    robot = model_of(cell).robot
+    for capsule in guessed_capsules(robot):
+        assert capsule.link != BASE
+        assert capsule.link > 2

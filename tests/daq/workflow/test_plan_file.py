@@ -1,0 +1,129 @@
+"""plan.yaml: read back as it was written, and strict about what a hand may have changed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.cli import main
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.clearance import Clearance
+from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
+from daq.workflow.plan import Plan, plan
+from daq.workflow.plan_file import load_plan, save_plan
+from ident.planning.clearance import Box
+
+CELLS = Path(__file__).parents[3] / "configs" / "cells"
+OLD = """format: drivegain-plan
+cell: demo
+seed: 1
+condition: 1500.0
+moves:
+  - {target_deg: [0, 0, 90, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.1}
+  - {target_deg: [10, 5, 80, 0, 0, 0], velocity: 0.5, acceleration: 0.5}
+"""
+
+
+@pytest.fixture(scope="module")
+def demo() -> Cell:
+    """The demonstration's cell."""
+    return load_cell(CELLS / "demo.yaml")
+
+
+@pytest.fixture(scope="module")
+def made(demo: Cell) -> Plan:
+    """A short plan for it."""
+    return plan(demo, seed=1, duration_s=8.0, exchanges=10)
+
+
+@pytest.mark.parametrize("name", ["demo", "gantry"])
+@settings(deadline=None, max_examples=4, derandomize=True)
+@given(seed=st.integers(0, 100))
+def test_a_plan_is_read_as_it_was_made(tmp_path_factory: pytest.TempPathFactory, name: str, seed: int) -> None:
+    cell, path = load_cell(CELLS / f"{name}.yaml"), tmp_path_factory.mktemp("plan") / "plan.yaml"
+    made = plan(cell, seed=seed, duration_s=14.0, exchanges=8, largest_condition=1e9, largest_std_percent=1e6)
+    save_plan(made, path)
+    found = load_plan(path, cell)
+    assert found.moves == made.moves
+    assert found.duration_s == pytest.approx(made.duration_s)
+    assert found.predicted_std_percent == pytest.approx(made.predicted_std_percent, abs=5e-4)
+    assert (found.units, found.cell, found.seed) == (made.units, cell.name, seed)
+
+
+def test_a_plan_of_an_earlier_version_is_read(demo: Cell, tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text(OLD)
+    found = load_plan(path, demo)
+    assert found.predicted_std_percent == ()
+    assert len(found.moves) == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error", "message"),
+    [
+        ("velocity: 0.5, acceleration: 0.5}", "velocity: 0.5, acceleration: 0.00005}", SchemaMismatch, "acceleration"),
+        ("velocity: 0.5, acceleration: 0.5}", "velocity: 1.5, acceleration: 0.5}", SchemaMismatch, "velocity"),
+        ("velocity: 0.5, acceleration: 0.5}", "velocity: .nan, acceleration: 0.5}", SchemaMismatch, "velocity"),
+        ("dwell_s: 0.1", "dwell_s: 61", SchemaMismatch, "dwell_s"),
+        ("target_deg: [10, 5", "target_deg: [10, 500", ConfigurationInconsistent, "500 deg"),
+        ("target_deg: [10, 5,", "target_deg: [10,", ConfigurationInconsistent, "5 positions"),
+        ("target_deg: [10, 5", "target: [10, 5", ConfigurationInconsistent, "target_deg"),
+        ("cell: demo", "cell: other", ConfigurationInconsistent, "other"),
+        ("condition: 1500.0", "condition: -1.0", SchemaMismatch, "condition"),
+        ("moves:", "predicted_std_percent: [1.0]\nmoves:", ConfigurationInconsistent, "one a gain"),
+        ("moves:", "predicted_std_percent: [0, 1, 1, 1, 1, 1]\nmoves:", SchemaMismatch, "predicted_std_percent"),
+        ("moves:", "surprise: 1\nmoves:", SchemaMismatch, "surprise"),
+    ],
+)
+def test_what_a_hand_may_have_changed_is_refused(
+    demo: Cell, tmp_path: Path, old: str, new: str, error: type[Exception], message: str
+) -> None:
+    path = tmp_path / "plan.yaml"
+    assert old in OLD
+    path.write_text(OLD.replace(old, new, 1))
+    with pytest.raises(error, match=message):
+        load_plan(path, demo)
+
+
+def test_more_than_an_hour_is_refused(demo: Cell, tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text(OLD + "  - {target_deg: [10, 5, 80, 0, 0, 0], velocity: 1, acceleration: 1, dwell_s: 60}\n" * 61)
+    with pytest.raises(ConfigurationInconsistent, match="at most 3600 s"):
+        load_plan(path, demo)
+
+
+def test_a_way_through_a_declared_obstacle_is_refused(demo: Cell, made: Plan, tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    save_plan(made, path)
+    everywhere = Box("press", (-0.6, -0.6, 0.3), (0.6, 0.6, 1.2))
+    blocked = replace(demo, clearance=Clearance(None, 0.01, (), (everywhere,)))
+    with pytest.raises(ConfigurationInconsistent, match="press"):
+        load_plan(path, blocked)
+
+
+def test_the_command_line_says_how_well_each_gain_will_be_seen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "plan.yaml"
+    arguments = ["plan", str(CELLS / "demo.yaml"), "--out", str(out), "--duration", "8", "--exchanges", "10"]
+    assert main([*arguments, "--json"]) == ExitCode.OK
+    found = json.loads(capsys.readouterr().out)
+    assert [gain["axis"] for gain in found["gains"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    assert "inertia only" in found["gains"][0]["words"]
+    assert found["gains"][0]["alone_percent"]["gravity"] is None
+    assert any("guess" in line for line in found["assumed"])
+    weak = [gain for gain in found["gains"] if gain["verdict"] != "good"]
+    assert weak
+    assert all("; add " in gain["words"] for gain in weak)
+    assert main(arguments) == ExitCode.OK
+    text = capsys.readouterr().out
+    assert "predicted σ" in text
+    assert "the way to its first target is not checked" in text
+    assert main([*arguments, "--sigma", "0.1"]) == ExitCode.USAGE
+    assert main([*arguments, "--payload", "anvil"]) == ExitCode.CONFIGURATION

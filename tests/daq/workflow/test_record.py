@@ -1,0 +1,300 @@
+"""Recording against drives that live in a time of their own: what the bus did must be in the log and in its verdict."""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Iterable
+from math import radians
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from daq.cli.app import main
+from daq.config.cell import Cell
+from daq.config.cell_file import bundle, load_cell
+from daq.errors import ExitCode, RunInvalid
+from daq.log.conversion import load_run
+from daq.log.reader import read_log
+from daq.log.salvage import salvage
+from daq.workflow.plan_file import load_plan
+from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, record
+from daq.workflow.safeguards import NEVER
+from drivers.canopen.network import CanopenNetwork, Undisturbed
+from drivers.errors import NodeMisplaced, SampleLost
+from drivers.stream.sample import EventKind
+from drivers.stream.socketcan import Losses
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
+
+WALL_NS = 1_700_000_000_000_000_000
+ELBOW, ELBOW_COUNTS = 3, round(radians(60) * 45 / (2 * 3.141592653589793) * 65536)
+PLAN = """format: drivegain-plan
+cell: demo
+seed: 1
+condition: 100.0
+moves:
+  - {target_deg: [5, -5, 70, 5, -5, 5], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+  - {target_deg: [0, 0, 60, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+"""
+
+
+class Rig:
+    """Six scripted drives in the place of the demo cell's, the elbow at 60 deg."""
+
+    def __init__(self, checkout: Path, folder: Path, patch: pytest.MonkeyPatch, pacing: str) -> None:
+        configs = checkout / "configs"
+        text = (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
+        self.cell_file = folder / "cell.yaml"
+        self.cell_file.write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
+        self.plan = folder / "plan.yaml"
+        self.plan.write_text(PLAN)
+        self.out = folder / "a.mcap"
+        self.network, self.bus = cell(6)
+        self.bus.nodes[ELBOW - 1].position = ELBOW_COUNTS
+
+        def network_of(_cell: Cell, _undisturbed: Undisturbed) -> CanopenNetwork:
+            return self.network
+
+        patch.setattr("daq.workflow.record.network_of", network_of)
+
+    def run(self, clocks: Clocks | None = None) -> Recorded:
+        """Record the plan."""
+        declared = load_cell(self.cell_file)
+        clocks = clocks or Clocks(lambda: WALL_NS, self.bus.clock)
+        moves = load_plan(self.plan, declared)
+        return record(
+            self.cell_file,
+            declared,
+            moves,
+            self.out,
+            payload=None,
+            operator="Ada",
+            granted_by="the test",
+            run_id="1",
+            clocks=clocks,
+        )
+
+    def profiles(self) -> list[bytes]:
+        """What the elbow was told about velocity and acceleration."""
+        cob_id = 0x300 + ELBOW
+        return [bytes(frame.data) for frame in self.bus.sent if frame.arbitration_id == cob_id]
+
+
+@pytest.fixture
+def lockstep(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(checkout, tmp_path, monkeypatch, "lockstep")
+
+
+@pytest.fixture
+def timed(checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
+    return Rig(checkout, tmp_path, monkeypatch, "timed")
+
+
+def silent_at_first(bus: ScriptedBus, cycles: int) -> None:
+    """Let the elbow's first answers be lost."""
+    first: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id != 0x180 + ELBOW or len(first) == cycles:
+            return (message,)
+        first.append(bus.cycle)
+        return ()
+
+    bus.tamper = tamper
+
+
+def test_no_search_for_garbage_delays_a_sync(timed: Rig) -> None:
+    usual, during = gc.get_threshold(), set()
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        during.add(gc.get_threshold()[2])
+        return (message,)
+
+    timed.bus.tamper = tamper
+    timed.run()
+    assert during == {NEVER}
+    assert gc.get_threshold() == usual
+
+
+@pytest.mark.parametrize("pacing", ["lockstep", "timed"])
+def test_a_sound_run_is_valid_and_starts_at_wall_time(
+    pacing: str, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = Rig(checkout, tmp_path, monkeypatch, pacing)
+    done = rig.run()
+    assert (done.log.valid, done.log.reason, done.log.lost_cycles) == (True, "", 0)
+    time_ns = read_log(rig.out).samples.time_ns
+    assert time_ns.tolist() == [WALL_NS + PERIOD_NS * k for k in range(len(time_ns))]
+    assert all(event.time_ns in time_ns for event in read_log(rig.out).events)
+    assert load_run(rig.out)[0].move is not None
+
+
+def test_what_is_done_before_the_first_sample_costs_no_period(timed: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow_bundle(cell_file: Path) -> dict[str, bytes]:
+        timed.bus.clock.now_ns += 30_000_000
+        return bundle(cell_file)
+
+    monkeypatch.setattr("daq.workflow.record.bundle", slow_bundle)
+    done = timed.run()
+    assert (done.log.valid, done.log.reason) == (True, "")
+    assert set(np.diff(read_log(timed.out).samples.time_ns)) == {PERIOD_NS}
+
+
+def test_moves_are_planned_from_where_the_axes_are_known_to_be(
+    lockstep: Rig, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent_at_first(lockstep.bus, 2)
+    done = lockstep.run()
+    samples = read_log(lockstep.out).samples
+    # They were lost before the recording began.
+    assert not samples.missing.any()
+    assert samples.position_counts[0, ELBOW - 1] == ELBOW_COUNTS
+    assert (done.log.valid, done.log.reason) == (True, "")
+    (tmp_path / "sound").mkdir()
+    sound = Rig(checkout, tmp_path / "sound", monkeypatch, "lockstep")
+    sound.run()
+    assert lockstep.profiles() == sound.profiles() != []
+
+
+def test_an_axis_that_never_answers_is_not_waited_for_for_ever(lockstep: Rig) -> None:
+    silent_at_first(lockstep.bus, 1000)
+    with pytest.raises(SampleLost, match=f"no answer from axis {ELBOW}"):
+        lockstep.run()
+    assert not lockstep.out.exists()
+    assert not any(node.powered_cycles for node in lockstep.bus.nodes)
+
+
+def test_a_schedule_that_slipped_is_refused(timed: Rig) -> None:
+    def busy(cycle: int) -> None:
+        if cycle == 150:
+            timed.bus.clock.now_ns += 3 * PERIOD_NS
+
+    timed.bus.on_cycle = busy
+    done = timed.run()
+    skipped = done.stream.skipped_periods
+    assert skipped >= 2
+    assert (done.log.valid, done.log.lost_cycles) == (False, skipped)
+    assert f"{skipped} periods without SYNC" in done.log.reason
+    with pytest.raises(RunInvalid, match="periods without SYNC"):
+        load_run(timed.out)
+
+
+@pytest.mark.parametrize(("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was told to send")])
+def test_what_the_stream_cannot_explain_makes_a_run_invalid(lockstep: Rig, twice: int, says: str) -> None:
+    sent: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        if message.arbitration_id != 0x182 or lockstep.bus.cycle < 150 or sent:
+            return (message,)
+        sent.append(lockstep.bus.cycle)
+        return (message, can.Message(arbitration_id=twice, is_extended_id=False, data=message.data))
+
+    lockstep.bus.tamper = tamper
+    done = lockstep.run()
+    assert not done.log.valid
+    assert says in done.log.reason
+
+
+def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
+    lockstep.bus.on_cycle = lambda cycle: lockstep.bus.inject(
+        can.Message(arbitration_id=0x1C0, is_extended_id=False, data=bytes(8))
+    )
+    done = lockstep.run()
+    assert done.stream.foreign > 100
+    assert (done.log.valid, done.log.reason) == (True, "")
+
+
+@pytest.mark.parametrize("step_ns", [0, 3_000_000_000])
+def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
+    lockstep: Rig, step_ns: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wall = {"ns": WALL_NS}
+
+    def set_clock(cycle: int) -> None:
+        if cycle == 150:
+            wall["ns"] += step_ns
+
+    lockstep.bus.on_cycle = set_clock
+    clocks = Clocks(lambda: wall["ns"] + lockstep.bus.clock(), lockstep.bus.clock)
+    lockstep.run(clocks)
+    log = read_log(lockstep.out)
+    assert log.statistics.wall_minus_monotonic_ns == WALL_NS + step_ns
+    assert log.head.run.wall_minus_monotonic_ns == WALL_NS
+    assert set(np.diff(log.samples.time_ns)) == {PERIOD_NS}
+    assert main(["info", str(lockstep.out), "--json"]) == ExitCode.OK
+    assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
+
+
+def test_what_is_told_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interface's own counters are looked at five times a second, so they may tell after the last cycle."""
+    bus, recv = lockstep.bus, lockstep.bus.recv
+    ended_ns: list[int] = []
+
+    def late(timeout: float | None = None) -> can.Message | None:
+        if timeout == pytest.approx(LATE_LOSSES_S) and not ended_ns:
+            ended_ns.append(bus.clock.now_ns)
+        if ended_ns and bus.clock.now_ns - ended_ns[0] > 200_000_000:
+            bus.losses = Losses(interface=2)  # type: ignore[attr-defined]
+        return recv(timeout)
+
+    monkeypatch.setattr(bus, "recv", late)
+    done = lockstep.run()
+    assert (done.log.valid, done.log.reason) == (False, "2 frames dropped by the interface")
+    assert any(event.kind is EventKind.FRAMES_DROPPED for event in read_log(lockstep.out).events)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, NodeMisplaced(1, "A", "B")], ids=["Ctrl-C", "misplaced"])
+def test_a_recording_that_ended_early_is_not_salvaged_as_a_valid_one(
+    lockstep: Rig, error: BaseException, tmp_path: Path
+) -> None:
+    def end(cycle: int) -> None:
+        if cycle == 150:
+            raise error
+
+    lockstep.bus.on_cycle = end
+    with pytest.raises((KeyboardInterrupt, NodeMisplaced)):
+        lockstep.run()
+    saved = salvage(lockstep.out.with_name("a.mcap.part"), tmp_path / "saved.mcap")
+    assert not saved.statistics.valid
+    assert "ended (" in saved.statistics.reason
+
+
+def test_an_answer_that_comes_twice_to_the_last_sync_of_all_is_counted(lockstep: Rig) -> None:
+    """Behind it SDO answers are looked for on the same bus: the amplifiers end watching us."""
+    for node in lockstep.bus.nodes:
+        node.objects[0x1016, 0], node.objects[0x1016, 1], node.objects[0x6007, 0] = (1, 1), (0, 4), (1, 2)
+
+    doubled: list[int] = []
+
+    def tamper(message: can.Message) -> Iterable[can.Message]:
+        nodes = lockstep.bus.nodes
+        stopped = all(node.statusword & 0x6F == 0x40 and node.powered_cycles for node in nodes)
+        if message.arbitration_id != 0x186 or not stopped:
+            return (message,)
+        doubled.append(lockstep.bus.cycle)
+        return (message, message)
+
+    lockstep.bus.tamper = tamper
+    done = lockstep.run()
+    assert doubled[-1] == lockstep.bus.cycle
+    assert (done.log.valid, done.log.reason) == (False, f"{len(doubled)} answers twice")
+
+
+def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
+    timed: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That takes SYNCs too, whose answers belong to no sample."""
+    network, bus = timed.network, timed.bus
+    unguard = network.unguard
+
+    def late_answers() -> None:
+        unguard()
+        for node in bus.nodes:
+            for answer in node.on_sync(bus.cycle):
+                bus.inject(answer)
+
+    monkeypatch.setattr(network, "unguard", late_answers)
+    done = timed.run()
+    assert (done.log.valid, done.log.reason) == (True, "")

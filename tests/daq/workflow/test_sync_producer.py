@@ -1,0 +1,66 @@
+"""Who sends SYNC, as the cell file says it; and what the losses of a stream make of a run."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell import KERNEL, RECORDER
+from daq.config.cell_file import load_cell
+from daq.errors import ConfigurationInconsistent
+from daq.workflow.record import _verdict
+from drivers.stream.stream import StreamStatistics
+
+CONFIGURATIONS = Path(__file__).parents[3] / "configs"
+EXPLAINED = ("cycles", "frames", "foreign")
+"""What may be counted in a sound run."""
+
+
+def cell_with(folder: Path, interface: str, pacing: str, producer: str | None) -> Path:
+    text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
+    text = text.replace("../", f"{CONFIGURATIONS}/").replace("interface: virtual", f"interface: {interface}")
+    said = "" if producer is None else f"\n  producer: {producer}"
+    path = folder / "cell.yaml"
+    path.write_text(text.replace("pacing: lockstep ", f"pacing: {pacing}{said} "), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("interface", "pacing", "producer", "expected"),
+    [
+        ("virtual", "lockstep", None, RECORDER),
+        ("virtual", "lockstep", "recorder", RECORDER),
+        ("socketcan", "timed", "kernel", KERNEL),
+        ("socketcan", "timed", "J3", "J3"),
+        ("socketcand", "timed", "J6", "J6"),
+    ],
+)
+def test_a_producer_that_there_is(
+    tmp_path: Path, interface: str, pacing: str, producer: str | None, expected: str
+) -> None:
+    cell = load_cell(cell_with(tmp_path, interface, pacing, producer))
+    assert cell.sync is not None
+    assert cell.sync.producer == expected
+
+
+@pytest.mark.parametrize(
+    ("interface", "pacing", "producer", "message"),
+    [
+        ("virtual", "timed", "kernel", "kernel on virtual; expected a bus of interface socketcan"),
+        ("socketcand", "timed", "kernel", "kernel on socketcand; expected a bus of interface socketcan"),
+        ("socketcan", "timed", "J9", r"J9; expected recorder, kernel, or an axis \(J1, J2, J3, J4, J5, J6\)"),
+        ("virtual", "lockstep", "J3", "J3 with pacing lockstep"),
+    ],
+)
+def test_a_producer_that_there_is_not(tmp_path: Path, interface: str, pacing: str, producer: str, message: str) -> None:
+    with pytest.raises(ConfigurationInconsistent, match=message):
+        load_cell(cell_with(tmp_path, interface, pacing, producer))
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(StreamStatistics)])
+def test_whatever_is_lost_makes_a_run_invalid(name: str) -> None:
+    valid, reason = _verdict(StreamStatistics(**{name: 3}))
+    assert valid == (name in EXPLAINED)
+    assert valid or reason.startswith("3 ")

@@ -1,0 +1,149 @@
+"""Validation: a calibration that was saved and read predicts as the fit did, and says what it cannot predict."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daq.cli import main
+from daq.errors import CalibrationUnreadable
+from daq.log.csv_import import import_csv
+from daq.workflow.calibration_file import load, save
+from daq.workflow.fit import calibration_of, fit
+from daq.workflow.validate import Acquaintance, conditioning_of, together, validate
+from ident.calibration import Calibration
+from tests.daq.calibrations import demo_calibration
+from tests.daq.logs import demo_content, samples, write
+
+
+@pytest.fixture(scope="module")
+def real(checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A calibration file of the real TX-40 with its gains fixed, and the log that it rests on."""
+    folder = tmp_path_factory.mktemp("tx40")
+    log, file = folder / "tx40.mcap", folder / "calibration.yaml"
+    import_csv(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
+    save(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
+    return file, log
+
+
+def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    file, log = real
+    assert main(["validate", str(file), str(log), "--json"]) == 0
+    output = capsys.readouterr()
+    assert output.err == ""
+    found = json.loads(output.out)
+    calibration = load(file)
+    assert found["axes"] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    (entry,) = found["logs"]
+    error = entry["relative_error_percent"]
+    assert error["axes"] == pytest.approx(calibration.relative_error_percent.axes, rel=1e-6)
+    assert error["total"] == pytest.approx(calibration.relative_error_percent.total, rel=1e-6)
+    assert (entry["seen_by_fit"], entry["held_out"], entry["same_configuration"]) == (True, False, True)
+    assert entry["rows"] == calibration.rows
+    assert entry["picture"] is None
+    assert found["filter"]["position_cutoff_hz"] == 100.0
+
+
+def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, log = real
+    assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
+    text = capsys.readouterr().out
+    assert f"{load(file).relative_error_percent.total:.2f}" in text
+    assert "seen by the fit" in text
+    assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.png'}"
+    assert (tmp_path / "new" / "folder" / "tx40.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "occupied").write_text("", encoding="utf-8")
+    assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "occupied")]) == 1
+    assert "tx40.png" in capsys.readouterr().err
+
+
+def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, Path]) -> None:
+    file, log = real
+    calibration = load(file)
+    (source,) = calibration.sources
+    changed = replace(calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64)
+    (held_out,) = validate(changed, [log])
+    assert (held_out.acquaintance, held_out.same_configuration) == (Acquaintance.HOLDOUT, False)
+    (new,) = validate(replace(calibration, sources=(replace(source, sha256="0" * 64),)), [log])
+    assert new.acquaintance is Acquaintance.NEW
+    # Twice the same rows weigh the same.
+    assert together((new, new)).total == pytest.approx(new.error.total)
+
+
+def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
+    file, log = real
+    calibration = load(file)
+    first, *others = calibration.gains
+    (right,) = validate(calibration, [log])
+    (wrong,) = validate(replace(calibration, gains=(replace(first, value=1.2 * first.value), *others)), [log])
+    # ‖1.2 Y − W χ‖/‖1.2 Y‖ with a residual that is nearly orthogonal to W χ.
+    expected = np.hypot(100.0 * 0.2 / 1.2, right.error.axes[0] / 1.2)
+    assert wrong.error.axes[0] == pytest.approx(expected, rel=0.05)
+    assert wrong.error.axes[1:] == pytest.approx(right.error.axes[1:])
+
+
+def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
+    file, log = real
+    calibration = load(file)
+    (as_fitted,) = validate(calibration, [log])
+    (slower,) = validate(replace(calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}), [log])
+    assert len(slower.time_s) < 0.3 * len(as_fitted.time_s)
+    assert slower.error.total < as_fitted.error.total
+
+
+@pytest.mark.parametrize(
+    "spoilt", [{}, {"position_cutoff_hz": 40.0}, {**demo_calibration().filter, "standstill_rad_s": 0.1}]
+)
+def test_a_calibration_without_its_filter_is_unreadable(spoilt: dict[str, float | list[float]]) -> None:
+    with pytest.raises(CalibrationUnreadable, match="position_cutoff_hz"):
+        conditioning_of(replace(demo_calibration(), filter=spoilt))
+
+
+@pytest.fixture
+def complete() -> Calibration:
+    """Of the demo cell, with a filter, and with parameters of no robot."""
+    whole: dict[str, float | list[float]] = {
+        "position_cutoff_hz": 40.0,
+        "position_order": 4.0,
+        "decimation_cutoff_hz": 20.0,
+        "standstill_rad_s": [0.03] * 6,
+        "standstill_share": 0.1,
+    }
+    return replace(demo_calibration(), filter=whole, effects=())
+
+
+def _calibrated(calibration: Calibration, tmp_path: Path) -> list[str]:
+    save(calibration, tmp_path / "calibration.yaml")
+    return ["validate", str(tmp_path / "calibration.yaml")]
+
+
+def test_refusals_have_their_exit_codes(
+    complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    angle = np.rint(20000.0 * np.sin(np.arange(3000)[:, None] / 200.0 + np.arange(6))).astype(int)
+    log = write(tmp_path / "a.mcap", demo_content(checkout), samples(angle.tolist()))
+    assert main([*_calibrated(replace(complete, cell="other"), tmp_path), str(log)]) == 4
+    assert "cell 'other' with the axes J1" in capsys.readouterr().err
+    assert main([*_calibrated(complete, tmp_path), str(log), "--json"]) == 4
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "'ZZ1R'" in output.err
+    assert main([*_calibrated(replace(complete, parameters=()), tmp_path), str(log)]) == 0
+    assert "100.00" in capsys.readouterr().out  # a model without parameters predicts nothing
+    assert main([*_calibrated(complete, tmp_path), str(tmp_path / "none.mcap")]) == 4
+    assert "none.mcap" in capsys.readouterr().err
+    assert main(["validate", str(tmp_path / "none.yaml"), str(log)]) == 4
+    assert "none.yaml" in capsys.readouterr().err
+
+
+def test_a_robot_that_stood_still_tells_nothing(
+    complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = write(tmp_path / "still.mcap", demo_content(checkout), samples([[0] * 6] * 3000))
+    assert main([*_calibrated(replace(complete, parameters=()), tmp_path), str(log)]) == 4
+    assert "did the robot move" in capsys.readouterr().err

@@ -1,0 +1,407 @@
+"""Writing back: every failure of the disk, two writers, and the way back. The gates are in test_gates.py."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import itertools
+import json
+import os
+import shlex
+import shutil
+import stat
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.cli.app import main
+from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit
+from daq.ledger.audit import AuditAction, read
+from daq.writeback.file_access import backups, only_writer
+from daq.writeback.file_proposal import Proposal, apply, propose
+from daq.writeback.file_target import roll_back
+from daq.writeback.request import Request
+from ident.calibration import Calibration
+from tests.daq.calibrations import AXES, KEYS, demo_calibration
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Path:
+    """A copy of the demo controller's file in a folder of its own."""
+    path = tmp_path / "the controllers" / "demo.yaml"
+    path.parent.mkdir()
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
+    return path
+
+
+def _propose(calibration: Calibration, controller: Path) -> Proposal:
+    return propose(Request(calibration, NOW), controller, KEYS, cell="demo")
+
+
+def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
+    before = controller.read_bytes()
+    proposal = _propose(demo_calibration(), controller)
+    assert proposal.refusals == ()
+    assert [change.axis for change in proposal.changes] == list(AXES)
+    assert "-    gain: -11.52       # Nm at the joint per A, from the data sheet\n" in proposal.diff
+    assert "+    gain: -9.2100       # Nm at the joint per A, from the data sheet\n" in proposal.diff
+    assert proposal.diff.count("\n+ ") == proposal.diff.count("\n- ") == 6
+    assert controller.read_bytes() == before
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -> None:
+    controller.chmod(0o640)
+    before = controller.read_bytes()
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    expected = before
+    for old, new in ((b"25.65", b"24.2000"), (b"-11.52", b"-9.2100"), (b"18.48", b"16.3000"), (b" 7.68", b" 6.7900")):
+        assert expected.count(old) == 1
+        expected = expected.replace(old, new)
+    expected = expected.replace(b"32.96", b"33.900", 1).replace(b"32.96", b"32.400", 1)
+    assert controller.read_bytes() == expected
+    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (before, expected))
+    assert written.backup == controller.parent / f"demo.yaml.20250102T030405Z.{digests}.bak"
+    assert written.backup.read_bytes() == before
+    assert sorted(controller.parent.iterdir()) == sorted([controller, written.backup])
+    assert {stat.S_IMODE(path.stat().st_mode) for path in (controller, written.backup)} == {0o640}
+
+
+def test_applying_twice_changes_nothing_the_second_time(controller: Path) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    again = _propose(demo_calibration(), controller)
+    assert again.diff == ""
+    assert apply(again, NOW) is None
+    assert len(backups(controller)) == 1
+
+
+def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
+    fewer = replace(demo_calibration(), gains=demo_calibration().gains[:5])
+    with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
+        _propose(fewer, controller)
+    with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
+        propose(Request(demo_calibration(), NOW), controller, {**KEYS, "J2": "drives.J1.gain"}, cell="demo")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("  J6:", "  J7:", "no key 'J6' in drives"),
+        ("loop: {kp", "loop: kp", None),
+        ("drives:", "drives: [", "no YAML"),
+        ("gain: 7.68", "gain: unknown", "'unknown'"),
+    ],
+)
+def test_a_controller_file_that_does_not_fit_is_refused(controller: Path, old: str, new: str, says: str | None) -> None:
+    controller.write_text(controller.read_text().replace(old, new))
+    with pytest.raises(ControllerUnfit, match=says):
+        _propose(demo_calibration(), controller)
+
+
+def test_a_missing_controller_file_or_a_folder_is_refused(controller: Path) -> None:
+    with pytest.raises(ControllerUnfit, match="no such file"):
+        _propose(demo_calibration(), controller.with_name("none.yaml"))
+    with pytest.raises(ControllerUnfit, match="no regular file"):
+        _propose(demo_calibration(), controller.parent)
+
+
+def test_a_file_changed_since_the_diff_is_refused(controller: Path) -> None:
+    proposal = _propose(demo_calibration(), controller)
+    controller.write_text(controller.read_text() + "# seen by K.\n")
+    changed = controller.read_bytes()
+    with pytest.raises(ControllerChanged):
+        apply(proposal, NOW)
+    assert controller.read_bytes() == changed
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+def test_a_second_writer_is_refused(controller: Path) -> None:
+    proposal = _propose(demo_calibration(), controller)
+    before = controller.read_bytes()
+    lock = controller.parent / ".demo.yaml.lock"
+    with lock.open("w") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ControllerBusy):
+            apply(proposal, NOW)
+        assert lock.exists()
+    assert controller.read_bytes() == before
+    # The lock of a writer that was killed is free, whatever its file says.
+    assert apply(proposal, NOW) is not None
+    assert not lock.exists()
+
+
+def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: Path) -> None:
+    file = tmp_path / "x.yaml"
+    lock, made = tmp_path / ".x.yaml.lock", 0
+    umask = os.umask(0o077)
+    try:
+        with only_writer(file):
+            made = stat.S_IMODE(lock.stat().st_mode)
+    finally:
+        os.umask(umask)
+    assert made == 0o644
+    assert not lock.exists()
+    if os.geteuid() != 0:
+        pytest.skip("only root can be another user")
+    lock.touch(0o644)
+    held = os.open(lock, os.O_RDONLY)
+    # The folders above are pytest's own, for root alone: a folder of its own, by its descriptor.
+    shared = Path(tempfile.mkdtemp())
+    lock = lock.rename(shared / lock.name)
+    shared.chmod(0o1777)
+    os.seteuid(65534)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        with pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+            pass
+        fcntl.flock(held, fcntl.LOCK_UN)
+        with only_writer(shared / "x.yaml"), pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+            pass
+        assert lock.exists()  # root's, in a folder where each removes their own
+    finally:
+        os.seteuid(0)
+        os.close(held)
+        shutil.rmtree(shared)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "keys"),
+    [
+        (
+            "x.dcf",
+            "[2003]\nObjectType=0x9\nSubNumber=2\n[2003sub1]\nDataType=0x0008\nParameterValue=32.96\n",
+            ("2003:01", "2003sub1"),
+        ),
+        ("x.xml", "<c><Axis name='J1'><gain>32.96</gain></Axis></c>", ("c/Axis[1]/gain", "c/Axis[@name='J1']/gain")),
+    ],
+)
+def test_two_names_of_one_number_are_refused(tmp_path: Path, name: str, content: str, keys: tuple[str, str]) -> None:
+    file = tmp_path / name
+    file.write_text(content)
+    two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
+    with pytest.raises(ControllerUnfit, match="which name the same number"):
+        propose(Request(two, NOW), file, dict(zip(("J1", "J2"), keys, strict=True)), cell="demo")
+
+
+def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link.yaml"
+    link.symlink_to(controller)
+    written = apply(_propose(demo_calibration(), link), NOW)
+    assert written is not None
+    assert link.is_symlink()
+    assert written.file == controller
+    assert written.backup.parent == controller.parent
+    assert b"-9.2100" in controller.read_bytes()
+    assert roll_back(link, NOW).file == controller
+    assert b"-11.52" in controller.read_bytes()
+
+
+class _Failing:
+    """Stands for a system call and fails on its n-th use, when the disk is full."""
+
+    def __init__(self, call: Callable[..., object], at: int) -> None:
+        self.call, self.at, self.uses = call, at, 0
+
+    def __call__(self, *arguments: object, **options: object) -> object:
+        self.uses += 1
+        if self.uses == self.at:
+            raise OSError(28, "No space left on device")
+        return self.call(*arguments, **options)
+
+
+@pytest.mark.parametrize("name", ["open", "fchmod", "fsync", "replace"])
+def test_whatever_step_fails_the_old_file_stands_and_nothing_is_left(
+    controller: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every use of every system call on the way fails in turn, until one run goes through."""
+    before = controller.read_bytes()
+    failures = 0
+    while True:
+        proposal = _propose(demo_calibration(), controller)
+        failing = _Failing(getattr(os, name), failures + 1)
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, failing)
+            try:
+                written = apply(proposal, NOW)
+            except OSError:
+                written = None
+        if failing.uses <= failures:
+            break
+        failures += 1
+        assert written is None
+        assert controller.read_bytes() == before
+        assert list(controller.parent.iterdir()) == [controller]
+    assert written is not None
+    assert failures >= {"open": 5, "fchmod": 2, "fsync": 4, "replace": 2}[name]
+
+
+def test_a_disk_that_gives_back_something_else_is_noticed(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = controller.read_bytes()
+    proposal = _propose(demo_calibration(), controller)
+    read = Path.read_bytes
+
+    def flipped(path: Path) -> bytes:
+        content = read(path)
+        return content.replace(b"kp: 120.0", b"kp: 120.1") if path.suffix == ".tmp" else content
+
+    monkeypatch.setattr(Path, "read_bytes", flipped)
+    with pytest.raises(ControllerUnfit, match=r"another value at drives\.J1\.loop\.kp"):
+        apply(proposal, NOW)
+    monkeypatch.undo()
+    assert controller.read_bytes() == before
+    assert list(controller.parent.iterdir()) == [controller]
+
+
+@pytest.mark.parametrize("does", ["saves it", "deletes it"])
+def test_what_a_person_saves_during_the_write_is_not_lost(
+    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str
+) -> None:
+    """An editor asks nobody for the lock: the last look is right before the rename."""
+    proposal = _propose(demo_calibration(), controller)
+    fsync, edited = os.fsync, controller.read_bytes() + b"# by hand\n"
+
+    def meanwhile(descriptor: int) -> None:
+        fsync(descriptor)
+        if Path(f"/proc/self/fd/{descriptor}").readlink().suffix == ".tmp" and backups(controller):
+            if does == "saves it":
+                controller.write_bytes(edited)
+            else:
+                controller.unlink()
+
+    audit = tmp_path / "audit.jsonl"
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    with pytest.raises(ControllerChanged, match="meanwhile"):
+        apply(proposal, NOW, audit=audit, who="T")
+    monkeypatch.undo()
+    assert list(controller.parent.iterdir()) == ([controller] if does == "saves it" else [])
+    assert not controller.exists() or controller.read_bytes() == edited
+    assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
+
+
+def test_a_file_that_somebody_makes_during_a_way_back_stays(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    controller.unlink()
+    fsync = os.fsync
+
+    def meanwhile(descriptor: int) -> None:
+        fsync(descriptor)
+        controller.write_bytes(b"by: hand\n")
+
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    with pytest.raises(ControllerChanged, match="meanwhile"):
+        roll_back(controller, NOW)
+    assert controller.read_bytes() == b"by: hand\n"
+
+
+def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
+    original = controller.read_bytes()
+    first = apply(_propose(demo_calibration(), controller), NOW)
+    assert first is not None
+    calibrated = controller.read_bytes()
+
+    back = roll_back(controller, NOW + timedelta(minutes=1))
+    assert controller.read_bytes() == original
+    assert back.source == first.backup
+    assert back.backup is not None
+    assert back.backup.read_bytes() == calibrated
+
+    roll_back(controller, NOW + timedelta(minutes=2))
+    assert controller.read_bytes() == calibrated
+    assert len(backups(controller)) == 3
+
+
+def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path) -> None:
+    apply(_propose(demo_calibration(), controller), NOW)
+    for step in (0, -3600, 0, -7200):
+        roll_back(controller, NOW + timedelta(seconds=step))
+    assert [(one.stamp, one.count) for one in backups(controller)] == [("20250102T030405Z", k) for k in range(5)]
+    contents = [one.path.read_bytes() for one in backups(controller)]
+    assert all(a != b for a, b in itertools.pairwise(contents))
+
+
+def _make_backup(controller: Path, was: bytes, became: bytes, stamp: str = "20250102T030405Z") -> Path:
+    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (was, became))
+    path = controller.parent / f"demo.yaml.{stamp}.{digests}.bak"
+    path.write_bytes(was)
+    return path
+
+
+def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
+    with pytest.raises(BackupMissing, match="no backup beside it"):
+        roll_back(controller, NOW)
+    # What a writer leaves that was killed before it replaced the file is no way back either.
+    _make_backup(controller, controller.read_bytes(), b"never written")
+    with pytest.raises(BackupMissing, match="same content"):
+        roll_back(controller, NOW)
+    controller.with_name("demo.yaml.bak").write_text("a human's own")
+    controller.unlink()
+    controller.parent.joinpath("other.yaml").write_text("x: 1\n")
+    with pytest.raises(BackupMissing, match="no backup beside it"):
+        roll_back(controller.with_name("other.yaml"), NOW)
+
+
+def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> None:
+    original = controller.read_bytes()
+    apply(_propose(demo_calibration(), controller), NOW)
+    _make_backup(controller, controller.read_bytes(), b"never written", "20250102T040405Z")
+    roll_back(controller, NOW + timedelta(hours=2))
+    assert controller.read_bytes() == original
+
+
+def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
+    before = controller.read_bytes()
+    _make_backup(controller, b"drives: [", before)
+    with pytest.raises(ControllerUnfit, match="no YAML"):
+        roll_back(controller, NOW)
+    assert controller.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"drives: {}\n"])
+def test_a_backup_that_was_gutted_is_not_restored(controller: Path, content: bytes) -> None:
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    written.backup.write_bytes(content)
+    calibrated = controller.read_bytes()
+    for deleted in (False, True):
+        if deleted:
+            controller.unlink()
+        with pytest.raises(ControllerUnfit, match="as its name says"):
+            roll_back(controller, NOW)
+        assert controller.exists() is not deleted
+    assert written.after == calibrated
+    assert list(controller.parent.iterdir()) == [written.backup]
+
+
+def test_a_deleted_file_comes_back(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    controller.chmod(0o640)
+    original = controller.read_bytes()
+    apply(_propose(demo_calibration(), controller), NOW)
+    controller.unlink()
+    assert main(["rollback", "--to", str(controller), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["backup"] is None
+    assert controller.read_bytes() == original
+    assert stat.S_IMODE(controller.stat().st_mode) == 0o640
+    controller.unlink()
+    assert main(["rollback", "--to", str(controller)]) == 0
+    assert "the file was gone" in capsys.readouterr().out
+
+
+def test_an_edit_since_the_write_is_not_lost(controller: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = controller.parent.rename(controller.parent.parent / "my controllers")
+    controller = folder / controller.name
+    written = apply(_propose(demo_calibration(), controller), NOW)
+    assert written is not None
+    edited = controller.read_bytes().replace(b"120.0", b"130.0")
+    controller.write_bytes(edited)
+    assert main(["rollback", "--to", str(controller)]) == 3
+    told = " ".join(capsys.readouterr().err.split())
+    assert f"`diff {shlex.quote(str(written.backup))} {shlex.quote(str(controller))}`" in told
+    assert controller.read_bytes() == edited

@@ -1,0 +1,608 @@
+"""Controllers' documents in JSON, XML and DCF: only the numbers meant change, as bytes and as any parser sees them."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.sax.saxutils import escape, quoteattr
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daq.config.controller import ControllerFormat
+from daq.errors import ControllerUnfit
+from daq.writeback.formats.dcf_document import DcfDocument
+from daq.writeback.formats.document import MAX_BYTES, ControllerDocument, decode, format_of, read_bytes
+from daq.writeback.formats.json_document import JsonDocument
+from daq.writeback.formats.scalar import respell
+from daq.writeback.formats.xml_document import XmlDocument
+from daq.writeback.formats.yaml_document import YamlDocument
+
+EXAMPLES = settings(max_examples=150)
+_numbers = st.sampled_from(["32.96", "-11.52", "7", "0", "1e3", "2.5E-3", "0.10", "-0.0", "123456789.125"])
+_gains = st.floats(1e-3, 1e4).flatmap(lambda gain: st.sampled_from([gain, -gain]))
+_ends = st.sampled_from(["\n", "\r\n"])
+_words = st.text("abcdefghijklmnopqrstuvwxyzéß漢", min_size=1, max_size=5)
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A generated file: its text cut where the numbers meant stand, their keys, and how it is encoded."""
+
+    pieces: tuple[str, ...]
+    numbers: tuple[str, ...]
+    keys: tuple[str, ...]
+    encoding: str = "utf-8"
+
+    def content(self, numbers: tuple[str, ...]) -> bytes:
+        return "".join(a + b for a, b in zip(self.pieces, (*numbers, ""), strict=True)).encode(self.encoding)
+
+
+_HOLE = "\0"
+"""Stands for a number meant while a file is made."""
+
+
+def _case(text: str, numbers: list[str], keys: list[str], encoding: str = "utf-8") -> _Case:
+    return _Case(tuple(text.split(_HOLE)), tuple(numbers), tuple(keys), encoding)
+
+
+@st.composite
+def _json_cases(draw: st.DrawFn) -> _Case:
+    numbers: list[str] = []
+    keys: list[str] = []
+    end = draw(_ends)
+    gap = st.sampled_from(["", " ", "\t", end, end + "    "])
+
+    def value(path: tuple[str, ...], depth: int) -> str:
+        kind = draw(st.sampled_from(["hole", "number", "word", "text", *(["object", "list"] if depth < 3 else [])]))
+        if kind == "hole" and path:
+            numbers.append(draw(_numbers))
+            keys.append(".".join(path))
+            return _HOLE
+        if kind == "object" or not path:
+            names = draw(st.lists(_words, max_size=4, unique=True))
+            inside = [
+                f"{draw(gap)}{json.dumps(name, ensure_ascii=draw(st.booleans()))}{draw(gap)}:{draw(gap)}"
+                f"{value((*path, name), depth + 1)}{draw(gap)}"
+                for name in names
+            ]
+            return "{" + ",".join(inside) + "}"
+        if kind == "list":
+            size = draw(st.integers(0, 3))
+            return "[" + ",".join(draw(gap) + value((*path, str(i)), depth + 1) for i in range(size)) + "]"
+        if kind == "text":
+            return json.dumps(draw(st.sampled_from(["32.96", 'say "7"', "\\", "déjà 漢", "{a: 1}", "\u2028"])))
+        return draw(st.sampled_from(["true", "null"])) if kind == "word" else draw(_numbers)
+
+    head = draw(st.sampled_from(["", "\ufeff", " ", end]))
+    return _case(head + value((), 0) + draw(gap), numbers, keys)
+
+
+@st.composite
+def _xml_cases(draw: st.DrawFn) -> _Case:
+    numbers: list[str] = []
+    keys: list[str] = []
+    end = draw(_ends)
+    encoding = draw(st.sampled_from(["utf-8", "utf-8", "iso-8859-1", "windows-1252"]))
+    names = _words if encoding == "utf-8" else st.text("abcdefgéß", min_size=1, max_size=5)
+    noise = st.sampled_from(
+        [
+            "",
+            " ",
+            end,
+            f"{end}  ",
+            "<!-- 32.96 <Gain>7</Gain> -->",
+            "<?tool keep=1?>",
+            "<![CDATA[<7>]]>",
+            "&#65;&amp;",
+            "é",
+        ]
+    )
+
+    def number(key: str) -> str:
+        numbers.append(draw(_numbers))
+        keys.append(key)
+        return _HOLE
+
+    def element(path: str, depth: int) -> str:
+        parts = []
+        used: dict[str, int] = {}
+        for _ in range(draw(st.integers(0, 3))):
+            name = draw(st.sampled_from(["Gain", "ns:Axis", "Ü", "Axis"]) if encoding == "utf-8" else st.just("Axis"))
+            used[name] = used.get(name, 0) + 1
+            parts.append(draw(noise) + inner(f"{path}/{name}[{used[name]}]", name, depth + 1))
+        return "".join(parts) + draw(noise)
+
+    def inner(path: str, name: str, depth: int) -> str:
+        label = draw(names)
+        attributes = f" name={quoteattr(label)}"
+        if draw(st.booleans()):
+            quote = draw(st.sampled_from(["'", '"']))
+            space = draw(st.sampled_from(["", " "]))
+            before, hole = draw(st.sampled_from([" ", end])), number(path + "/@gain")
+            attributes += f"{before}gain{space}={space}{quote}{space}{hole}{space}{quote}"
+        attributes += draw(st.sampled_from(["", " ", " note='a>b'", f"{end}x='&lt;7'"]))
+        shape = draw(st.sampled_from(["number", "text", "empty", *(["elements"] if depth < 3 else [])]))
+        if shape == "empty":
+            return f"<{name}{attributes}/>"
+        if shape == "number":
+            pad = draw(st.sampled_from(["", " ", end]))
+            return f"<{name}{attributes}>{pad}{number(path)}{pad}</{name}>"
+        return f"<{name}{attributes}>{escape(label) if shape == 'text' else element(path, depth)}</{name}>"
+
+    head = f'<?xml version="1.0" encoding="{encoding}"?>{end}'
+    if encoding == "utf-8":
+        head = draw(st.sampled_from(["", "\ufeff", head, "\ufeff" + head]))
+    text = f"{head}<!-- é -->{end}<Robot xmlns:ns='urn:x'>{element('Robot', 0)}</Robot>{end}"
+    return _case(text, numbers, keys, encoding)
+
+
+@st.composite
+def _dcf_cases(draw: st.DrawFn) -> _Case:
+    numbers: list[str] = []
+    keys: list[str] = []
+    end = draw(_ends)
+    lines = [draw(st.sampled_from(["; Müller, 32.96", "[FileInfo]", "", "[Comments]", "[DeviceInfo]"]))]
+    if lines[0].startswith("["):
+        lines += ["Lines=1", "Line1=made by hand; 7"]
+    objects = draw(st.lists(st.tuples(st.integers(0x2000, 0x2003), st.integers(0, 0x1F)), max_size=6, unique=True))
+    for index, sub in objects:
+        title = f"{index:04X}sub{sub:X}" if sub or draw(st.booleans()) else f"{index:04x}"
+        kind = draw(st.sampled_from([4, 8, 0x11, 7]))
+        space = draw(st.sampled_from(["", " "]))
+        lines += [f"[{title}]", f"ParameterName=gain {index}", f"DataType=0x{kind:04X}", "DefaultValue=32.96"]
+        if draw(st.booleans()):
+            lines.append("; the value é")
+        if draw(st.booleans()):
+            keys.append(
+                draw(st.sampled_from([f"{index:04x}sub{sub:x}", f"{index:04X}:{sub:02X}", f"0x{index:X}sub{sub:X}"]))
+            )
+            whole = st.sampled_from(["0", "17", "0x1F", "0x0000ab", "123456"])
+            numbers.append(draw(whole if kind in (4, 7) else _numbers))
+            lines.append(f"{draw(st.sampled_from(['ParameterValue', 'parametervalue']))}{space}={space}{_HOLE}{space}")
+        lines += draw(st.sampled_from([[], [""], ["PDOMapping=0"], ["Denotation=32.96"]]))
+    return _case(end.join(lines) + draw(st.sampled_from(["", end])), numbers, keys, "iso-8859-1")
+
+
+CASES = {
+    ControllerFormat.JSON: _json_cases(),
+    ControllerFormat.XML: _xml_cases(),
+    ControllerFormat.DCF: _dcf_cases(),
+}
+
+
+def _json_tree(content: bytes) -> object:
+    return json.loads(content.decode("utf-8-sig"), parse_float=float, parse_int=float)
+
+
+def _xml_tree(content: bytes) -> object:
+    parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True, insert_pis=True))
+    return [
+        (e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail) for e in ElementTree.fromstring(content, parser).iter()
+    ]
+
+
+def _dcf_tree(content: bytes) -> object:
+    parser = configparser.RawConfigParser(strict=False, delimiters=("=",), comment_prefixes=(";",))
+    parser.read_string(content.decode("latin-1"))
+    return {section: dict(parser.items(section)) for section in parser.sections()}
+
+
+@pytest.mark.parametrize("kind", list(CASES), ids=lambda kind: kind.value)
+@EXAMPLES
+@given(data=st.data())
+def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObject) -> None:
+    case = data.draw(CASES[kind])
+    document = decode(case.content(case.numbers), "robot", kind)
+    assert document.content == case.content(case.numbers)
+    found = document.locate(case.keys)
+    assert [scalar.text for scalar in found] == list(case.numbers)
+    spelt = tuple(
+        respell(scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)).spelling
+        for scalar, gain in zip(
+            found, data.draw(st.lists(_gains, min_size=len(found), max_size=len(found))), strict=True
+        )
+    )
+    spelling = dict(zip(case.keys, spelt, strict=True))
+
+    changed = document.with_values(spelling)
+
+    assert changed.content == case.content(spelt)
+    assert [scalar.text for scalar in changed.locate(case.keys)] == list(spelt)
+    assert document.with_values({}).content == document.content
+    decode(changed.content, "robot", kind).check_against(document, spelling)
+
+
+@pytest.mark.parametrize(
+    ("kind", "cases", "tree"),
+    [
+        (ControllerFormat.JSON, _json_cases(), _json_tree),
+        (ControllerFormat.XML, _xml_cases(), _xml_tree),
+        (ControllerFormat.DCF, _dcf_cases(), _dcf_tree),
+    ],
+    ids=["json", "xml", "dcf"],
+)
+@EXAMPLES
+@given(data=st.data())
+def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
+    kind: ControllerFormat, cases: st.SearchStrategy[_Case], tree: Callable[[bytes], object], data: st.DataObject
+) -> None:
+    """The readers are none of those with which the document proves itself, and know nothing of its keys."""
+    case = data.draw(cases)
+    document = decode(case.content(case.numbers), "robot", kind)
+    marks = tuple(str(70000 + i) for i in range(len(case.keys)))
+    changed = document.with_values(dict(zip(case.keys, marks, strict=True)))
+    seen, expected = repr(tree(changed.content)), repr(tree(document.content))
+    for mark in marks:
+        assert seen.count(mark) == 1
+    if case.keys:
+        assert seen != expected
+    # Each mark put back to a common blank, and the old numbers too, the two are the same.
+    blank = case.content(tuple("70000" for _ in marks))
+    assert tree(decode(blank, "robot", kind).content) == tree(
+        changed.with_values(dict.fromkeys(case.keys, "70000")).content
+    )
+
+
+@pytest.mark.parametrize("kind", list(CASES), ids=lambda kind: kind.value)
+@EXAMPLES
+@given(data=st.data())
+def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObject) -> None:
+    case = data.draw(CASES[kind].filter(lambda case: bool(case.keys)))
+    document = decode(case.content(case.numbers), "robot", kind)
+    spelling = dict.fromkeys(case.keys, "7000")
+    content = document.with_values(spelling).content
+    at = data.draw(st.integers(0, len(content) - 1))
+    other = bytes([data.draw(st.integers(1, 126).filter(lambda byte: byte != content[at]))])
+    with pytest.raises(ControllerUnfit):
+        decode(content[:at] + other + content[at + 1 :], "robot", kind).check_against(document, spelling)
+
+
+@pytest.mark.parametrize("kind", list(ControllerFormat), ids=lambda kind: kind.value)
+@given(
+    begin=st.sampled_from([b"", b"\xff\xfe", b"[", b"{", b"{}", b"<a", b"<a/>", b"[6076]\n", b"\0"]),
+    noise=st.binary(max_size=60),
+)
+def test_whatever_stands_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
+    with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
+        decode(begin + noise, "robot", kind).locate(("6076.nowhere",))
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "says"),
+    [
+        ('{"J1": {"gain": 1.0}}', "J2.gain", "no key 'J2' in the file (it has J1)"),
+        ('{"J1": {"gain": 1.0}}', "J1.kp", "no key 'kp' in J1 (it has gain)"),
+        ('{"J1": {"gain": 1.0}}', "J1", "a list or mapping"),
+        ('{"J1": {"gain": 1.0}}', "J1.gain.value", "no key 'value' in J1.gain"),
+        ('{"gains": [1.0, 2.0]}', "gains.2", "no key '2' in gains (it has 0, 1)"),
+        ('{"J1": "1.0"}', "J1", "without quotes"),
+        ('{"J1": null}', "J1", "found null"),
+        ('{"J1": NaN}', "J1", "no NaN and no Infinity"),
+        ('{"J1": -Infinity}', "J1", "no NaN and no Infinity"),
+        ('{"J1": 1.0, "J1": 2.0}', "J1", '"J1" a second time'),
+        ('{"a": {"b": 1, "\\u0062": 2}, "J1": 1.0}', "J1", "a second time"),
+        ('{"J1": 1.0,}', "J1", "a key in quotes"),
+        ('{"J1": 01.0}', "J1", "expected , or }"),
+        ('{"J1": 1.0 // new\n}', "J1", "robot:1"),
+        ('{\n"J1": 1.0', "J1", "the end of the file"),
+        ('{"J1": 1.0}{', "J1", "expected the end of the file"),
+        ("[" * 200 + "]" * 200, "0", "at most 100 lists in lists"),
+    ],
+)
+def test_json_that_does_not_fit_is_refused(text: str, key: str, says: str) -> None:
+    with pytest.raises(ControllerUnfit) as caught:
+        JsonDocument("robot", text).locate((key,))
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "says"),
+    [
+        ("<R><G>1</G></R>", "R/H", "no H in R (it has G)"),
+        ("<R><G>1</G></R>", "S/G", "no S in the file (it has R)"),
+        ("<R><G>1</G><G>2</G></R>", "R/G", "2 of G in R, on lines 1, 1"),
+        ("<R><G>1</G></R>", "R/G[2]", "no G[2] in R"),
+        ("<R><G n='a'>1</G></R>", "R/G[@n='b']", "no G[@n='b'] in R"),
+        ("<R><G n='a'>1</G></R>", "R/G/@m", "no attribute @m in R/G (it has @n)"),
+        ("<R><G>1</G></R>", "R/G[@n=a]", "a path that cannot be read from '[@n=a]' on"),
+        ("<R><G>1</G></R>", "R//G", "a path that cannot be read"),
+        ("<R><G>1</G></R>", "", "a path that cannot be read"),
+        ("<R><G>1</G></R>", "R", "line 1: '<G>1</G>'"),
+        ("<R><G/></R>", "R/G", "line 1: ''"),
+        ("<R><G><![CDATA[1]]></G></R>", "R/G", "CDATA"),
+        ("<R><G>1<!-- x --></G></R>", "R/G", "comments"),
+        ("<R><G>&#49;</G></R>", "R/G", "entities"),
+        ("<R><G g='&#49;'/></R>", "R/G/@g", "entities"),
+        ("<R><G>1,5</G></R>", "R/G", "'1,5'"),
+        ("<R><G>NaN</G></R>", "R/G", "'NaN'"),
+        ("<R><G>0x10</G></R>", "R/G", "'0x10'"),
+    ],
+)
+def test_a_number_in_xml_that_cannot_be_changed_alone_is_refused(text: str, key: str, says: str) -> None:
+    with pytest.raises(ControllerUnfit) as caught:
+        XmlDocument("robot", text, "utf-8").locate((key,))
+    assert says in str(caught.value)
+    assert "nothing was written" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b'<!DOCTYPE R [<!ENTITY a "1">]><R><G>&a;</G></R>', "a document type"),
+        (b'<!DOCTYPE R SYSTEM "file:///etc/passwd"><R/>', "a document type"),
+        (b"<R><G>1</R>", "mismatched tag"),
+        (b"<R/><R/>", "junk after document element"),
+        (b"<R>&a;</R>", "undefined entity"),
+        ("<R><G>1</G></R>".encode("utf-16"), "save the file as UTF-8"),
+        ('<?xml version="1.0" encoding="shift_jis"?><R/>'.encode("shift_jis"), "multi-byte"),
+        (b'<?xml version="1.0" encoding="klingon"?><R/>', "unknown encoding"),
+    ],
+)
+def test_xml_that_is_not_safe_or_none_is_refused(content: bytes, says: str) -> None:
+    with pytest.raises(ControllerUnfit) as caught:
+        decode(content, "robot.xml")
+    assert says in str(caught.value)
+
+
+def test_deep_and_wide_xml_takes_no_recursion() -> None:
+    deep = b"<R><G>1.5</G>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"<b/>" * 20_000 + b"</R>"
+    assert b"<G>2.5000</G>" in decode(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
+
+
+_DCF = """\
+[6076]
+ParameterName=Motor rated torque
+DataType=0x0007
+ParameterValue=0x5DC
+[2003]
+ObjectType=0x9
+SubNumber=3
+[2003sub1]
+DataType=0x0003
+LowLimit=-400
+HighLimit=400
+ParameterValue=-0
+[2003sub2]
+DataType=0x0008
+ParameterValue=1.5
+[2003sub3]
+DataType=0x0009
+ParameterValue=abc
+[2003subA]
+DataType=0x0004
+ParameterValue=$NODEID+0x10
+[2004]
+DataType=0x0008
+ParameterValue=0x3F800000
+[2005]
+DataType=0x0003
+ParameterValue=0xFFF0
+[2006]
+DataType=0x0003
+DefaultValue=7
+[2007]
+DataType=0x0003
+ParameterValue=7
+ParameterValue=8
+[2008]
+DataType=0x0003
+ParameterValue=7 ; the gain
+[2009]
+DataType=0x0003
+ParameterValue=010
+[200A]
+DataType=0x0003
+ParameterValue=1
+[200a]
+DataType=0x0003
+ParameterValue=2
+[200B]
+DataType=0x0003
+LowLimit=few
+ParameterValue=2
+[200Csub1]
+DataType=0x0008
+ParameterValue=1.5
+[200csub01]
+DataType=0x0008
+ParameterValue=2.5
+[200Dsub0A]
+DataType=0x0008
+ParameterValue=1.5
+"""
+
+
+@pytest.mark.parametrize(
+    ("key", "says"),
+    [
+        ("6077", "no section [6077] or [6077sub0] (it does not have this index at all)"),
+        ("2003:04", "no section [2003sub4] (it has 2003, 2003sub1, 2003sub2, 2003sub3, 2003suba)"),
+        ("2003", "an array or record"),
+        ("gain", "a key that names no object"),
+        ("2003:03", "DataType 0x0009"),
+        ("2003:0A", "'$NODEID+0x10'"),
+        ("2004", "'0x3F800000' in a real object"),
+        ("2006", "without ParameterValue"),
+        ("2007", "parametervalue twice"),
+        ("2008", "'7 ; the gain'"),
+        ("2009", "'010'"),
+        ("200A", "it 2 times, on lines"),
+        ("200B", "few as lowlimit"),
+        ("200C:01", "it 2 times, on lines"),
+    ],
+)
+def test_an_object_that_cannot_be_changed_alone_is_refused(key: str, says: str) -> None:
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", _DCF).locate((key,))
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("number", ["0x0_8", "0_8", "0b1000", "0o10", "010", "+8", "-0x8", "8.0", "0x", "8h"])
+@pytest.mark.parametrize("entry", ["DataType", "ObjectType"])
+def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> None:
+    others = {"DataType": "0x0008", "ObjectType": "0x7"} | {entry: number}
+    text = "[2003]\n" + "".join(f"{name}={written}\n" for name, written in others.items()) + "ParameterValue=1.5\n"
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", text).locate(("2003",))
+    line = text.splitlines().index(f"{entry}={number}") + 1
+    assert f"line {line}: '{number}'; expected {entry.lower()} in decimal digits" in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["0x0008", "0X8", "8", "0x00000008", "0x11", "17"])
+def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None:
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n").locate(("2003",))
+    assert scalar.value == 1.5
+
+
+@pytest.mark.parametrize("number", ["010", "-010", "+010", "08", "00", "007"])
+@pytest.mark.parametrize("kind", ["0x0004", "0x0008", "0x0011"])
+def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, number: str) -> None:
+    """10 to a reader of decimals, 8 to one of CiA 306."""
+    with pytest.raises(ControllerUnfit) as caught:
+        DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n").locate(("2003",))
+    assert f"line 3: '{number}'" in str(caught.value)
+    assert "octal" in str(caught.value)
+    assert "nothing was written" in str(caught.value)
+
+
+@pytest.mark.parametrize(("number", "value"), [("0", 0.0), ("0.10", 0.1), ("010.5", 10.5), ("-0.0", 0.0), ("10", 10.0)])
+def test_a_real_of_a_dcf_with_a_point_is_no_octal_number(number: str, value: float) -> None:
+    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n").locate(("2003",))
+    assert scalar.value == value
+
+
+def test_a_number_of_xml_that_begins_with_zero_is_decimal() -> None:
+    """As xs:double says."""
+    (scalar,) = XmlDocument("robot", "<R><G>010</G></R>", "utf-8").locate(("R/G",))
+    assert scalar.value == 10.0
+
+
+@pytest.mark.parametrize("key", ["200D:0A", "200dsubA", "0x200Dsub0a"])
+def test_an_object_is_its_index_and_subindex_however_its_section_spells_them(key: str) -> None:
+    changed = DcfDocument("drive.dcf", _DCF).with_values({key: "2.5000"})
+    assert changed.text == _DCF.replace(
+        "[200Dsub0A]\nDataType=0x0008\nParameterValue=1.5", "[200Dsub0A]\nDataType=0x0008\nParameterValue=2.5000"
+    )
+
+
+@pytest.mark.parametrize(
+    ("key", "gain", "std", "factor", "spelling"),
+    [
+        ("6076", 1.2344, 0.001, 1000.0, "0x4D2"),
+        ("2003:01", -0.2, 0.02, 1000.0, "-200"),
+        ("2003sub2", 33.91234, 0.03, 1.0, "33.9123"),
+        ("2005", -20.0, 0.6, 1.0, "0xFFEC"),
+        ("2005", 300.2, 0.6, 1.0, "0x012C"),
+    ],
+)
+def test_an_integer_keeps_its_style_and_another_unit_its_factor(
+    key: str, gain: float, std: float, factor: float, spelling: str
+) -> None:
+    document = DcfDocument("drive.dcf", _DCF)
+    (scalar,) = document.locate((key,))
+    told = respell(scalar, gain, std, factor)
+    assert told.spelling == spelling
+    assert abs(told.new - gain) <= std
+    assert told.old == scalar.value / factor
+    (read,) = document.with_values({key: spelling}).locate((key,))
+    assert read.value / factor == told.new
+
+
+@pytest.mark.parametrize(
+    ("key", "gain", "std", "factor", "says"),
+    [
+        ("6076", 33.4, 0.1, 1.0, "33.4 ± 0.1, which the integer 33 does not tell"),
+        ("6076", 0.3, 0.5, 1.0, "the integer 0 does not tell"),
+        ("6076", -3.0, 0.5, 1.0, "-3 for an integer of 0 to 4294967295"),
+        ("2003:01", 0.4001, 1e-3, 1000.0, "0.4"),
+        ("2003:01", 0.401, 1e-3, 1000.0, "401 for an integer of -400 to 400"),
+        ("2005", 33.0, 0.1, 1000.0, "33000 for an integer of -32768 to 32767"),
+    ],
+)
+def test_an_integer_that_does_not_tell_the_gain_is_refused(
+    key: str, gain: float, std: float, factor: float, says: str
+) -> None:
+    (scalar,) = DcfDocument("drive.dcf", _DCF).locate((key,))
+    if says == "0.4":
+        assert respell(scalar, gain, std, factor).spelling == "400"
+        return
+    with pytest.raises(ControllerUnfit) as caught:
+        respell(scalar, gain, std, factor)
+    assert says in str(caught.value)
+
+
+def test_the_same_number_stays_as_the_human_wrote_it() -> None:
+    (hexadecimal,) = DcfDocument("drive.dcf", _DCF).locate(("6076",))
+    assert respell(hexadecimal, 1.5, 0.01, 1000.0).spelling == "0x5DC"
+    (decimal,) = JsonDocument("robot", '{"a": 32960}').locate(("a",))
+    assert respell(decimal, 32.96, 0.01, 1000.0).spelling == "32960"
+    assert respell(decimal, 32.97, 0.01, 1000.0) != respell(decimal, 32.96, 0.01, 1000.0)
+
+
+@pytest.mark.parametrize("name", ["Elmo_cob.dcf", "ElmoSimplIQ_cob.dcf", "Schunk_0_63_cob.dcf", "pilz_prbt_0_1.dcf"])
+def test_a_real_device_configuration_changes_in_one_number_alone(shared_data: Path, name: str) -> None:
+    content = (shared_data / "eds" / name).read_bytes()
+    document = decode(content, name)
+    heartbeat = "1017"
+    (scalar,) = document.locate((heartbeat,))
+    changed = document.with_values({heartbeat: "123"}).content
+    cut = (scalar.start, scalar.end)
+    assert changed == content[: cut[0]] + b"123" + content[cut[1] :]
+    assert content[cut[0] : cut[1]].decode() == scalar.text
+
+
+@pytest.mark.parametrize("name", ["maxon_epos4.eds", "ros2_canopen_cia402_slave.eds"])
+def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) -> None:
+    document = decode((shared_data / "eds" / name).read_bytes(), name)
+    with pytest.raises(ControllerUnfit, match="without ParameterValue"):
+        document.locate(("1017",))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("a.yaml", ControllerFormat.YAML),
+        ("a.YML", ControllerFormat.YAML),
+        ("a.json", ControllerFormat.JSON),
+        ("a.xml", ControllerFormat.XML),
+        ("a.dcf", ControllerFormat.DCF),
+        ("folder.xml/a.EDS", ControllerFormat.DCF),
+        ("a.json.20250102T030405Z.0123456789ab-0123456789ab.bak", ControllerFormat.JSON),
+        ("a.conf", ControllerFormat.YAML),
+    ],
+)
+def test_the_name_tells_the_format(name: str, kind: ControllerFormat) -> None:
+    assert format_of(name) is kind
+
+
+def test_the_configuration_may_tell_the_format_instead() -> None:
+    kinds: list[ControllerDocument] = [decode(b"<a/>", "a.cfg", ControllerFormat.XML), decode(b"a: 1", "a.cfg")]
+    assert [type(kind) for kind in kinds] == [XmlDocument, YamlDocument]
+
+
+def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
+    pipe, large, folder = tmp_path / "pipe.yaml", tmp_path / "large.yaml", tmp_path / "folder.yaml"
+    os.mkfifo(pipe)
+    folder.mkdir()
+    with large.open("wb") as stream:
+        stream.truncate(MAX_BYTES + 1)
+    for path, says in (
+        (pipe, "no regular file"),
+        (Path("/dev/zero"), "no regular file"),
+        (folder, "no regular file"),
+        (large, "more than 4 MiB"),
+        (tmp_path / "none", "no such file"),
+    ):
+        with pytest.raises(ControllerUnfit, match=says):
+            read_bytes(path)
+    link = tmp_path / "link.yaml"
+    link.symlink_to(tmp_path / "there.yaml")
+    (tmp_path / "there.yaml").write_bytes(b"a: 1\n")
+    assert read_bytes(link) == b"a: 1\n"

@@ -1,0 +1,591 @@
+"""Gains written into the objects of simulated drives: without power, read back, saved, all or none, and back again."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell import Cell
+from daq.config.controller import GainObject
+from daq.errors import BackupMissing, CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.ledger.audit import AuditAction, read, verify
+from daq.writeback.drive_proposal import DriveProposal, propose_to_drives
+from daq.writeback.drive_record import read_record, read_records, record_folder
+from daq.writeback.drive_target import DrivesWritten, apply_to_drives, roll_back_drives, way_back_of_drives
+from daq.writeback.gates.table import Gate
+from daq.writeback.request import Request
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.hub import Hub
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.parameters import Saving
+from drivers.canopen.pdo import CONTROLWORD
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import (
+    BusBusy,
+    DriverError,
+    IdentityMismatch,
+    ObjectAccessError,
+    ParametersMixed,
+    PowerNotOff,
+    ReadbackDiffers,
+    SaveRefused,
+)
+from drivers.profiles.profile import Mapping, ObjectEntry, Parameter, ParameterKind
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.node import NmtCommand, NmtState
+from ident.calibration import Calibration
+from tests.daq.calibrations import AXES, IDENTIFIED, NAMEPLATE, demo_calibration
+from tests.daq.drives import REAL, Listener, demo_cell, entered_gain, network_of, saved_gain, simulated
+
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+IN_DRIVES = pytest.approx(NAMEPLATE)
+NEW = pytest.approx(IDENTIFIED)
+
+
+@pytest.fixture
+def address(request: pytest.FixtureRequest) -> BusAddress:
+    return BusAddress("virtual", request.node.nodeid)
+
+
+@pytest.fixture
+def listener(address: BusAddress) -> Iterator[Listener]:
+    heard = Listener(address)
+    yield heard
+    heard.close()
+
+
+def _propose(
+    cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, looked_at: str | None = None
+) -> DriveProposal:
+    request = Request(calibration or demo_calibration(), NOW, configuration_changed=True, looked_at=looked_at)
+    return propose_to_drives(cell, request, network)
+
+
+def _write(
+    cell: Cell, address: BusAddress, saving: Saving = Saving.KNOWN, mapping: Mapping = Mapping.STORED
+) -> DrivesWritten:
+    """Look, and then write, each in a network of its own, as two commands do."""
+    with network_of(cell, address, mapping) as network:
+        proposal = _propose(cell, network)
+    assert proposal.refusals == ()
+    assert cell.history is not None
+    with network_of(cell, address, mapping) as network:
+        return apply_to_drives(proposal, network, NOW, saving=saving, audit=cell.history.audit, who="T")
+
+
+def _gains(simulation: SimulatedCell) -> list[float]:
+    return [entered_gain(node) for node in simulation.nodes]
+
+
+def _saved(simulation: SimulatedCell) -> list[float]:
+    return [saved_gain(node) for node in simulation.nodes]
+
+
+def test_gains_are_written_read_back_and_saved(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        before = [node.saved for node in simulation.nodes]
+        written = _write(cell, address)
+        assert [change.parameter.value(change.new) / 1000.0 for change in written.changes] == NEW
+        assert all(change.saved for change in written.changes)
+        assert _gains(simulation) == NEW
+        # A drive that loses its power comes back with what it saved: the gain, and the mapping of before.
+        for node in simulation.nodes:
+            node.command_nmt(NmtCommand.RESET_NODE, 0.0)
+        assert _gains(simulation) == NEW
+        assert [node.saved.pdos for node in simulation.nodes] == [stored.pdos for stored in before]
+    assert [node for node, *_ in listener.downloads()] == [1, 2, 3, 4, 5, 6] * 2
+
+
+def test_nothing_but_the_gain_and_the_save_is_ever_sent(
+    address: BusAddress, listener: Listener, tmp_path: Path
+) -> None:
+    """No controlword, no NMT, no SYNC, no PDO and no heartbeat: nothing can move."""
+    with simulated(address):
+        listener.frames()
+        _write(demo_cell(tmp_path), address)
+    heard = listener.frames()
+    ours = [frame for frame in heard if not 0x580 < frame.arbitration_id < 0x600 and frame.arbitration_id < 0x700]
+    assert {frame.arbitration_id for frame in ours} == set(range(0x601, 0x607))
+    written = {int.from_bytes(frame.data[1:3], "little") for frame in ours if frame.data[0] >> 5 == 1}
+    assert written == {0x2003, 0x1010}
+    assert CONTROLWORD.index not in written
+
+
+def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address), network_of(cell, address) as network:
+        proposal = _propose(cell, network)
+    assert listener.downloads() == []
+    assert list(tmp_path.iterdir()) == []
+    assert [change.old for change in proposal.changes] == IN_DRIVES
+    assert [change.new for change in proposal.changes] == NEW
+    assert proposal.changes[3].key == "node 4, 2003h:01"
+    assert not proposal.unchanged
+
+
+def test_a_real_object_and_another_sign_and_unit(address: BusAddress, tmp_path: Path) -> None:
+    negative = replace(REAL, factor=-0.5)
+    cell = demo_cell(tmp_path, *(negative if axis == "J4" else REAL for axis in AXES))
+    with simulated(address, entered=(*NAMEPLATE[:3], 5.76, *NAMEPLATE[4:])) as simulation:
+        written = _write(cell, address)
+        assert entered_gain(simulation.nodes[3], REAL) == pytest.approx(4.605, rel=1e-6)
+        assert entered_gain(simulation.nodes[0], REAL) == pytest.approx(33.9, rel=1e-6)
+    assert written.changes[0].parameter.kind is ParameterKind.F32
+
+
+def test_written_to_ram_alone_is_gone_with_the_power(address: BusAddress, tmp_path: Path) -> None:
+    with simulated(address) as simulation:
+        written = _write(demo_cell(tmp_path), address, Saving.RAM, Mapping.UNKNOWN)
+        assert not any(change.saved for change in written.changes)
+        assert _gains(simulation) == NEW
+        assert _saved(simulation) == IN_DRIVES
+        # What stands in RAM is no reason not to save it the next time.
+        assert all(change.saved for change in _write(demo_cell(tmp_path), address).changes)
+        assert _saved(simulation) == NEW
+
+
+@pytest.mark.parametrize("axis", [0, 4])
+def test_an_axis_with_power_is_refused_and_nothing_is_written(
+    address: BusAddress, listener: Listener, tmp_path: Path, axis: int
+) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        with network_of(cell, address) as network:
+            proposal = _propose(cell, network)
+            for command in (0x06, 0x07, 0x0F):
+                network.link.objects(axis + 1).write(CONTROLWORD, command)
+        listener.frames()
+        with (
+            network_of(cell, address) as network,
+            pytest.raises(PowerNotOff, match=rf"node {axis + 1}: OPERATION ENABLED"),
+        ):
+            apply_to_drives(proposal, network, NOW)
+        assert listener.downloads() == []
+        assert _gains(simulation) == IN_DRIVES
+    assert read_records(record_folder(cell)) == ()
+
+
+def test_power_that_comes_midway_ends_it_and_the_rest_is_put_back(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = demo_cell(tmp_path)
+
+    def enable_2(access: ObjectAccess) -> None:
+        if access.node_id == 2:
+            for command in (0x06, 0x07, 0x0F):
+                write(access, CONTROLWORD, command)
+
+    write = _after_gain(monkeypatch, enable_2)
+    with simulated(address) as simulation:
+        with pytest.raises(ParametersMixed, match=r"stand again in J1, and are NOT known to stand where J2: node 2"):
+            _write(cell, address)
+        assert _gains(simulation)[0] == pytest.approx(NAMEPLATE[0])
+        assert _gains(simulation)[1] == pytest.approx(IDENTIFIED[1])
+        assert _gains(simulation)[2:] == pytest.approx(NAMEPLATE[2:])
+        assert _saved(simulation) == IN_DRIVES
+
+
+Write = Callable[[ObjectAccess, ObjectEntry, int], None]
+
+
+def _after_gain(monkeypatch: pytest.MonkeyPatch, then: Callable[[ObjectAccess], None]) -> Write:
+    """Let something happen after each write of a gain; the write as it was."""
+    write = ObjectAccess.write
+
+    def written(access: ObjectAccess, entry: ObjectEntry, value: int) -> None:
+        write(access, entry, value)
+        if entry.index == 0x2003:
+            then(access)
+
+    monkeypatch.setattr(ObjectAccess, "write", written)
+    return write
+
+
+@pytest.mark.parametrize("kind", [FaultKind.REFUSES_WRITE, FaultKind.REFUSES_SAVE], ids=lambda kind: kind.value)
+def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
+    address: BusAddress, tmp_path: Path, kind: FaultKind
+) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address, FaultSpec(kind, 2)) as simulation:
+        with pytest.raises(ObjectAccessError, match=r"node 3: object (2003h:01|1010h:01): aborted") as caught:
+            _write(cell, address)
+        restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
+        assert caught.value.__notes__ == [f"kept: the old values stand again in {', '.join(restored)}"]
+        assert _gains(simulation) == IN_DRIVES
+        assert _saved(simulation) == IN_DRIVES
+
+
+def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+
+        def stop(access: ObjectAccess) -> None:
+            if access.node_id == 3:
+                simulation.nodes[2].nmt = NmtState.STOPPED
+
+        _after_gain(monkeypatch, stop)
+        with pytest.raises(ParametersMixed, match="node 3: object 2003h:01: the node does not answer") as caught:
+            _write(cell, address)
+        assert caught.value.restored == ("J1", "J2")
+        assert isinstance(caught.value.__cause__, ObjectAccessError)
+        assert _gains(simulation) == pytest.approx([*NAMEPLATE[:2], IDENTIFIED[2], *NAMEPLATE[3:]])
+        # It comes back, and the record leads back.
+        simulation.nodes[2].nmt = NmtState.OPERATIONAL
+        monkeypatch.undo()
+        with network_of(cell, address) as network:
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+        assert _gains(simulation) == IN_DRIVES
+        assert _saved(simulation) == IN_DRIVES
+
+
+@pytest.mark.parametrize("made", [False, True], ids=["aborted", "answer lost"])
+def test_whichever_transfer_fails_the_old_values_stand_everywhere(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: bool
+) -> None:
+    """Every SDO transfer of the path fails once, before it was made or after; only the whole way changes all."""
+    cell = demo_cell(tmp_path)
+    left = 0
+
+    def failing(transfer: Callable[..., int | None]) -> Callable[..., int | None]:
+        def tried(access: ObjectAccess, entry: ObjectEntry, *value: int) -> int | None:
+            nonlocal left
+            left -= 1
+            if left == 0 and not made:
+                raise ObjectAccessError(access.node_id, str(entry), "aborted", 0x08000020)
+            result = transfer(access, entry, *value)
+            if left == 0:
+                raise ObjectAccessError(access.node_id, str(entry), "no answer")
+            return result
+
+        return tried
+
+    with simulated(address) as simulation:
+        with network_of(cell, address) as network:
+            proposal = _propose(cell, network)
+        monkeypatch.setattr(ObjectAccess, "read", failing(ObjectAccess.read))
+        monkeypatch.setattr(ObjectAccess, "write", failing(ObjectAccess.write))
+        failed = 0
+        while True:
+            left = failed + 1
+            with network_of(cell, address) as network:
+                network.bounds = replace(network.bounds, listen_s=0.0)
+                try:
+                    apply_to_drives(proposal, network, NOW)
+                except DriverError:
+                    failed += 1
+                else:
+                    break
+            assert _gains(simulation) == IN_DRIVES
+            assert _saved(simulation) == IN_DRIVES
+        assert left > 0  # no transfer was left to fail
+        assert _gains(simulation) == NEW
+        assert _saved(simulation) == NEW
+    assert failed > 100
+
+
+@pytest.mark.parametrize("kind", [FaultKind.SECOND_MASTER, FaultKind.SDO_MASTER], ids=lambda kind: kind.value)
+def test_a_foreign_master_is_refused(address: BusAddress, tmp_path: Path, kind: FaultKind) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address, FaultSpec(kind, 1)) as simulation:
+        with network_of(cell, address) as network, pytest.raises(BusBusy):
+            _propose(cell, network)
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_a_foreign_master_that_comes_midway_ends_it(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = demo_cell(tmp_path)
+
+    def greet(access: ObjectAccess) -> None:
+        if access.node_id == 3:
+            with network_of(cell, address) as other:
+                other.link.objects(1).read(ObjectEntry(0x1000, 0, 32, signed=False))
+
+    _after_gain(monkeypatch, greet)
+    with simulated(address) as simulation:
+        with pytest.raises(BusBusy) as caught:
+            _write(cell, address)
+        assert "kept: the old values stand again in J1, J2, J3" in caught.value.__notes__
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_another_drive_is_refused(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    faulty = simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 5))
+    with faulty, network_of(cell, address) as network, pytest.raises(IdentityMismatch, match="node 6"):
+        _propose(cell, network)
+
+
+def test_a_drive_that_keeps_something_else_is_found(
+    address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = ObjectAccess.write
+    cell = demo_cell(tmp_path)
+
+    def rounding(access: ObjectAccess, entry: ObjectEntry, value: int) -> None:
+        rounds = entry.index == 0x2003 and access.node_id == 4 and value == 2**32 - 9210
+        write(access, entry, value + rounds)
+
+    monkeypatch.setattr(ObjectAccess, "write", rounding)
+    with simulated(address) as simulation:
+        with pytest.raises(ReadbackDiffers, match=r"reads back as -9209 .*written was -9210") as caught:
+            _write(cell, address)
+        assert caught.value.__notes__ == ["kept: the old values stand again in J1, J2, J3, J4"]
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        with network_of(cell, address) as network:
+            proposal = _propose(cell, network)
+        killed = network_of(cell, address)
+        killed.link.open()
+        killed.prepare()
+        killed.link.close()
+        for node in simulation.nodes:
+            node.lose_guard()  # the mapping alone must be enough
+        listener.frames()
+        with network_of(cell, address) as network, pytest.raises(SaveRefused, match="TPDO1: COB-ID 00000181h"):
+            apply_to_drives(proposal, network, NOW)
+        assert listener.downloads() == []
+        assert _saved(simulation) == IN_DRIVES
+        # Categories of their own do not keep the mapping, and RAM keeps nothing.
+        with network_of(cell, address, Mapping.SEPARATE) as network:
+            assert apply_to_drives(proposal, network, NOW).changes[0].saved
+        assert _gains(simulation) == NEW
+
+
+@pytest.mark.parametrize("recorder_id", [127, 126], ids=["usual", "127 was a device's"])
+def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
+    address: BusAddress, tmp_path: Path, recorder_id: int
+) -> None:
+    """Killed before the mapping was touched: 1016h would stop the axis for want of a recorder, for ever."""
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation, network_of(cell, address) as network:
+        proposal = _propose(cell, network)
+        consumer = ObjectEntry(0x1016, 1, 32, signed=False)
+        network.link.objects(2).write(consumer, recorder_id << 16 | 500)
+        with pytest.raises(SaveRefused, match=rf"node 2: .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"):
+            apply_to_drives(proposal, network, NOW)
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        with pytest.raises(SaveRefused, match=r"node 1: .*--ram-only.*--save-unknown"):
+            _write(cell, address, mapping=Mapping.UNKNOWN)
+        assert _gains(simulation) == IN_DRIVES
+        assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).changes)
+        assert _saved(simulation) == NEW
+
+
+def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation, network_of(cell, address) as network:
+        network.axes = tuple(replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes)
+        with pytest.raises(SaveRefused, match="is not described in its profile"):
+            apply_to_drives(_propose(cell, network), network, NOW, saving=Saving.ANY)
+        assert _gains(simulation) == IN_DRIVES
+
+
+def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    calibration = demo_calibration()
+    far = replace(calibration, gains=(replace(calibration.gains[0], value=60.0), *calibration.gains[1:]))
+    with simulated(address), network_of(cell, address) as network:
+        proposal = _propose(cell, network, far, looked_at="0" * 64)
+        assert [refusal.gate for refusal in proposal.refusals] == [Gate.BASE, Gate.CHANGE, Gate.NAMEPLATE]
+        looked = _propose(cell, network, looked_at=_propose(cell, network).base_sha256)
+        assert looked.refusals == ()
+        with pytest.raises(CalibrationRefused, match="3 closed gates"):
+            apply_to_drives(proposal, network, NOW, audit=tmp_path / "audit", who="T")
+        strange = replace(calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9")))
+        with pytest.raises(CalibrationRefused, match="one of each axis of the cell"):
+            _propose(cell, network, strange)
+        nowhere = replace(cell, controller=None)
+        with pytest.raises(ConfigurationInconsistent, match="no objects in the drives"):
+            _propose(nowhere, network)
+    assert listener.downloads() == []
+    assert [entry.action for entry in read(tmp_path / "audit")] == [AuditAction.REFUSED]
+
+
+@pytest.mark.parametrize(
+    ("told", "says"),
+    [
+        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1.0), "33.7 ± 0.14, which the number 34 does not tell"),
+        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e9), "does not fit i32"),
+        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e-3), "the number 0 does not tell"),
+        (GainObject(Parameter(0x2003, 1, ParameterKind.U32), -1.0), "does not fit u32"),
+    ],
+)
+def test_an_object_that_cannot_hold_the_gain_is_refused(
+    address: BusAddress, tmp_path: Path, told: GainObject, says: str
+) -> None:
+    calibration = demo_calibration()
+    gains = (replace(calibration.gains[0], value=33.7, std=0.135), *calibration.gains[1:])
+    cell = demo_cell(tmp_path, *(told,) * 6)
+    with simulated(address), network_of(cell, address) as network, pytest.raises(ControllerUnfit) as caught:
+        _propose(cell, network, replace(calibration, gains=gains))
+    assert says in str(caught.value)
+
+
+def test_a_drive_that_somebody_changed_since_the_dry_run_is_refused(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation, network_of(cell, address) as network:
+        proposal = _propose(cell, network)
+        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
+        with pytest.raises(ControllerChanged, match="look at a new dry run"):
+            apply_to_drives(proposal, network, NOW)
+        assert _gains(simulation)[4] == 18.0
+    assert read_records(record_folder(cell)) == ()
+
+
+def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    assert cell.history is not None
+    with simulated(address) as simulation:
+        written = _write(cell, address)
+        record = read_record(written.record)
+        assert [(note.axis, note.serial, note.old, note.new) for note in record.drives][:2] == [
+            ("J1", 1001, 32960, 33900),
+            ("J2", 1002, 32960, 32400),
+        ]
+        for minutes, expected, saved in ((1, IN_DRIVES, IN_DRIVES), (2, NEW, NEW), (2, IN_DRIVES, IN_DRIVES)):
+            with network_of(cell, address) as network:
+                roll_back_drives(
+                    way_back_of_drives(cell, network),
+                    network,
+                    NOW + timedelta(minutes=minutes),
+                    audit=cell.history.audit,
+                    who="T",
+                )
+            assert _gains(simulation) == expected
+            assert _saved(simulation) == saved
+    assert len(read_records(record_folder(cell))) == 4
+    actions = [entry.action for entry in read(cell.history.audit)]
+    assert (
+        actions
+        == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+        + [
+            AuditAction.ROLLBACK_BEGUN,
+            AuditAction.ROLLED_BACK,
+        ]
+        * 3
+    )
+    assert verify(cell.history.audit).open_writes == ()
+
+
+def test_a_way_back_that_would_lose_what_somebody_did_is_refused(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation, network_of(cell, address) as network:
+        with pytest.raises(BackupMissing, match="no record"):
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+        written = _write(cell, address)
+        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
+        with pytest.raises(ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"):
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
+        body = json.loads(written.record.read_text())
+        body["drives"][0]["old"] = 99999
+        written.record.write_text(json.dumps(body))
+        with pytest.raises(ControllerUnfit, match="as it says"):
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+        assert _gains(simulation) == NEW
+        written.record.write_text("{}")
+        with pytest.raises(ControllerUnfit, match="the record of a write to drives"):
+            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+
+
+def test_a_gain_that_somebody_entered_in_a_drive_is_looked_at_first(address: BusAddress, tmp_path: Path) -> None:
+    """The newest record says what drivegain left there: that, or what stood there before, is no surprise."""
+    cell = demo_cell(tmp_path)
+    entry = ObjectEntry(0x2003, 1, 32, signed=True)
+    with simulated(address), network_of(cell, address) as network:
+        first = _propose(cell, network)
+        assert first.refusals == ()  # no record: nothing to compare with
+        written = _write(cell, address)
+        for word in (16300, 18480):
+            network.link.objects(5).write(entry, word)
+            assert _propose(cell, network).refusals == ()
+        network.link.objects(5).write(entry, 18000)
+        changed = _propose(cell, network)
+        assert [(one.gate, one.subject, one.found) for one in changed.refusals] == [
+            (Gate.BASE, "J5, 2003h:01", "18000")
+        ]
+        assert "16300" in changed.refusals[0].expected
+        assert _propose(cell, network, looked_at=changed.base_sha256).refusals == ()
+        assert [one.gate for one in _propose(cell, network, looked_at=first.base_sha256).refusals] == [Gate.BASE]
+        network.link.objects(5).write(entry, 16300)
+        written.record.write_text("{}")
+        unread = _propose(cell, network)
+        assert [(one.gate, one.subject) for one in unread.refusals] == [(Gate.BASE, str(written.record))]
+        assert _propose(cell, network, looked_at=unread.base_sha256).refusals == ()
+
+
+def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address):
+        _write(cell, address)
+    new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
+    with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
+        with network_of(new, address) as network, pytest.raises(ControllerChanged, match="serial number 1002"):
+            roll_back_drives(way_back_of_drives(new, network), network, NOW)
+        assert _gains(simulation) == NEW
+
+
+@pytest.mark.parametrize("writes", [0, 1, 3, 6, 8])
+def test_after_a_kill_the_record_says_what_stood_there_and_leads_back(tmp_path: Path, writes: int) -> None:
+    """SIGKILL after so many writes, saves among them."""
+    cell = demo_cell(tmp_path)
+    assert cell.history is not None
+    with Hub(("can0",)) as hub, simulated(hub.address()) as simulation:
+        process = multiprocessing.get_context("spawn").Process(
+            target=_write_until_killed, args=(tmp_path, hub.address(), writes)
+        )
+        process.start()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
+        changed = min(writes, 6)
+        assert _gains(simulation) == pytest.approx([*IDENTIFIED[:changed], *NAMEPLATE[changed:]])
+        (path,) = read_records(record_folder(cell))
+        assert [note.parameter.value(note.old) / 1000.0 for note in read_record(path).drives] == IN_DRIVES
+        (left,) = verify(cell.history.audit).open_writes
+        assert left.begun.action is AuditAction.APPLY_BEGUN
+        with network_of(cell, hub.address()) as network:
+            if writes:
+                roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            else:
+                with pytest.raises(BackupMissing, match="1 records of what stands there now"):
+                    roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+        assert _gains(simulation) == IN_DRIVES
+        assert _saved(simulation) == IN_DRIVES
+
+
+def _write_until_killed(folder: Path, address: BusAddress, writes: int) -> None:
+    made = 0
+    write = ObjectAccess.write
+
+    def counted(access: ObjectAccess, entry: ObjectEntry, value: int) -> None:
+        nonlocal made
+        if made == writes:
+            os.kill(os.getpid(), signal.SIGKILL)
+        made += 1
+        write(access, entry, value)
+
+    ObjectAccess.write = counted  # type: ignore[method-assign, assignment]
+    _write(demo_cell(folder), address)

@@ -1,0 +1,588 @@
+"""Every gate closes for its own reason, and alone: one thing is broken of a calibration that passes all of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell import Cell
+from daq.config.cell_file import load_cell
+from daq.config.policy import AppliedBy, ApplyPolicy, ApplyPolicyModel, HoldOut
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
+from daq.files import sha256
+from daq.ledger.audit import AuditAction, read
+from daq.workflow.calibration_file import encode
+from daq.writeback.file_proposal import Proposal, apply, propose, propose_for, refused
+from daq.writeback.gates import fit as fit_gates
+from daq.writeback.gates.table import Gate
+from daq.writeback.request import Request
+from daq.writeback.signature import generate, sign
+from ident.calibration import Calibration, Gain, Source
+from ident.estimators.estimate import RelativeError
+from tests.daq.calibrations import AXES, KEYS, RECORDED, demo_calibration, demo_recording, recorded, with_recordings
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+DAY = timedelta(days=1)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """All that a proposal is made of; every gate is open."""
+
+    calibration: Calibration
+    cell: Cell
+    controller: Path
+    policy: ApplyPolicy
+    now: datetime
+    entered_kg: dict[str, float]
+    looked_at: str | None
+    appliers: tuple[str, ...]
+    file: Path | None
+    signed: tuple[str, ...]
+
+    def propose(self) -> Proposal:
+        """Sign, and work out the change."""
+        content = encode(self.calibration)
+        if self.file is not None:
+            self.file.write_bytes(content)
+            for name in self.signed:
+                sign(self.file, self.file.parent / f"{name}.key", name, at=NOW)
+        request = Request(
+            self.calibration,
+            self.now,
+            policy=self.policy,
+            entered_kg=self.entered_kg,
+            looked_at=self.looked_at,
+            appliers=self.appliers,
+            file=self.file,
+            content=content,
+        )
+        return propose_for(self.cell, request, self.controller)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    """A calibration of the demo cell that Ada applies and Bob has signed."""
+    controller = tmp_path / "demo.yaml"
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controller)
+    cell = load_cell(CONFIGS / "cells" / "demo.yaml")
+    keys = {name: generate(tmp_path, name)[1].line for name in ("Ada", "Bob")}
+    calibration = with_recordings(demo_calibration(), controller_sha256=sha256(controller.read_bytes()))
+    return Scene(
+        calibration=replace(
+            calibration, configuration_sha256=cell.digest, recording_configuration_sha256=cell.recording_digest
+        ),
+        cell=cell,
+        controller=controller,
+        policy=ApplyPolicy(signatures=1, signers=keys),
+        now=NOW,
+        entered_kg={},
+        looked_at=None,
+        appliers=("Ada", "root"),
+        file=tmp_path / "calibration.yaml",
+        signed=("Bob",),
+    )
+
+
+def _gain(axis: str, **changes: float) -> Callable[[Scene], Scene]:
+    def broken(scene: Scene) -> Scene:
+        gains = tuple(_changed(gain, changes) if gain.axis == axis else gain for gain in scene.calibration.gains)
+        return replace(scene, calibration=replace(scene.calibration, gains=gains))
+
+    return broken
+
+
+def _unit(axis: str, unit: str) -> Callable[[Scene], Scene]:
+    def broken(scene: Scene) -> Scene:
+        gains = (replace(gain, unit=unit) if gain.axis == axis else gain for gain in scene.calibration.gains)
+        return _calibration(gains=tuple(gains))(scene)
+
+    return broken
+
+
+def _changed(gain: Gain, changes: dict[str, float]) -> Gain:
+    return replace(gain, **changes)  # type: ignore[arg-type]  # fields by name
+
+
+def _nameplate(axis: str, nameplate: float) -> Callable[[Scene], Scene]:
+    """The cell's, and the calibration's with it."""
+
+    def broken(scene: Scene) -> Scene:
+        axes = (replace(one, nameplate_gain=nameplate) if one.name == axis else one for one in scene.cell.axes)
+        return _gain(axis, nameplate=nameplate)(replace(scene, cell=replace(scene.cell, axes=tuple(axes))))
+
+    return broken
+
+
+def _payload(**changes: object) -> Callable[[Scene], Scene]:
+    """Another disc in the cell file now, which somebody has looked at: every digest is right."""
+
+    def broken(scene: Scene) -> Scene:
+        payloads = (replace(one, **changes) for one in scene.cell.payloads)  # type: ignore[arg-type]
+        return replace(scene, cell=replace(scene.cell, payloads=tuple(payloads)))
+
+    return broken
+
+
+def _calibration(**changes: object) -> Callable[[Scene], Scene]:
+    return lambda scene: replace(scene, calibration=replace(scene.calibration, **changes))  # type: ignore[arg-type]
+
+
+def _logs(**changes: object) -> Callable[[Scene], Scene]:
+    return lambda scene: replace(scene, calibration=with_recordings(scene.calibration, **changes))
+
+
+def _source(index: int, **changes: object) -> Callable[[Scene], Scene]:
+    def broken(scene: Scene) -> Scene:
+        sources = list(scene.calibration.sources)
+        told = sources[index].recording
+        of_recording = {key: value for key, value in changes.items() if key in _RECORDING}
+        rest = {key: value for key, value in changes.items() if key not in _RECORDING}
+        if told is not None and of_recording:
+            rest["recording"] = replace(told, **of_recording)  # type: ignore[arg-type]
+        sources[index] = replace(sources[index], **rest)  # type: ignore[arg-type]
+        return replace(scene, calibration=replace(scene.calibration, sources=tuple(sources)))
+
+    return broken
+
+
+_RECORDING = set(type(demo_recording()).__slots__)
+
+
+def _only(*indices: int) -> Callable[[Scene], Scene]:
+    """Some of the logs; what is said of a hold-out goes with its log."""
+
+    def broken(scene: Scene) -> Scene:
+        sources = tuple(scene.calibration.sources[index] for index in indices)
+        gone = {} if 2 in indices else {"holdout_error_percent": None, "nameplate_holdout_error_percent": None}
+        return _calibration(sources=sources, **gone)(scene)
+
+    return broken
+
+
+def _scene(**changes: object) -> Callable[[Scene], Scene]:
+    return lambda scene: replace(scene, **changes)  # type: ignore[arg-type]
+
+
+def _effect(scene: Scene) -> Scene:
+    worse = replace(scene.calibration.effects[0], error_after_percent=6.1)
+    return _calibration(effects=(worse,))(scene)
+
+
+def _edited(scene: Scene) -> Scene:
+    scene.controller.write_text(scene.controller.read_text() + "# seen by K.\n")
+    return scene
+
+
+def _edited_before_the_dry_run(scene: Scene) -> Scene:
+    return replace(_edited(scene), looked_at="0" * 64)
+
+
+def _forged(scene: Scene) -> Scene:
+    """Bob has signed another file of that name."""
+    assert scene.file is not None
+    scene.file.write_bytes(b"another calibration")
+    sign(scene.file, scene.file.parent / "Bob.key", "Bob", at=NOW)
+    return replace(scene, signed=())
+
+
+def _another_serial_now(scene: Scene) -> Scene:
+    axes = list(scene.cell.axes)
+    assert axes[3].identity is not None
+    axes[3] = replace(axes[3], identity=replace(axes[3].identity, serial=4711))
+    return replace(scene, cell=replace(scene.cell, axes=tuple(axes)))
+
+
+NO_SERIALS: Callable[[Scene], Scene] = lambda scene: replace(  # noqa: E731
+    scene,
+    cell=replace(
+        scene.cell,
+        axes=tuple(
+            replace(a, identity=None if a.identity is None else replace(a.identity, serial=None))
+            for a in scene.cell.axes
+        ),
+    ),
+)
+
+
+def _wanted(scene: Scene) -> Scene:
+    """The cell wants a hold-out."""
+    return replace(scene, policy=replace(scene.policy, holdout=HoldOut.REQUIRED))
+
+
+def _bounded(scene: Scene, **axes: float) -> Scene:
+    return replace(scene, policy=replace(scene.policy, max_change=axes))
+
+
+def _both(*steps: Callable[[Scene], Scene]) -> Callable[[Scene], Scene]:
+    def broken(scene: Scene) -> Scene:
+        for step in steps:
+            scene = step(scene)
+        return scene
+
+    return broken
+
+
+def _doubled(scene: Scene) -> Scene:
+    """The loaded log once more."""
+    return _calibration(sources=(*scene.calibration.sources, scene.calibration.sources[1]))(scene)
+
+
+def _bare(scene: Scene) -> Scene:
+    """Nothing was mounted, ever."""
+    return _both(*(_source(index, payload=None, mass_kg=None, entered_kg=None) for index in (1, 2)))(scene)
+
+
+HELD = (3.2, 2.9, 3.5, 4.1, 5.6, 5.0)
+
+CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
+    (Gate.CHANGE, "J2", _gain("J2", value=32.96 * 1.36)),
+    (Gate.CHANGE, "J2", _gain("J2", value=32.96 * 0.64)),
+    (Gate.CHANGE, "J4", lambda scene: _bounded(scene, J4=2.3)),
+    (Gate.NAMEPLATE, "J5", _nameplate("J5", 10.5)),
+    (Gate.SIGN, "J4", _gain("J4", value=9.21)),
+    (Gate.SIGN, "J1", _nameplate("J1", -32.96)),
+    (Gate.UNCERTAINTY, "J6", _gain("J6", std=0.031 * 6.79)),
+    (Gate.NOT_IDENTIFIED, "J6", _gain("J6", std=0.0)),
+    (Gate.NOT_FINITE, "J6", _gain("J6", std=-0.1)),
+    (Gate.NOT_FINITE, "J3", _gain("J3", value=math.nan)),
+    (Gate.NOT_FINITE, "J3", _gain("J3", value=math.inf)),
+    (Gate.NOT_FINITE, "J3", _gain("J3", value=0.0)),
+    (Gate.NOT_FINITE, "J3", _gain("J3", std=math.nan)),
+    (Gate.NOT_FINITE, "J3", _gain("J3", nameplate=math.nan)),
+    (Gate.NOT_FINITE, "calibration", _calibration(holdout_error_percent=RelativeError((1.0,), math.nan))),
+    (Gate.NOT_FINITE, "calibration", _calibration(relative_error_percent=RelativeError((math.nan,), 3.0))),
+    (Gate.NOT_FINITE, "calibration", _calibration(relative_error_percent=RelativeError((*HELD[:5], -1.0), 3.0))),
+    (Gate.NOT_FINITE, "calibration", _calibration(holdout_error_percent=RelativeError(HELD, -3.0))),
+    (Gate.NAMEPLATE, "J5", _gain("J5", nameplate=17.0)),
+    (Gate.UNIT, "J5", _unit("J5", "mNm/A")),
+    (Gate.CELL, "calibration", _calibration(cell="other")),
+    (Gate.CONFIGURATION, "calibration", _calibration(recording_configuration_sha256="e" * 64)),
+    (
+        Gate.CONFIGURATION,
+        "calibration",
+        _calibration(configuration_sha256="e" * 64, recording_configuration_sha256=None),
+    ),
+    (
+        Gate.ERROR,
+        "calibration",
+        _calibration(
+            holdout_error_percent=RelativeError((26.0,) * 6, 26.0),
+            nameplate_holdout_error_percent=RelativeError((30.0,) * 6, 30.0),
+        ),
+    ),
+    (
+        Gate.ERROR,
+        "calibration",
+        _both(_only(0, 1), _calibration(relative_error_percent=RelativeError((26.0,) * 6, 26.0))),
+    ),
+    (
+        Gate.ERROR,
+        "J6",
+        _calibration(
+            holdout_error_percent=RelativeError((*HELD[:5], 51.0), 3.3),
+            nameplate_holdout_error_percent=RelativeError((*HELD[:5], 60.0), 4.3),
+        ),
+    ),
+    (
+        Gate.ERROR,
+        "J6",
+        _both(_only(0, 1), _calibration(relative_error_percent=RelativeError((*HELD[:5], 51.0), 3.3))),
+    ),
+    (Gate.ERROR, "calibration", _calibration(holdout_error_percent=RelativeError(HELD[:5], 3.3))),
+    (Gate.ERROR, "calibration", _calibration(holdout_error_percent=RelativeError((), 3.3))),
+    (Gate.ERROR, "calibration", _calibration(relative_error_percent=RelativeError((), 3.3))),
+    (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.25))),
+    (
+        Gate.HOLDOUT,
+        "J4",
+        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], 4.1 / 1.021, *HELD[4:]), 4.3)),
+    ),
+    (
+        Gate.HOLDOUT,
+        "J4",
+        _calibration(nameplate_holdout_error_percent=RelativeError((*HELD[:3], math.nan, *HELD[4:]), 4.3)),
+    ),
+    (Gate.HOLDOUT, "J6", _calibration(nameplate_holdout_error_percent=RelativeError(HELD[:5], 4.3))),
+    (Gate.HOLDOUT, "calibration", _both(_wanted, _only(0, 1))),
+    (Gate.HOLDOUT, "calibration", _calibration(nameplate_holdout_error_percent=None)),
+    (Gate.HOLDOUT, "calibration", _calibration(holdout_error_percent=None)),
+    (Gate.HOLDOUT, "calibration", lambda scene: _calibration(sources=scene.calibration.sources[:2])(scene)),
+    (
+        Gate.HOLDOUT_STILL,
+        "J2",
+        _calibration(holdout_error_percent=RelativeError((3.2, math.nan, 3.5, 4.1, 5.6, 5.0), 3.3)),
+    ),
+    (Gate.EFFECT, "effect load-friction on J3", _effect),
+    (Gate.SOURCES, "calibration", _calibration(sources=())),
+    (Gate.SOURCES, "log loaded", _source(1, sha256="")),
+    (Gate.SOURCES, "log run.mcap.part", _source(0, name="run.mcap.part")),
+    (Gate.SOURCES, "log unused", _source(2, recording=None)),
+    (Gate.SOURCES, "log loaded", _source(1, serials=())),
+    (Gate.SOURCES, "log loaded", _source(1, serials=tuple(range(1001, 1006)))),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=())),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0,) * 7)),
+    (Gate.SOURCES, "log loaded", _source(1, missing=())),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0, 0.0, -0.1, 0.0, 0.0, 0.0))),
+    (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0))),
+    (Gate.SOURCES, "log unused", _source(2, sha256="b" * 64)),
+    (Gate.SOURCES, "log loaded", _source(1, sha256="a" * 64)),
+    (Gate.SOURCES, "log other", _both(_doubled, _source(3, name="other", sha256="e" * 64, role="train"))),
+    (Gate.SOURCES, "calibration", _both(_bare, _only(0, 1))),
+    (Gate.SOURCES, "calibration", _only(1)),
+    (Gate.SOURCES, "calibration", _only(2)),
+    (Gate.PARTIAL, "log loaded", _source(1, partial=True)),
+    (Gate.PARTIAL, "log loaded", _source(1, partial=True, missing=(0, 3, 0, 0, 0, 0))),
+    (Gate.LOSSY, "log loaded", _source(1, lost_cycles=1)),
+    (Gate.LOSSY, "log unused", _source(2, missing=(0, 3, 0, 0, 0, 0))),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=(NOW + 1.1 * DAY).timestamp())),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=None)),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=1e300)),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=-1e13)),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=math.inf)),
+    (Gate.STALE, "log unloaded", _source(0, recorded_s=math.nan)),
+    (Gate.SERIAL, "axis J4", _another_serial_now),
+    (Gate.SERIAL, "log loaded, axis J4", _source(1, serials=(1001, 1002, 1003, None, 1005, 1006))),
+    (Gate.SERIAL, "axis J4", _both(NO_SERIALS, _source(1, serials=(1001, 1002, 1003, 9, 1005, 1006)))),
+    (Gate.SATURATED, "log loaded, axis J3", _source(1, saturated_percent=(0.0, 0.0, 2.1, 0.0, 0.0, 0.0))),
+    (Gate.MASS, "log loaded, payload disc", _source(1, entered_kg=None)),
+    (Gate.MASS, "log loaded, payload disc", _source(1, entered_kg=4.596)),
+    (Gate.MASS, "log loaded, payload disc", _source(1, mass_kg=None)),
+    (Gate.MASS, "payload disc", _scene(entered_kg={"disc": 4.58})),
+    (Gate.MASS, "log unloaded", _source(0, mass_kg=4.59)),
+    (Gate.MASS, "log unused", _source(2, payload=None)),
+    (Gate.MASS, "payload disc", _payload(mass_kg=4.60)),
+    (Gate.MASS, "payload disc", _payload(name="other disc")),
+    (Gate.BASE, "demo.yaml", _edited),
+    (Gate.BASE, "demo.yaml", _edited_before_the_dry_run),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(signed=())),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Ada",))),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(appliers=("Ada", "bob"))),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Ada",), appliers=("ADA ", "root"))),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Ada",), appliers=("\uff21da", "root"))),
+    (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Bob",), appliers=("Ada", " bob"))),
+    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ad\u0430", "root"))),
+    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ada\u200b", "root"))),
+    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ada\x1b[2K", "root"))),
+    (Gate.SIGNATURE, "whoever", _scene(appliers=("", "root"))),
+    (Gate.SIGNATURE, "whoever", _scene(appliers=("Carl", "root"))),
+    (Gate.SIGNATURE, "calibration", _scene(file=None)),
+    (Gate.SIGNATURE, "calibration.yaml.Bob.minisig", _forged),
+)
+
+
+def test_a_calibration_that_is_fine_goes_through(scene: Scene) -> None:
+    proposal = scene.propose()
+    assert proposal.refusals == ()
+    assert apply(proposal, NOW) is not None
+
+
+@pytest.mark.parametrize(("gate", "subject", "broken"), CLOSED)
+def test_each_gate_closes_alone(
+    scene: Scene, tmp_path: Path, gate: Gate, subject: str, broken: Callable[[Scene], Scene]
+) -> None:
+    scene = broken(scene)
+    before = scene.controller.read_bytes()
+    proposal = scene.propose()
+    assert {refusal.gate for refusal in proposal.refusals} == {gate}
+    assert all(subject in refusal.subject for refusal in proposal.refusals)
+    audit = tmp_path / "audit.jsonl"
+    with pytest.raises(CalibrationRefused) as caught:
+        apply(proposal, NOW, audit=audit, who="Ada")
+    assert exit_code(type(caught.value)) == 3
+    for refusal in proposal.refusals:
+        assert refusal.found in str(caught.value)
+        assert refusal.remedy
+    assert scene.controller.read_bytes() == before
+    assert not list(tmp_path.glob("*.bak"))
+    (entry,) = read(audit)
+    assert (entry.action, entry.who, entry.subject) == (AuditAction.REFUSED, "Ada", str(scene.controller))
+    told = entry.details["refusals"]
+    assert isinstance(told, list)
+    assert [one["gate"] for one in told] == [gate.value] * len(proposal.refusals)
+
+
+def test_every_gate_has_such_a_test() -> None:
+    assert {gate for gate, _, _ in CLOSED} == set(Gate)
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        _gain("J2", value=32.96 * 1.349),
+        _gain("J2", value=32.96 * 0.651),
+        _nameplate("J5", 11.0),
+        _gain("J6", std=0.0299 * 6.79),
+        _only(0, 1),
+        _calibration(nameplate_holdout_error_percent=RelativeError(HELD, 3.3 / fit_gates.NOISE)),
+        _calibration(
+            nameplate_holdout_error_percent=RelativeError(tuple(axis / fit_gates.AXIS_NOISE for axis in HELD), 3.3)
+        ),
+        _calibration(
+            holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
+            nameplate_holdout_error_percent=RelativeError((*HELD[:5], 49.9), 3.3),
+        ),
+        _calibration(effects=()),
+        _source(0, recorded_s=(NOW - 29.9 * DAY).timestamp()),
+        _source(0, recorded_s=(NOW + 0.9 * DAY).timestamp()),
+        _logs(saturated_percent=(2.0,) * 6),
+        _logs(controller_sha256=None),
+        _source(1, entered_kg=4.595),
+        _both(_source(1, entered_kg=None), _source(2, entered_kg=None), _scene(entered_kg={"disc": 4.585})),
+        _both(NO_SERIALS, _logs(serials=(None,) * 6)),
+        _wanted,
+        lambda scene: _bounded(scene, J4=2.32, J1=0.95),
+        _calibration(configuration_sha256="e" * 64),
+        _calibration(recording_configuration_sha256=None),
+        _scene(appliers=("root",)),
+        _scene(appliers=("Root", "root")),
+        _scene(appliers=()),
+        _scene(policy=ApplyPolicy(), signed=(), file=None, appliers=("Carl", "root")),
+        _payload(mass_kg=4.594),
+        _scene(policy=ApplyPolicy(), signed=(), file=None),
+        _scene(policy=ApplyPolicy(max_age_days=None), now=NOW + 3000 * DAY),
+        _both(_logs(recorded_s=None), _scene(policy=ApplyPolicy(max_age_days=None))),
+    ],
+)
+def test_just_inside_its_bound_a_gate_is_open(scene: Scene, kept: Callable[[Scene], Scene]) -> None:
+    assert kept(scene).propose().refusals == ()
+
+
+def test_whoever_has_looked_at_a_changed_file_may_go_on(scene: Scene) -> None:
+    scene = _edited(scene)
+    (refusal,) = scene.propose().refusals
+    digest = sha256(scene.controller.read_bytes())
+    # In full: this dry run, with a gate closed, ends without the line that a write would need.
+    assert (refusal.gate, refusal.remedy.endswith(f"--base {digest}")) == (Gate.BASE, True)
+    assert replace(scene, looked_at=sha256(scene.controller.read_bytes())).propose().refusals == ()
+
+
+def test_the_policy_moves_the_bounds(scene: Scene) -> None:
+    tight = ApplyPolicy(
+        max_change_percent=5.0,
+        max_nameplate_percent=15.0,
+        max_std_percent=0.3,
+        max_saturated_percent=1.0,
+        max_age_days=0.01,
+    )
+    gates = [(refusal.gate, refusal.subject) for refusal in replace(scene, policy=tight).propose().refusals]
+    assert [axis for gate, axis in gates if gate is Gate.CHANGE] == ["J3", "J4", "J5", "J6"]
+    assert [axis for gate, axis in gates if gate is Gate.NAMEPLATE] == ["J4"]
+    assert [axis for gate, axis in gates if gate is Gate.UNCERTAINTY] == list(AXES)
+    assert len([axis for gate, axis in gates if gate is Gate.SATURATED]) == 3
+    assert len([axis for gate, axis in gates if gate is Gate.STALE]) == 3
+
+
+@pytest.mark.parametrize(
+    ("told", "wanted"),
+    [
+        ({}, HoldOut.OPTIONAL),
+        ({"holdout": "required"}, HoldOut.REQUIRED),
+        ({"by": "job"}, HoldOut.REQUIRED),
+        ({"by": "job", "holdout": "required"}, HoldOut.REQUIRED),
+    ],
+)
+def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: HoldOut) -> None:
+    policy = ApplyPolicyModel.model_validate_json(json.dumps(told)).policy
+    assert (policy.holdout, policy.by) == (wanted, AppliedBy(told.get("by", "person")))
+    with pytest.raises(ValueError, match="holdout: required"):
+        ApplyPolicyModel.model_validate_json('{"by": "job", "holdout": "optional"}')
+
+
+def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path: Path) -> None:
+    cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
+    text = cell.read_text()
+    assert "policy:" not in text
+    cell.write_text(text + "policy: {apply: {max_change: {J4: 2.0}}}\n")
+    assert load_cell(cell).apply.max_change == {"J4": 2.0}
+    cell.write_text(text + "policy:\n  apply:\n    max_change:\n      j4: 2.0\n")
+    line = len(cell.read_text().splitlines())
+    with pytest.raises(ConfigurationInconsistent, match=rf":{line}: policy\.apply\.max_change\.j4: found axis 'j4'"):
+        load_cell(cell)
+
+
+def test_an_age_below_a_day_is_told_in_hours(scene: Scene) -> None:
+    """2025-01-02 02:00 is an hour and four minutes ago."""
+    hour = replace(scene, policy=ApplyPolicy(max_age_days=1 / 24))
+    told = {(one.found, one.expected) for one in hour.propose().refusals}
+    assert told == {("recorded 1.1 hours ago", "recorded within the last 1 hours")}
+    days = _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())(replace(scene, policy=ApplyPolicy()))
+    assert [(one.found, one.expected) for one in days.propose().refusals] == [
+        ("recorded 30.1 days ago", "recorded within the last 30 days")
+    ]
+
+
+def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
+    cell = _payload(mass_kg=5.0)(scene).cell
+    request = Request(scene.calibration, NOW, policy=ApplyPolicy(), configuration_changed=True)
+    proposal = propose_for(cell, request, scene.controller)
+    assert {(one.gate, one.found) for one in proposal.refusals} == {(Gate.MASS, "fitted with 4.59 kg")}
+
+
+def test_two_names_of_one_signer_are_one_person(scene: Scene, tmp_path: Path) -> None:
+    again = generate(tmp_path, "ADA")[1].line
+    two = replace(scene.policy, signatures=2, signers={**scene.policy.signers, "ADA": again})
+    twice = replace(scene, policy=two, signed=("Ada", "ADA"), appliers=("root",))
+    assert [one.gate for one in twice.propose().refusals] == [Gate.SIGNATURE]
+
+
+def test_a_signer_s_key_that_is_none_is_refused_with_file_line_and_key(tmp_path: Path, scene: Scene) -> None:
+    cell = shutil.copytree(CONFIGS, tmp_path / "configs") / "cells" / "demo.yaml"
+    text = cell.read_text()
+    line = len(text.splitlines()) + 4
+    head = text + "policy:\n  apply:\n    signers:\n"
+    cell.write_text(f"{head}      Ada: RWQnonsense\n")
+    with pytest.raises(ConfigurationInconsistent, match=rf"demo\.yaml:{line}: policy\.apply\.signers\.Ada: found"):
+        load_cell(cell)
+    key = scene.policy.signers["Ada"]
+    cell.write_text(f"{head}      Ada: {key}\n      Bob: {key}\n")
+    with pytest.raises(ConfigurationInconsistent, match=rf":{line + 1}: policy\.apply\.signers\.Bob: .*key of Ada"):
+        load_cell(cell)
+    cell.write_text(f"{head}      Ada: {key}\n")
+    assert load_cell(cell).apply.signers == {"Ada": key}
+
+
+def test_two_signatures_of_others_are_two(scene: Scene) -> None:
+    two = replace(scene, policy=replace(scene.policy, signatures=2))
+    assert [refusal.gate for refusal in replace(two, signed=("Ada", "Bob")).propose().refusals] == [Gate.SIGNATURE]
+    assert replace(two, signed=("Ada", "Bob"), appliers=("the job",)).propose().refusals == ()
+
+
+def test_all_closed_gates_are_told_at_once(scene: Scene) -> None:
+    other = replace(scene, policy=ApplyPolicy(max_change_percent=5.0))
+    error = refused(_calibration(cell="other")(other).propose())
+    assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [True] * 5 + [False]
+
+
+def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
+    scene.controller.write_text(scene.controller.read_text().replace("7.68", "0.0"))
+    looked = replace(scene, looked_at=sha256(scene.controller.read_bytes()))
+    assert [(one.gate, one.subject) for one in looked.propose().refusals] == [(Gate.SIGN, "J6")]
+
+
+def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
+    skew = replace(scene.calibration.effects[0], name="time-skew", axis="all axes", error_after_percent=9.0)
+    (refusal,) = _calibration(effects=(skew,))(scene).propose().refusals
+    assert refusal.subject == "effect time-skew on all axes"
+
+
+def test_a_library_that_tells_no_circumstances_is_not_asked_for_them(scene: Scene) -> None:
+    old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
+    assert propose(Request(old, NOW), scene.controller, KEYS, cell="demo").refusals == ()
+    assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {Gate.SOURCES, Gate.HOLDOUT}
+
+
+def test_the_demo_calibration_is_of_the_day_it_says() -> None:
+    assert all(
+        source.recording is not None and source.recording.recorded_s == (RECORDED + DAY).timestamp()
+        for source in recorded(demo_calibration(), RECORDED + DAY).sources
+    )

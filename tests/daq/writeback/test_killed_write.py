@@ -1,0 +1,219 @@
+"""Kill -9 at every system call of the write path: the old file or the new one, whole, and the audit tells which."""
+
+from __future__ import annotations
+
+import gc
+import os
+import re
+import stat
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from daq.ledger.audit import AuditAction, AuditVerdict, Content, verify
+from daq.writeback.file_access import backups
+from daq.writeback.file_proposal import apply, propose
+from daq.writeback.file_target import roll_back
+from daq.writeback.formats.document import decode
+from daq.writeback.request import Request
+from ident.calibration import Calibration
+from ident.estimators.estimate import RelativeError
+from tests.daq import killing
+from tests.daq.calibrations import demo_calibration
+from tests.daq.killing import killed_at
+
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n"
+KEYS = {"J1": "drives.J1.gain"}
+FEWEST_CALLS = 50
+LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
+"""What may lie about: the files themselves, whole backups, the lock that nobody holds, and unfinished copies."""
+
+
+def _calibration(gain: float) -> Calibration:
+    calibration = demo_calibration()
+    return replace(
+        calibration,
+        gains=(replace(calibration.gains[0], value=gain, std=0.1),),
+        relative_error_percent=RelativeError((3.1,), 3.1),
+        holdout_error_percent=RelativeError((3.2,), 3.2),
+        nameplate_holdout_error_percent=RelativeError((4.2,), 4.2),
+    )
+
+
+@dataclass(frozen=True)
+class Place:
+    """A controller's file with its audit, as a writer finds it."""
+
+    folder: Path
+
+    @property
+    def file(self) -> Path:
+        return self.folder / "x.yaml"
+
+    @property
+    def audit(self) -> Path:
+        return self.folder / "audit.jsonl"
+
+    def apply(self, gain: float, minutes: int = 0) -> None:
+        """Write a gain."""
+        proposal = propose(Request(_calibration(gain), NOW), self.file, KEYS, cell="demo")
+        assert proposal.refusals == ()
+        apply(proposal, NOW + timedelta(minutes=minutes), audit=self.audit, who="Ada")
+
+    def to_apply(self) -> Callable[[], object]:
+        """The write itself, everything before it done: another gain goes in."""
+        proposal = propose(Request(_calibration(33.9), NOW), self.file, KEYS, cell="demo")
+        return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
+
+    def to_roll_back(self) -> Callable[[], object]:
+        """The way back from a write before."""
+        return lambda: roll_back(self.file, NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
+
+    def content(self) -> bytes | None:
+        """Of the file; None where it is gone."""
+        return self.file.read_bytes() if self.file.exists() else None
+
+    def kinds_left(self) -> set[str]:
+        """Endings of what lies about; nothing else does."""
+        names = [path.name for path in self.folder.iterdir()]
+        assert [name for name in names if not LEFT.fullmatch(name)] == []
+        return {name.rpartition(".")[2] for name in names}
+
+
+def _unflushed(_descriptor: int) -> None:
+    """For what comes before the kill and after it: a kill is no power cut, and flushing takes most of the time."""
+
+
+def _fresh(folder: Path) -> Place:
+    """Nobody has written there yet, and there is no audit."""
+    folder.mkdir()
+    place = Place(folder)
+    place.file.write_bytes(OLD)
+    place.file.chmod(0o640)
+    return place
+
+
+def _written_once(folder: Path) -> Place:
+    place = _fresh(folder)
+    place.apply(32.4)
+    return place
+
+
+def _deleted(folder: Path) -> Place:
+    place = _written_once(folder)
+    place.file.unlink()
+    return place
+
+
+def _told(verdict: AuditVerdict) -> Content:
+    """Which of the two the audit says the file is, after the one write that was killed."""
+    # Before it, nothing or one finished write.
+    if verdict.open_writes:
+        assert len(verdict.open_writes) == 1
+        return verdict.open_writes[0].content
+    last = verdict.entries[-1].action if verdict.entries else None
+    begun = [
+        entry for entry in verdict.entries if entry.action in {AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN}
+    ]
+    ended = {AuditAction.APPLIED, AuditAction.ROLLED_BACK}
+    return (
+        Content.AFTER if last in ended and begun[-1].at == (NOW + timedelta(minutes=1)).isoformat() else Content.BEFORE
+    )
+
+
+@pytest.mark.parametrize(
+    ("prepare", "work"),
+    [
+        pytest.param(_fresh, Place.to_apply, id="apply, first of all"),
+        pytest.param(_written_once, Place.to_apply, id="apply, once more"),
+        pytest.param(_written_once, Place.to_roll_back, id="rollback"),
+        pytest.param(_deleted, Place.to_roll_back, id="rollback of a file that was deleted"),
+    ],
+)
+def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_which(
+    tmp_path: Path,
+    prepare: Callable[[Path], Place],
+    work: Callable[[Place], Callable[[], object]],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = prepare(tmp_path / "model")
+    before = model.content()
+    work(model)()
+    after = model.content()
+    assert before != after
+    outcomes: Counter[Content] = Counter()
+    left: set[str] = set()
+    number = 0
+    gc.disable()  # of the child: when it collects is not part of the path
+    try:
+        while True:
+            number += 1
+            with monkeypatch.context() as patch:
+                patch.setattr(os, "fsync", _unflushed)
+                place = prepare(tmp_path / str(number))
+            killed = killed_at(number, work(place))
+            outcomes[_check(place, before, after)] += 1
+            left |= place.kinds_left()
+            with monkeypatch.context() as patch:
+                patch.setattr(os, "fsync", _unflushed)
+                _check_next_write(place, before, after)
+            if not killed:
+                break
+    finally:
+        gc.enable()
+    with capsys.disabled():
+        told = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
+        print(f"\n  killed at each of {number - 1} system calls: {told}; left behind: {', '.join(sorted(left))}")  # noqa: T201
+    assert number > FEWEST_CALLS
+    assert set(outcomes) == {Content.BEFORE, Content.AFTER}
+    # Otherwise nobody was killed half-way.
+    assert {"lock", "tmp"} <= left
+
+
+@pytest.mark.parametrize(("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
+def test_where_ptrace_is_not_permitted_it_is_skipped_by_people_and_fails_in_ci(
+    monkeypatch: pytest.MonkeyPatch, ci: str, ends: type[BaseException]
+) -> None:
+    monkeypatch.setenv("CI", ci)
+    monkeypatch.setattr(killing, "_ptrace", lambda *_: -1)
+    with pytest.raises(ends, match="ptrace is not permitted"):
+        killing.killed_at(1, lambda: None)
+
+
+def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
+    """Whole, with its mode, and known by the audit; gone only where it was."""
+    content = place.content()
+    assert content in {before, after}
+    if content is not None:
+        decode(content, "x.yaml").locate(tuple(KEYS.values()))
+        assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
+    verdict = verify(place.audit)
+    assert verdict.holds
+    told = _told(verdict)
+    assert told is (Content.BEFORE if content == before else Content.AFTER)
+    for backup in backups(place.file):
+        backup.content()  # each is what its name says
+    return told
+
+
+def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -> None:
+    """Whoever comes next is not hindered, and the audit still tells what the killed one has done."""
+    was = place.content()
+    told = [one.content for one in verify(place.audit).open_writes]
+    if was is None:
+        assert roll_back(place.file, NOW + timedelta(minutes=2), audit=place.audit).after == after
+        assert [one.content for one in verify(place.audit).open_writes] == told
+        return
+    place.apply(31.5, minutes=2)
+    assert b"31.5" in place.file.read_bytes()
+    verdict = verify(place.audit)
+    assert verdict.holds
+    assert [one.content for one in verdict.open_writes] == told
+    assert roll_back(place.file, NOW + timedelta(minutes=3), audit=place.audit).after == was
+    assert place.file.read_bytes() in {before, after}

@@ -1,0 +1,72 @@
+"""What --base says: the change that somebody has looked at, of a file or of the drives, and no other."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daq.config.cell import Cell
+from daq.errors import CalibrationRefused, UsageError
+from daq.writeback.request import LookedAt, change_of, look, other_change
+from drivers.canopen.bus import BusAddress
+from drivers.simulation.cell import SimulatedCell
+from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
+from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simulated
+
+
+@given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
+def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
+    looked = look(f" {change_of(before, after).upper()}\n", before)
+    assert looked.base_sha256 == hashlib.sha256(before).hexdigest()
+    assert other_change(looked, "x", before, after) == ()
+    assert bool(other_change(looked, "x", before, another)) == (another != after)
+    assert (look(change_of(another, after), before).base_sha256 == looked.base_sha256) == (another == before)
+
+
+def test_the_whole_digest_alone_names_no_change() -> None:
+    digest = hashlib.sha256(b"old").hexdigest()
+    looked = look(digest, b"old")
+    assert looked == LookedAt(digest, None)
+    assert other_change(looked, "x", b"old", b"whatever") == ()
+    assert look(None, b"old") == LookedAt(None, None)
+
+
+@pytest.mark.parametrize("told", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
+def test_what_is_no_digest_is_refused(told: str) -> None:
+    with pytest.raises(UsageError, match="12 digits, a hyphen, 12 digits"):
+        look(told, b"old")
+
+
+@pytest.fixture
+def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
+    return on_its_own_bus(tmp_path, request.node.name)
+
+
+@pytest.fixture
+def simulation(cell: Cell) -> Iterator[SimulatedCell]:
+    """Its drives."""
+    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+        yield running
+
+
+def test_the_drives_get_the_change_that_was_looked_at_and_no_other(
+    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = demo_calibration()
+    apply_in_drives(cell, calibration=calibration, base=None, yes=False)
+    base = capsys.readouterr().out.split("--base ")[1].split(maxsplit=1)[0]
+    moved = replace(calibration.gains[3], value=calibration.gains[3].value * 1.01)
+    another = replace(calibration, gains=(*calibration.gains[:3], moved, *calibration.gains[4:]))
+    with pytest.raises(CalibrationRefused, match="have changed since the dry run"):
+        apply_in_drives(cell, calibration=another, base=base, yes=True)
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
+    apply_in_drives(cell, calibration=calibration, base=base, yes=True)
+    assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
+    with pytest.raises(CalibrationRefused, match="as --base says"):
+        apply_in_drives(cell, calibration=another, base=base, yes=True)

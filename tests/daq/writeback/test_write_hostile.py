@@ -1,0 +1,186 @@
+"""Files that are no files: links, loops, pipes, devices. A clear word for each, and nobody waits."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from daq.errors import CalibrationMissing, ControllerUnfit
+from daq.ledger.audit import AuditAction, Content, append, read, verify
+from daq.workflow import calibration_file
+from daq.writeback.file_proposal import apply, propose
+from daq.writeback.file_target import roll_back
+from daq.writeback.request import Request
+from tests.daq.calibrations import KEYS, demo_calibration
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Path:
+    """In a folder of its own."""
+    path = tmp_path / "controllers" / "demo.yaml"
+    path.parent.mkdir()
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
+    return path
+
+
+def _directory(path: Path) -> None:
+    path.mkdir()
+
+
+def _fifo(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def _device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def _huge(path: Path) -> None:
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)  # no block of it is on the disk
+
+
+def _nothing(path: Path) -> None:
+    path.unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("made", [_directory, _fifo, _device, _huge, _nothing])
+def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
+    tmp_path: Path, made: Callable[[Path], None]
+) -> None:
+    path = tmp_path / "x.yaml"
+    made(path)
+    with pytest.raises(ControllerUnfit):
+        propose(Request(demo_calibration(), NOW), path, KEYS, cell="demo")
+    with pytest.raises(CalibrationMissing):
+        calibration_file.load(path)
+
+
+def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
+    link = tmp_path / "link.yaml"
+    link.symlink_to(tmp_path / "gone" / "demo.yaml")
+    with pytest.raises(ControllerUnfit, match=r"a symbolic link to .*gone/demo\.yaml, which is not there"):
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+
+
+def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.yaml", tmp_path / "other.yaml"
+    one.symlink_to(other)
+    other.symlink_to(one)
+    with pytest.raises(ControllerUnfit, match="round in a circle"):
+        propose(Request(demo_calibration(), NOW), one, KEYS, cell="demo")
+    with pytest.raises(ControllerUnfit, match="round in a circle"):
+        roll_back(one, NOW)
+    with pytest.raises(CalibrationMissing):
+        calibration_file.load(one)
+
+
+def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controller: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link.yaml"
+    link.symlink_to(controller)
+    controller.parent.chmod(0o777)
+    with pytest.raises(ControllerUnfit, match="everybody may write"):
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+    # Whoever names the file itself has chosen it.
+    assert propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo").refusals == ()
+    controller.parent.chmod(0o755)
+    assert propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo").refusals == ()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
+def test_the_link_of_a_stranger_is_not_followed(controller: Path, tmp_path: Path) -> None:
+    link = tmp_path / "link.yaml"
+    link.symlink_to(controller)
+    os.lchown(link, 4711, 4711)
+    with pytest.raises(ControllerUnfit, match="user 4711 has made"):
+        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+    os.chown(controller, 4711, 4711)
+    written = apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW)
+    assert written is not None
+    assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
+
+
+def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, tmp_path: Path) -> None:
+    """The other name would keep the old gains, and whoever reads it would not know."""
+    other = tmp_path / "plc's.yaml"
+    other.hardlink_to(controller)
+    for name in (controller, other):
+        with pytest.raises(ControllerUnfit, match=r"2 names \(hard links\)") as caught:
+            propose(Request(demo_calibration(), NOW), name, KEYS, cell="demo")
+    remedy = str(caught.value).rpartition("of its own: ")[2]
+    assert subprocess.run(remedy, shell=True, check=False).returncode == 0
+    assert controller.stat().st_nlink == 1
+    assert other.read_bytes() == controller.read_bytes()
+    assert propose(Request(demo_calibration(), NOW), other, KEYS, cell="demo").refusals == ()
+    assert apply(propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo"), NOW) is not None
+
+
+def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path, tmp_path: Path) -> None:
+    """The lock's name is no way to another file either."""
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    victim = tmp_path / "victim"
+    (controller.parent / ".demo.yaml.lock").symlink_to(victim)
+    with pytest.raises(OSError, match="symbolic link"):
+        apply(proposal, NOW)
+    assert not victim.exists()
+
+
+def test_a_deleted_file_comes_back_through_its_link_and_is_written_down(controller: Path, tmp_path: Path) -> None:
+    audit, link = tmp_path / "audit.jsonl", tmp_path / "link.yaml"
+    link.symlink_to(controller)
+    before = controller.read_bytes()
+    apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW, audit=audit, who="Ada")
+    controller.unlink()
+    assert roll_back(link, NOW, audit=audit, who="Bob").file == controller
+    assert controller.read_bytes() == before
+    entries = read(audit)
+    assert [entry.action for entry in entries][2:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert entries[2].details["sha256_before"] is None
+    assert {entry.subject for entry in entries} == {str(controller)}
+
+
+def test_what_fails_within_a_write_is_written_down_as_failed(
+    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit, before = tmp_path / "audit.jsonl", controller.read_bytes()
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("daq.writeback.file_target.replace_file", full)
+    with pytest.raises(OSError, match="No space"):
+        apply(proposal, NOW, audit=audit, who="Ada")
+    assert controller.read_bytes() == before
+    begun, failed = read(audit)
+    assert (begun.action, failed.action) == (AuditAction.APPLY_BEGUN, AuditAction.FAILED)
+    assert failed.details["begun"] == begun.number
+    assert "No space" in str(failed.details["error"])
+    assert failed.details["sha256_found"] == begun.details["sha256_before"]
+
+
+def test_an_end_that_cannot_be_written_down_leaves_the_write_and_a_warning(
+    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+
+    def full_at_the_end(path: Path, action: AuditAction, **rest: object) -> object:
+        if action is AuditAction.APPLIED:
+            raise OSError(28, "No space left on device")
+        return append(path, action, **rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("daq.ledger.audit.append", full_at_the_end)
+    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    assert apply(proposal, NOW, audit=audit, who="Ada") is not None
+    assert "the audit could not be told that it is applied" in caplog.text
+    (left,) = verify(audit).open_writes
+    assert left.content is Content.AFTER

@@ -1,0 +1,202 @@
+"""The buses: one contract for all, and what each may do wrong."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import can
+import pytest
+from can.interfaces.socketcand import SocketCanDaemonBus
+
+from drivers.canopen.bus import BusAddress, SocketcandBus, open_bus
+from drivers.canopen.hub import HOST, Hub
+from drivers.canopen.link import Link
+from drivers.canopen.sdo import SdoPolicy
+from drivers.errors import BusError
+from tests.drivers.bus_contract import WAIT_S, BusContract, Ends, same
+from tests.drivers.scripted import FakeClock
+
+
+def three_ends(address: BusAddress) -> Iterator[Ends]:
+    ends = open_bus(address), open_bus(address), open_bus(address)
+    try:
+        yield ends
+    finally:
+        for end in ends:
+            end.shutdown()
+
+
+class TestVirtual(BusContract):
+    @pytest.fixture
+    def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
+        yield from three_ends(BusAddress("virtual", request.node.nodeid))
+
+
+class TestHub(BusContract):
+    @pytest.fixture
+    def ends(self) -> Iterator[Ends]:
+        with Hub(("can0",)) as hub:
+            yield from three_ends(hub.address())
+
+
+def test_channels_of_a_hub_are_buses_of_their_own() -> None:
+    with Hub(("left", "right")) as hub:
+        left, other, right = (open_bus(hub.address(name)) for name in ("left", "left", "right"))
+        left.send(can.Message(arbitration_id=1, is_extended_id=False))
+        assert other.recv(WAIT_S) is not None
+        assert right.recv(0.0) is None
+        for end in (left, other, right):
+            end.shutdown()
+
+
+def test_an_unknown_channel_is_refused_with_the_known_ones() -> None:
+    with Hub(("can0",)) as hub, pytest.raises(BusError, match=r"no bus can1, there is can0"):
+        open_bus(hub.address("can1"))
+
+
+def test_a_closed_hub_does_not_look_like_silence() -> None:
+    with Hub(("can0",)) as hub:
+        link = Link(hub.address(), SdoPolicy(), FakeClock())
+        link.open()
+    with pytest.raises(BusError, match="closed the connection"):
+        link.pump(WAIT_S)
+    link.close()
+
+
+def test_nobody_listens() -> None:
+    with socket.socket() as taken:
+        taken.bind((HOST, 0))
+        port = taken.getsockname()[1]
+        with pytest.raises(BusError, match=str(port)):
+            open_bus(BusAddress("socketcand", "can0", port=port))
+        taken.listen()
+        with pytest.raises(BusError, match=f"{port}: .*another hub runs on this port"), Hub(("can0",), port=port):
+            pass
+
+
+def test_an_unknown_interface_is_a_bus_error() -> None:
+    with pytest.raises(BusError, match="carrier-pigeon"):
+        open_bus(BusAddress("carrier-pigeon", "can0"))
+
+
+def test_a_hub_that_does_not_run_has_no_address() -> None:
+    with pytest.raises(BusError, match="not running"):
+        Hub(("can0",)).address()
+
+
+def test_python_cans_own_client_understands_the_hub() -> None:
+    with Hub(("can0",)) as hub:
+        address = hub.address()
+        theirs = SocketCanDaemonBus("can0", address.host, address.port)
+        ours = open_bus(address)
+        for data in (b"", b"\x01\xab", bytes(8)):
+            frame = can.Message(arbitration_id=0x81, is_extended_id=False, data=data)
+            ours.send(frame)
+            assert same(theirs.recv(WAIT_S), frame)
+            theirs.send(frame)
+            assert same(ours.recv(WAIT_S), frame)
+        theirs.shutdown()
+        ours.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("said", "answer"),
+    [
+        (b"< send 080 0 >", b"< error unknown command >"),
+        (b"< rawmode >", b"< error unknown command >"),
+        (b"< open can0 >< rawmode >< send 080 2 1 >", b"< ok >< ok >< error malformed frame >"),
+        (b"< open can0 >< rawmode >< send 080 9 1 1 1 1 1 1 1 1 1 >", b"< ok >< ok >< error malformed frame >"),
+        (b"< echo >", b"< echo >"),
+    ],
+)
+def test_the_hub_answers_what_it_does_not_understand(said: bytes, answer: bytes) -> None:
+    with Hub(("can0",)) as hub, socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+        client.sendall(said)
+        expected, heard = b"< hi >" + answer, b""
+        while len(heard) < len(expected):
+            heard += client.recv(256)
+        assert heard == expected
+
+
+def test_the_hub_hangs_up_on_what_is_no_socketcand() -> None:
+    with Hub(("can0",)) as hub, socket.create_connection((HOST, hub.address().port), timeout=WAIT_S) as client:
+        client.sendall(b"GET / HTTP/1.1 " + b"x" * 1000)
+        heard = b""
+        while chunk := client.recv(256):
+            heard += chunk
+        assert heard == b"< hi >"
+
+
+def test_a_server_that_takes_nothing_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("drivers.canopen.bus.SEND_S", 0.02)
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    frame = can.Message(arbitration_id=1, is_extended_id=False, data=bytes(8))
+    with theirs:
+        with pytest.raises(can.CanOperationError, match=r"takes nothing for 0\.02 s"):
+            for _ in range(100_000):
+                end.send_burst((frame,) * 100)
+        with pytest.raises(can.CanOperationError, match="takes nothing"):  # half a frame may have gone out
+            end.send(frame)
+    end.shutdown()
+
+
+ENDLESS = {
+    "nothing": b"x" * 100_000,
+    "beginnings": b"< " * 50_000,
+    "a frame": b"< frame 123 1.0 " + b"0" * 100_000,
+    "digits": b"< frame 123 " + b"1" * 100_000,
+    "an identifier": b"< frame " + b"1" * 100_000,
+}
+
+
+@pytest.mark.parametrize("kind", ENDLESS)
+def test_a_server_that_never_ends_a_message_is_told_and_not_parsed_ever_slower(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    with theirs:
+        theirs.sendall(ENDLESS[kind])
+        with pytest.raises(can.CanOperationError, match=r"without the end of a message.*socketcand server"):
+            for _ in range(100):
+                end.recv(WAIT_S)
+    end.shutdown()
+
+
+def test_a_handshake_without_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi" + b" " * 100_000)
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    with theirs, pytest.raises(can.CanInitializationError, match="without the end of a message"):
+        SocketcandBus("can0", HOST, 1)
+
+
+@pytest.mark.parametrize("said", ["< frame 123456789 1.0 00 >", "< frame 123 1.0 000000000000000000 >"])
+def test_a_frame_that_no_bus_carries_is_told(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"< hi >< ok >< ok >")
+    monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
+    monkeypatch.setattr(ours.__class__, "setsockopt", lambda *_: None)
+    end = SocketcandBus("can0", HOST, 1)
+    with theirs:
+        theirs.sendall(said.encode())
+        with pytest.raises(can.CanOperationError, match="a frame of"):
+            end.recv(WAIT_S)
+    end.shutdown()
+
+
+def test_remote_frames_are_refused_where_the_protocol_has_none() -> None:
+    with Hub(("can0",)) as hub:
+        end = open_bus(hub.address())
+        with pytest.raises(can.CanOperationError, match="remote"):
+            end.send(can.Message(arbitration_id=0x701, is_extended_id=False, is_remote_frame=True))
+        end.shutdown()

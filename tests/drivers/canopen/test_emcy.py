@@ -1,0 +1,32 @@
+"""The texts of error codes."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.canopen.emcy import CODES, describe
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0x8611, "following error"),
+        (0x8130, "life guard error or heartbeat error"),
+        (0x2310, "continuous over-current at the output"),
+        (0x7305, "incremental sensor 1 fault"),
+        (0x231F, "continuous over-current at the output (this code is the maker's)"),
+        (0x73A7, "sensor (this code is the maker's)"),
+        (0xA123, "reserved (this code is the maker's)"),
+        (0xFF01, "device specific, see the drive's manual"),
+    ],
+)
+def test_a_code_has_the_text_of_its_standard_or_of_its_class(code: int, text: str) -> None:
+    assert describe(code) == text
+
+
+@given(st.integers(0, 0xFFFF))
+def test_every_code_says_something(code: int) -> None:
+    assert describe(code)
+    assert (describe(code) == CODES.get(code)) == (code in CODES)

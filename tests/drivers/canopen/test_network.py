@@ -1,0 +1,325 @@
+"""The network of a cell against scripted nodes that deviate one at a time."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+import pytest
+
+from drivers.canopen.link import NmtState
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.sdo import SdoPolicy
+from drivers.errors import (
+    BusError,
+    IdentityMismatch,
+    MappingRefused,
+    MotionRefused,
+    NmtRefused,
+    NodeMissing,
+    ObjectAccessError,
+    StateRefused,
+)
+from drivers.profiles.cia402 import State
+from drivers.profiles.profile import Axis, Identity, ObjectEntry
+from drivers.profiles.scale import ScaleImplausible
+from drivers.stream.sample import EventKind
+from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell
+
+
+def test_scan_tells_who_is_there_and_changes_nothing() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].nmt = 4  # stopped: answers no SDO, but says so by heartbeat
+    bus.nodes[1].store(0x1017, 0, 10)
+    before = [copy.deepcopy(node.objects) for node in bus.nodes]
+    with network:
+        first, second = network.scan(wait_s=0.05)
+    assert first.identity == Identity(0x29A, 0x40200, 7)
+    assert (first.node_id, first.device_name, first.state) == (1, "axis", State.SWITCH_ON_DISABLED)
+    assert (second.node_id, second.identity, second.nmt) == (2, None, NmtState.STOPPED)
+    for node, objects in zip(bus.nodes, before, strict=True):
+        assert {**node.objects, (0x6041, 0): None} == {**objects, (0x6041, 0): None}
+    assert not [frame for frame in bus.sent if frame.arbitration_id < 0x580]
+
+
+def test_a_node_without_name_and_serial_is_described_as_far_as_it_tells() -> None:
+    network, bus = cell(1)
+    for key in ((0x1008, 0), (0x1018, 4), (0x6041, 0)):
+        del bus.nodes[0].objects[key]
+    bus.nodes[0]._refresh = lambda: None  # type: ignore[method-assign] # this node has no 6041h to refresh
+    with network:
+        (found,) = network.scan(wait_s=0.05)
+    assert found.identity == Identity(0x29A, 0x40200, None)
+    assert (found.device_name, found.state) == (None, None)
+
+
+def test_prepare_sets_up_and_leaving_restores_everything() -> None:
+    network, bus = cell(2)
+    before = [copy.deepcopy(node.objects) for node in bus.nodes]
+    with network:
+        network.prepare()
+        node = bus.nodes[0]
+        assert node.nmt == NmtState.OPERATIONAL
+        assert (node.value(0x1800, 1), node.value(0x1800, 2), node.value(0x1A00, 0)) == (0x181, 1, 3)
+        assert [node.value(0x1A00, sub) for sub in (1, 2, 3)] == [0x60640020, 0x60740010, 0x60410010]
+        assert node.value(0x1801, 1) >> 31 == 1  # the default TPDO2 would come between ours
+        assert node.value(0x6061, 0) == 1
+        assert network.ampere_per_unit() == pytest.approx((0.002, 0.002))
+        report = network.readback()["J1"]
+        assert isinstance(report, dict)
+        assert report["serial"] == 7
+        assert report["scale_objects"] == {"6075h:00": 2000}
+        assert (report["amplitude"], report["tap"]) == ("rms", "reference")
+        assert report["mapping"][0] == "TPDO1: COB-ID 00000181h, type 1, 60640020 60740010 60410010"
+    changed = ((0x6040, 0), (0x6041, 0))
+    for node, objects in zip(bus.nodes, before, strict=True):
+        assert node.nmt == NmtState.PRE_OPERATIONAL
+        for key, value in objects.items():
+            # Entries beyond the count mean nothing.
+            mapped = 0x1600 <= key[0] < 0x1C00 and key[1] > 1
+            assert key in changed or mapped or node.objects[key] == value, key
+
+
+def test_a_body_that_fails_still_restores() -> None:
+    network, bus = cell(1)
+    with pytest.raises(MotionRefused), network:
+        network.prepare()
+        raise MotionRefused("whatever")
+    assert bus.nodes[0].value(0x1800, 2) == 255
+    assert bus.nodes[0].nmt == NmtState.PRE_OPERATIONAL
+
+
+def test_an_axis_that_somebody_enabled_is_without_power_afterwards() -> None:
+    network, bus = cell(1)
+    with network:
+        network.prepare()
+        for command in (6, 7, 15):
+            bus.nodes[0].control(command, 0)
+        assert network.statuswords()[0] & 0x6F == 0x27
+    assert bus.nodes[0].statusword & 0x6F == 0x40
+
+
+def test_an_axis_that_stays_in_quick_stop_is_without_power_afterwards() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].quick_stop_stays = True
+    with network:
+        network.prepare()
+        for command in (6, 7, 15):
+            bus.nodes[0].control(command, 0)
+    assert bus.nodes[0].statusword & 0x6F == 0x40
+
+
+def test_a_missing_node_is_named_with_those_that_answered() -> None:
+    clock = FakeClock()
+    bus = ScriptedBus((ScriptedNode(1),), clock)
+    axes = (Axis("J1", 1, PROFILE), Axis("J2", 2, PROFILE))
+    network = CanopenNetwork(ADDRESS, axes, clock=clock, opener=lambda address: bus)
+    with network, pytest.raises(NodeMissing, match=r"node 2 did not answer .*answered: 1") as missing:
+        network.prepare()
+    assert missing.value.node_ids == (2,)
+
+
+@pytest.mark.parametrize(
+    ("sub", "field"), [(1, "vendor id"), (2, "product code"), (4, "serial number")], ids=["vendor", "product", "serial"]
+)
+def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field: str) -> None:
+    network, bus = cell(2)
+    bus.nodes[1].store(0x1018, sub, 0x1234)
+    with network, pytest.raises(IdentityMismatch, match=rf"node 2: {field} .*0x1234"):
+        network.prepare()
+    writes = [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1]
+    assert writes == []
+
+
+def test_a_node_that_ignores_nmt_is_refused() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].obeys_nmt = False
+    with network, pytest.raises(NmtRefused, match=r"node 2: asked for NMT OPERATIONAL.*PRE-OPERATIONAL"):
+        network.prepare()
+    assert bus.nodes[0].value(0x1800, 2) == 255
+
+
+def test_a_node_without_heartbeat_cannot_confirm() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].beats = False
+    with pytest.raises(NmtRefused, match="nothing") as refused, network:
+        network.prepare()
+    assert any("closing the network" in note for note in refused.value.__notes__)
+
+
+def test_a_mapping_that_reads_back_differently_is_refused() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].lies[0x1A00, 2] = 0x60770010
+    with pytest.raises(MappingRefused, match=r"TPDO1: reads back as .*60770010.*written was .*60740010"), network:
+        network.prepare()
+
+
+@pytest.mark.parametrize(
+    ("where", "code", "words"),
+    [
+        ((0x1A00, 2), 0x06040041, "60740010 to 1A00h:02.*cannot be mapped"),
+        ((0x1A00, 0), 0x06040042, "1A00h:00.*length exceeded"),
+        ((0x1801, 1), 0x06010002, "TPDO2.*read only"),
+    ],
+)
+def test_aborts_of_the_mapping_are_shown(where: tuple[int, int], code: int, words: str) -> None:
+    network, bus = cell(1)
+    bus.nodes[0].aborts[where] = code
+    with pytest.raises(MappingRefused, match=words), network:
+        network.prepare()
+
+
+def test_a_mode_that_is_not_taken_is_refused() -> None:
+    network, bus = cell(1)
+    bus.nodes[0].lies[0x6061, 0] = 8
+    with network, pytest.raises(StateRefused, match="mode 8 in 6061h"):
+        network.prepare()
+
+
+def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
+    network, bus = cell(1)
+    held: list[can.Message] = []
+
+    def delay_first(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x581 and not held:
+            held.append(message)
+            return ()
+        return (*held[:1], message)  # from now on the old answer comes before every new one
+
+    bus.tamper = delay_first
+    with network:
+        access = network.link.objects(1)
+        assert access.read(ObjectEntry(0x1018, 1, 32, signed=False)) == 0x29A
+        assert access.read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
+
+
+def test_sdo_failures_name_node_object_and_reason() -> None:
+    network, bus = cell(1)
+    with network:
+        access = network.link.objects(1)
+        with pytest.raises(ObjectAccessError, match=r"node 1: object 2000h:00: aborted.*does not exist") as aborted:
+            access.read(ObjectEntry(0x2000, 0, 32, signed=False))
+        assert aborted.value.abort_code == 0x06020000
+        with pytest.raises(ObjectAccessError, match="has 16 bits, expected 32"):
+            access.read(ObjectEntry(0x6074, 0, 32, signed=True))
+        with pytest.raises(ObjectAccessError, match="does not fit 16 bits"):
+            access.write(ObjectEntry(0x6040, 0, 16, signed=False), 70000)
+        with pytest.raises(ObjectAccessError, match=r"node 9: .*no answer within 0.01 s, asked 3 times"):
+            network.link.objects(9, SdoPolicy(0.01, 3)).read(ObjectEntry(0x6041, 0, 16, signed=False))
+        bus.broken = True
+        with pytest.raises(BusError, match="wire was cut"):
+            access.read(ObjectEntry(0x6041, 0, 16, signed=False))
+
+
+def test_faults_are_reset_only_on_request_and_never_into_power() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].fault()
+    with network:
+        network.prepare()
+        assert bus.nodes[1].statusword & 0x4F == 0x08
+        network.reset_faults()
+        assert bus.nodes[1].statusword & 0x6F == 0x40
+    assert all(node.powered_cycles == 0 for node in bus.nodes)
+
+
+def test_bus_off_is_an_error_and_other_error_frames_are_not() -> None:
+    network, bus = cell(1)
+    with network:
+        bus.inject(can.Message(arbitration_id=0x04, is_extended_id=True, is_error_frame=True, data=bytes(8)))
+        network.link.pump(0.0)
+        bus.inject(can.Message(arbitration_id=0x40, is_extended_id=True, is_error_frame=True, data=bytes(8)))
+        with pytest.raises(BusError, match="bus-off"):
+            network.link.pump(0.0)
+
+
+def test_emcy_and_its_end_are_told_in_words() -> None:
+    network, bus = cell(1)
+    with network:
+        bus.inject(bus.nodes[0].emcy(0x2310))
+        bus.inject(bus.nodes[0].emcy(0x0000))
+        network.link.pump(0.0)
+        first, second = network.link.take_events(5, (1,))
+    assert (first.kind, first.code, first.axis, first.time_ns) == (EventKind.EMCY, 0x2310, 0, 5)
+    assert "EMCY 2310h continuous over-current" in first.text
+    assert second.kind is EventKind.EMCY_RESET
+
+
+def test_nothing_can_be_done_on_a_closed_network() -> None:
+    network, _ = cell(1)
+    with pytest.raises(BusError, match="not open"):
+        network.prepare()
+
+
+def test_preparing_twice_still_restores_the_first_settings() -> None:
+    network, bus = cell(1)
+    with network:
+        network.prepare()
+        network.prepare()
+    assert (bus.nodes[0].value(0x1800, 2), bus.nodes[0].value(0x6060, 0), bus.nodes[0].value(0x1017, 0)) == (255, 8, 0)
+
+
+def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
+    network, bus = cell(2)
+    with pytest.raises(MappingRefused, match=r"node 1: TPDO1"), network:
+        network.prepare()
+        bus.nodes[0].aborts[0x1800, 2] = 0x06010002
+    assert bus.nodes[0].value(0x1400, 2) == 255
+    assert bus.nodes[0].value(0x1017, 0) == 0
+    assert bus.nodes[1].value(0x1800, 2) == 255
+
+
+def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> None:
+    network, bus = cell(2)
+    bus.nodes[1].store(0x6075, 0, 0)
+    with pytest.raises(ScaleImplausible, match=r"node 2.*6075h:00 = 0"), network:
+        network.prepare()
+    assert not any(node.powered_cycles for node in bus.nodes)
+    assert bus.nodes[0].value(0x6060, 0) == 8  # everything was given back
+
+
+@pytest.mark.parametrize("times", [1, 100])
+def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_axes_with_power(times: int) -> None:
+    network, bus = cell(2)
+    send, told = bus.send, 0
+
+    def fail(msg: can.Message, timeout: float | None = None) -> None:
+        nonlocal told
+        if 0x600 < msg.arbitration_id < 0x680 and told < times:
+            told += 1
+            raise BusError("bus B", "bus-off")  # as a split bus does, once
+        send(msg, timeout)
+
+    with pytest.raises(BusError, match="bus B: bus-off"), network:
+        network.prepare()
+        for node in bus.nodes:
+            node.statusword = 0x0227
+        bus.send = fail  # type: ignore[method-assign]
+    given_up = times > 1
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x27 if given_up else 0x40] * 2
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [1 if given_up else 8] * 2
+    assert told == (2 if given_up else 1)
+
+
+def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
+    network, bus = cell(1)
+    inside: list[bool] = []
+
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        inside.append(True)
+        yield
+
+    network.undisturbed = undisturbed
+    send = bus.send
+
+    def cut(msg: can.Message, timeout: float | None = None) -> None:
+        if inside:
+            raise KeyboardInterrupt
+        send(msg, timeout)
+
+    bus.send = cut  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt) as interrupt, network:
+        network.prepare()
+    assert ["cut short" in note for note in interrupt.value.__notes__] == [True]

@@ -1,0 +1,54 @@
+"""Frozen data: the way that a set-point has gone, and when equal values prove that nothing is measured any more."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.motion.move import Move, synchronised, trapezoid_duration_s
+from drivers.motion.watch import FROZEN_S, FrozenData, way_counts
+from drivers.stream.sample import Sample
+
+PERIOD_NS = 1_000_000
+MOVE = Move((50_000, 0), (100_000, 1), (1_000_000, 1))
+
+distances = st.floats(1.0, 1e7)
+speeds = st.floats(10.0, 1e6)
+ramps = st.floats(100.0, 1e7)
+
+
+@settings(deadline=None)
+@given(distances, speeds, ramps, st.floats(-0.1, 1.2))
+def test_the_way_is_that_of_the_trapezoid(distance: float, speed: float, ramp: float, part: float) -> None:
+    time_s = part * trapezoid_duration_s(distance, speed, ramp)
+    path = synchronised(np.zeros(1), np.array([distance]), np.array([speed]), np.array([ramp]))
+    expected = float(path.at(np.array([max(time_s, 0.0)]))[0][0, 0])
+    assert way_counts(distance, speed, ramp, time_s) == pytest.approx(expected, rel=1e-6, abs=1e-6 * distance)
+
+
+def alarms(positions: list[int], currents: list[int], missing: list[int] | None = None) -> list[int]:
+    data = FrozenData(MOVE, (0, 0), (0,), PERIOD_NS)
+    told = []
+    for cycle, (position, current) in enumerate(zip(positions, currents, strict=True)):
+        lost = 0 if missing is None else missing[cycle]
+        sample = Sample(cycle, cycle * PERIOD_NS, (position, 0), (current, 0), (0x27, 0x27), lost)
+        if data.frozen(sample):
+            told.append(cycle)
+    return told
+
+
+def test_an_axis_that_shows_nothing_new_is_told_in_its_bound() -> None:
+    assert alarms([7] * 100, [3] * 100)[0] == round(FROZEN_S * 1e9 / PERIOD_NS)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 39), st.booleans())
+def test_one_count_in_position_or_current_is_life(beat: int, of_current: bool) -> None:
+    alive = [(cycle + beat) // 40 for cycle in range(500)]
+    assert alarms([7] * 500 if of_current else alive, alive if of_current else [3] * 500) == []
+
+
+def test_a_repeated_value_of_a_lost_sample_proves_nothing() -> None:
+    assert alarms([7] * 500, [3] * 500, [int(cycle % 40 == 0) for cycle in range(500)]) == []

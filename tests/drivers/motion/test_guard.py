@@ -1,0 +1,223 @@
+"""Amplifiers that watch the recorder: what is set, what is given back, and what they lack."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import can
+import pytest
+
+from drivers.errors import RecorderIdTaken
+from drivers.motion.execute import execute
+from drivers.motion.move import Move
+from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, permission
+
+RECORDER = 127
+
+
+def give_guard(node: ScriptedNode, entry: int = 0, option: int | None = 1) -> None:
+    node.objects[0x1016, 0] = (1, 1)
+    node.objects[0x1016, 1] = (entry, 4)
+    if option is not None:
+        node.objects[0x6007, 0] = (option, 2)
+
+
+@pytest.mark.parametrize(
+    "before", [0, 0x00050000, RECORDER << 16 | 500], ids=["free", "unused", "left by a killed one"]
+)
+def test_an_amplifier_is_told_to_watch_us_and_gets_its_settings_back(before: int) -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node, before)
+    with network:
+        network.prepare()
+        assert [node.value(0x1016, 1) for node in bus.nodes] == [RECORDER << 16 | 500] * 2
+        assert [node.value(0x6007, 0) for node in bus.nodes] == [3, 3]
+        assert network.unguarded() == ()
+    expected = 0 if before >> 16 == RECORDER else before
+    assert [(node.value(0x1016, 1), node.value(0x6007, 0)) for node in bus.nodes] == [(expected, 1)] * 2
+
+
+def test_what_an_amplifier_lacks_is_said() -> None:
+    network, bus = cell(3)
+    give_guard(bus.nodes[1], option=None)
+    give_guard(bus.nodes[2], entry=0x0005_01F4)  # it watches somebody else, and that is not ours to change
+    with network:
+        network.prepare()
+        assert network.unguarded() == (
+            "J1: no 1016h: it does NOT stop by itself when the recorder is killed",
+            "J2: no 6007h: when the recorder is killed it stops in the way that its maker decided",
+            "J3: no free 1016h: it does NOT stop by itself when the recorder is killed",
+        )
+    assert bus.nodes[2].value(0x1016, 1) == 0x0005_01F4
+
+
+@pytest.mark.parametrize(
+    ("refused", "lack", "entry", "option"),
+    [
+        (
+            (0x6007, 0),
+            "6007h = 1 rules how it stops when the recorder is killed: 3 is abort",
+            RECORDER << 16 | 500,
+            1,
+        ),
+        ((0x1016, 1), "it does NOT stop by itself when the recorder is killed: 1016h is aborted", 0, 1),
+    ],
+)
+def test_an_amplifier_that_refuses_to_watch_is_recorded_all_the_same(
+    refused: tuple[int, int], lack: str, entry: int, option: int
+) -> None:
+    network, bus = cell(1)
+    give_guard(bus.nodes[0])
+    bus.nodes[0].aborts[refused] = 0x06090030
+    with network:
+        network.prepare()
+        (said,) = network.unguarded()
+        assert lack in said
+        assert (bus.nodes[0].value(0x1016, 1), bus.nodes[0].value(0x6007, 0)) == (entry, option)
+    assert (bus.nodes[0].value(0x1016, 1), bus.nodes[0].value(0x6007, 0)) == (0, 1)
+
+
+def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other_time() -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    powered: list[bool] = []
+    beats_ns: list[int] = []
+    send = bus.send
+
+    def listen(msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x700 + RECORDER:
+            beats_ns.append(bus.clock.now_ns)
+            powered.append(bus.nodes[0].value(0x1016, 1) != 0)
+        send(msg, timeout)
+
+    bus.send = listen  # type: ignore[method-assign]
+    with network:
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        for _ in range(100):
+            next(stream)
+        assert not beats_ns
+        move = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
+        list(execute(network, stream, (move,), permission()))
+        count = len(beats_ns)
+        assert count > 5
+        assert max(b - a for a, b in pairwise(beats_ns)) <= 1.5 * network.heartbeat_ms * 1e6
+        assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]  # nobody watches while the log is finished
+    assert len(beats_ns) == count
+    assert all(powered)
+
+
+def join(bus: ScriptedBus, node_id: int, *, beat_ms: int = 0, answers: bool = True) -> ScriptedNode:
+    """Another device, which is no axis; its first heartbeat comes as late as one can."""
+    device = ScriptedNode(node_id)
+    device.obeys_nmt = False
+    device.store(0x1017, 0, beat_ms)
+    device.next_beat_ns = bus.clock.now_ns + beat_ms * 1_000_000
+    device.nmt = 5 if answers else 4  # a scripted node that is stopped answers no SDO request
+    bus.nodes = (*bus.nodes, device)
+    return device
+
+
+HEARTBEAT_OF_ANOTHER = can.Message(arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x05")
+BOOT_UP_OF_ANOTHER = can.Message(arbitration_id=0x700 + RECORDER, is_extended_id=False, data=b"\x00")
+
+
+@pytest.mark.parametrize(
+    ("beat_ms", "answers"), [(400, False), (100, True), (0, True)], ids=["heartbeat", "both", "SDO server"]
+)
+def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(beat_ms: int, answers: bool) -> None:
+    """Its heartbeat would keep the axes running when the recorder is killed."""
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node, RECORDER << 16 | 500)  # and it is not a recorder's that was killed, though it looks like one
+        node.objects[0x1016, 0], node.objects[0x1016, 2] = (2, 1), (0, 4)
+    join(bus, 127, beat_ms=beat_ms, answers=answers)
+    join(bus, 126, beat_ms=beat_ms, answers=answers)
+    with network:
+        network.prepare()
+        assert network.recorder_id == 125
+        watched = [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]]
+        assert watched == [[RECORDER << 16 | 500, 125 << 16 | 500]] * 2
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        move = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
+        list(execute(network, stream, (move,), permission()))
+        beats = {frame.arbitration_id for frame in bus.sent if frame.arbitration_id > 0x700}
+        assert beats == {0x700 + 125}
+    assert [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]] == [[RECORDER << 16 | 500, 0]] * 2
+
+
+def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off_now() -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    bus.nodes[1].store(0x1016, 1, RECORDER << 16 | 2000)
+    with network:
+        network.prepare()
+        assert network.recorder_id == 126
+        assert bus.nodes[0].value(0x1016, 1) == 126 << 16 | 500
+        assert [text.partition(":")[0] for text in network.unguarded()] == ["J2"]
+    assert [node.value(0x1016, 1) for node in bus.nodes] == [0, RECORDER << 16 | 2000]
+
+
+def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
+    """Another device had the highest id at that time."""
+    network, bus = cell(1)
+    give_guard(bus.nodes[0], 126 << 16 | 500)
+    with network:
+        network.prepare()
+        assert bus.nodes[0].value(0x1016, 1) == RECORDER << 16 | 500
+    assert bus.nodes[0].value(0x1016, 1) == 0
+
+
+def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> None:
+    network, bus = cell(2)
+    for node in bus.nodes:
+        give_guard(node)
+    for node_id in range(3, 128):
+        join(bus, node_id)
+    with pytest.raises(RecorderIdTaken, match=r"found none that is free.*expected an id.*nothing has moved"), network:
+        network.prepare()
+    assert [node.value(0x1016, 1) for node in bus.nodes[:2]] == [0, 0]
+    assert all(node.powered_cycles == 0 for node in bus.nodes)
+
+
+@pytest.mark.parametrize("frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"])
+def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: can.Message) -> None:
+    network, bus = cell(2)
+    with network:
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        bus.inject(frame)
+        with pytest.raises(RecorderIdTaken, match="77Fh of another device, which has node id 127 too"):
+            list(
+                execute(network, stream, (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),), permission())
+            )
+    assert all(node.powered_cycles == 0 for node in bus.nodes)
+
+
+@pytest.mark.parametrize("frame", [HEARTBEAT_OF_ANOTHER, BOOT_UP_OF_ANOTHER], ids=["heartbeat", "boot-up"])
+def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: can.Message) -> None:
+    network, bus = cell(2)
+    events: list[CellEvent] = []
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = lambda cycle: bus.inject(frame) if cycle in (60, 61) else None
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
+        with pytest.raises(
+            RecorderIdTaken, match=r"found a heartbeat 77Fh .*expected an id .*give that device another"
+        ):
+            list(
+                execute(
+                    network, stream, (Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000)),), permission()
+                )
+            )
+        assert bus.cycle < 70
+        assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+        assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x77F]
+    assert [abs(node.position) < 40_000 for node in bus.nodes] == [True, True]

@@ -1,0 +1,459 @@
+"""Motion: what moves, when, and that every way out ends without power."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, nullcontext
+
+import can
+import pytest
+
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import (
+    BusError,
+    DriveFault,
+    DriverError,
+    HeartbeatLost,
+    MotionRefused,
+    MotionTimeout,
+    NodeMisplaced,
+    SampleLost,
+    StateRefused,
+)
+from drivers.motion.execute import MotionBounds, execute
+from drivers.motion.move import Move, synchronised_move
+from drivers.profiles.profile import Axis
+from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission
+
+Moving = tuple[CanopenNetwork, SyncStream, ScriptedBus, list[CellEvent]]
+BOUNDS = MotionBounds(enable_s=0.1, acknowledge_s=0.05, settle_s=0.05, stop_s=0.1, standstill_cycles=5)
+FAR = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
+
+
+@pytest.fixture
+def moving() -> Iterator[Moving]:
+    network, bus = cell(2)
+    events: list[CellEvent] = []
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        yield network, SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append), bus, events
+        bus.tamper = lambda message: (message,)
+        bus.broken = False
+        for node in bus.nodes:
+            node.beats = True
+
+
+def powerless(bus: ScriptedBus) -> bool:
+    return all(node.statusword & 0x6F in (0x40, 0x08, 0x28) and not node.moving for node in bus.nodes)
+
+
+def run(moving: Moving, *moves: Move) -> list[Sample]:
+    network, stream, _, _ = moving
+    return list(execute(network, stream, moves, permission(), BOUNDS))
+
+
+def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> None:
+    _, stream, bus, events = moving
+    first = synchronised_move((0, 0), (50_000, -40_000), permission().limits, dwell_cycles=7)
+    second = synchronised_move((50_000, -40_000), (0, 10_000), permission().limits, dwell_cycles=3)
+    samples = run(moving, first, second)
+    assert samples[-1].position_counts == (0, 10_000)
+    assert [sample.cycle for sample in samples] == list(range(len(samples)))
+    assert bus.nodes[0].setpoint_cycles == bus.nodes[1].setpoint_cycles
+    assert len(bus.nodes[0].setpoint_cycles) == 2
+    marks = [event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)]
+    assert [(mark.kind, mark.code) for mark in marks] == [
+        (EventKind.MOVE_START, 0),
+        (EventKind.MOVE_END, 0),
+        (EventKind.MOVE_START, 1),
+        (EventKind.MOVE_END, 1),
+    ]
+    starts = [mark.time_ns // PERIOD_NS for mark in marks if mark.kind is EventKind.MOVE_START]
+    assert starts == bus.nodes[0].setpoint_cycles
+    assert powerless(bus)
+    assert stream.statistics.missing == 0
+
+
+def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    run(moving, FAR)
+    written = [tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes]
+    assert written == [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
+
+
+def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    samples = run(moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4))
+    assert samples[-1].position_counts == (5_000, 0)
+    assert bus.nodes[1].setpoint_cycles == []
+
+
+def test_a_drive_that_needs_its_controlword_twice_still_moves(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    bus.nodes[0].second_controlword = bus.nodes[1].second_controlword = True
+    assert run(moving, FAR)[-1].position_counts == (50_000, -40_000)
+
+
+def test_nothing_is_told_to_an_axis_whose_position_is_unknown(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    for node in bus.nodes:
+        node.position = 30_000.0
+    bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
+    run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    targets = [
+        int.from_bytes(frame.data[2:], "little", signed=True) for frame in bus.sent if frame.arbitration_id == 0x202
+    ]
+    assert min(targets) == 20_000
+
+
+def test_without_permission_nothing_is_even_enabled(moving: Moving) -> None:
+    network, stream, bus, _ = moving
+    with pytest.raises(MotionRefused, match="no permission"):
+        list(execute(network, stream, (FAR,), None, BOUNDS))
+    with pytest.raises(MotionRefused, match="J1: move 0 goes to 50000 counts, allowed is -40000 to 40000"):
+        list(execute(network, stream, (FAR,), permission(span=40_000), BOUNDS))
+    with pytest.raises(MotionRefused, match="limits for 3 axes"):
+        list(execute(network, stream, (FAR,), permission(axes=3), BOUNDS))
+    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+
+
+def test_a_drive_in_fault_is_not_enabled(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    bus.nodes[1].fault()
+    with pytest.raises(StateRefused, match=r"node 2: asked for OPERATION ENABLED.*FAULT"):
+        run(moving, FAR)
+    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+
+
+def break_at(bus: ScriptedBus, cycle: int, what: str) -> None:
+    """Let something go wrong in the middle of the move."""
+
+    def act(now: int) -> None:
+        if now != cycle:
+            return
+        if what == "fault":
+            bus.nodes[1].fault()
+        elif what == "following error":
+            bus.nodes[1].fault(following_error=True)
+        elif what == "emcy":
+            bus.inject(bus.nodes[1].emcy(0x8611))
+        elif what == "power lost":
+            bus.nodes[1].control(0, now)
+        elif what == "silent":
+            bus.tamper = lambda message: () if message.arbitration_id == 0x182 else (message,)
+        elif what == "heartbeat":
+            bus.nodes[1].beats = False
+
+    def tick(now: int) -> None:
+        bus.clock.now_ns += PERIOD_NS
+        act(now)
+
+    bus.on_cycle = tick
+
+
+@pytest.mark.parametrize("quick_stop_stays", [False, True], ids=["605Ah=2", "605Ah=6"])
+@pytest.mark.parametrize(
+    ("what", "error"),
+    [
+        ("fault", DriveFault),
+        ("following error", DriveFault),
+        ("emcy", DriveFault),
+        ("power lost", DriveFault),
+        ("silent", SampleLost),
+        ("heartbeat", HeartbeatLost),
+    ],
+)
+def test_every_failure_stops_all_axes(
+    moving: Moving, what: str, error: type[Exception], quick_stop_stays: bool
+) -> None:
+    _, _, bus, events = moving
+    bus.nodes[0].quick_stop_stays = bus.nodes[1].quick_stop_stays = quick_stop_stays
+    break_at(bus, 60, what)
+    with pytest.raises(error):
+        run(moving, FAR)
+    assert powerless(bus)
+    assert 0 < bus.nodes[0].position < 50_000
+    assert EventKind.STOP in [event.kind for event in events]
+    assert EventKind.STOP_UNCONFIRMED not in [event.kind for event in events]
+
+
+@pytest.mark.parametrize("interrupt", [GeneratorExit, KeyboardInterrupt, ZeroDivisionError])
+def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseException]) -> None:
+    network, stream, bus, _ = moving
+    with pytest.raises(interrupt), closing(execute(network, stream, (FAR,), permission(), BOUNDS)) as samples:
+        for sample in samples:
+            if sample.cycle == 60:
+                raise interrupt
+    assert powerless(bus)
+    assert 0 < bus.nodes[0].position < 50_000
+
+
+def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
+    _, _, bus, _ = moving
+
+    def interrupt(cycle: int) -> None:
+        if cycle == 60:
+            raise KeyboardInterrupt
+
+    bus.on_cycle = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        run(moving, FAR)
+    assert powerless(bus)
+
+
+def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
+    _, _, bus, events = moving
+
+    def fault_at_stop(cycle: int) -> None:
+        if any(event.kind is EventKind.STOP for event in events) and bus.nodes[1].statusword & 0x6F == 0x40:
+            bus.nodes[1].fault()
+
+    bus.on_cycle = fault_at_stop
+    with pytest.raises(DriveFault, match="node 2"):
+        run(moving, FAR)
+    assert powerless(bus)
+
+
+def test_a_setpoint_that_is_never_acknowledged_ends_in_a_timeout(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    bus.nodes[1].ignores_setpoint = True
+    with pytest.raises(MotionTimeout, match="move 0: axis 2 did not"):
+        run(moving, FAR)
+    assert powerless(bus)
+
+
+def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving) -> None:
+    _, _, bus, _ = moving
+    break_at(bus, 60, "nothing")
+
+    def stuck(cycle: int) -> None:
+        bus.nodes[1].moving = False
+        bus.nodes[1].statusword |= 0x0400
+        bus.nodes[1].store(0x6074, 0, cycle & 1)  # a live current: what stands still is the axis, not its data
+
+    bus.on_cycle = stuck
+    with pytest.raises(MotionTimeout, match="axis 2"):
+        run(moving, FAR)
+    assert powerless(bus)
+
+
+def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, _, bus, _ = moving
+    receive = bus.recv
+    last_profile = 0x302
+
+    def interrupt(timeout: float | None = None) -> can.Message | None:
+        # The set-points are queued right after the SYNC that follows the last profile.
+        if not timeout and last_profile in [frame.arbitration_id for frame in bus.sent[-4:-1]]:
+            monkeypatch.setattr(bus, "recv", receive)
+            raise KeyboardInterrupt
+        return receive(timeout)
+
+    monkeypatch.setattr(bus, "recv", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(moving, FAR)
+    assert last_profile in [frame.arbitration_id for frame in bus.sent]
+    controlwords = [frame.data[0] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
+    assert not any(word & 0x10 for word in controlwords)
+    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    assert powerless(bus)
+
+
+def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
+    """Cycles from the stop to its end of drives that stay in QUICK STOP ACTIVE while their encoders show this."""
+    _, _, bus, events = moving
+    stopping: list[int] = []
+
+    def drift(cycle: int) -> None:
+        if any(event.kind is EventKind.STOP for event in events):
+            stopping.append(cycle)
+            for node in bus.nodes:
+                node.position += drift_counts[len(stopping) % len(drift_counts)]
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = drift
+    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    return stopping
+
+
+def test_an_encoder_that_flickers_stands_still(moving: Moving) -> None:
+    stopping = stop_with(moving, (3.0, -5.0, 2.0, 0.0))
+    assert len(stopping) < 20
+    assert powerless(moving[2])
+
+
+def test_an_axis_that_creeps_does_not_stand_still(moving: Moving) -> None:
+    bound_cycles = round(BOUNDS.stop_s * 1e9 / PERIOD_NS)
+    assert len(stop_with(moving, (7.0,))) >= bound_cycles
+
+
+def test_every_axis_that_could_not_be_stopped_is_told(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+    network, _, bus, _ = moving
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+
+    def refuse(axis: Axis) -> None:
+        raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "QUICK STOP ACTIVE", 0x07)
+
+    def coast(_cycle: int) -> None:
+        for node in bus.nodes:
+            node.position += 50
+
+    bus.on_cycle = coast
+    near = Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    with monkeypatch.context() as patched:
+        patched.setattr(network, "disable", refuse)
+        with pytest.raises(StateRefused, match="node 1") as error:
+            run(moving, near)
+    assert ["node 2" in note for note in error.value.__notes__] == [True]
+    bus.on_cycle = lambda _cycle: None
+
+
+def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> None:
+    network, stream, bus, events = moving
+
+    def cut(cycle: int) -> None:
+        bus.broken = cycle >= 60
+
+    bus.on_cycle = cut
+    with pytest.raises(Exception, match="wire was cut") as error:
+        list(execute(network, stream, (FAR,), permission(), BOUNDS))
+    assert any("while stopping" in note for note in error.value.__notes__)
+    assert events[-1].kind is EventKind.STOP_UNCONFIRMED
+    bus.on_cycle = lambda cycle: None
+
+
+def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
+    _, _, bus, events = moving
+    bus.nodes[1].ignores_setpoint = True
+    with pytest.raises(MotionTimeout):
+        run(moving, FAR)
+    kinds = [event.kind for event in events]
+    (ended,) = [event for event in events if event.kind is EventKind.ENDED]
+    assert ended.text.startswith("MotionTimeout: move 0: axis 2 did not")
+    assert kinds.index(EventKind.ENDED) < kinds.index(EventKind.STOP)
+
+
+def test_moves_that_were_made_end_for_no_reason(moving: Moving) -> None:
+    run(moving, FAR)
+    assert EventKind.ENDED not in [event.kind for event in moving[3]]
+
+
+def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:
+    """What would interrupt it is asked to wait from its first frame to its last."""
+    network, _, bus, events = moving
+    inside: list[bool] = []
+
+    @contextmanager
+    def undisturbed() -> Iterator[None]:
+        assert EventKind.STOP not in [event.kind for event in events]
+        inside.append(True)
+        yield
+        assert powerless(bus)
+        inside.clear()
+
+    def act(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            assert inside
+
+    network.undisturbed = undisturbed
+    bus.on_cycle = act
+    with pytest.raises(DriveFault):
+        run(moving, FAR)
+    bus.on_cycle = lambda _cycle: None
+    network.undisturbed = nullcontext
+
+
+def test_a_stop_that_is_cut_short_says_so(moving: Moving) -> None:
+    _, _, bus, events = moving
+
+    def act(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise KeyboardInterrupt
+
+    bus.on_cycle = act
+    with pytest.raises(KeyboardInterrupt) as cut:
+        run(moving, FAR)
+    assert cut.value.__notes__ == ["while stopping: the stop was cut short"]
+    assert isinstance(cut.value.__context__, DriveFault)
+
+
+def test_amplifiers_that_were_not_seen_to_stand_go_on_watching_us(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, _, bus, events = moving
+
+    def refuse(axis: Axis) -> None:
+        raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "OPERATION ENABLED", 0x27)
+
+    def deaf(cycle: int) -> None:
+        if cycle == 60:
+            bus.nodes[1].fault()
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.nodes[0].statusword = bus.nodes[0].statusword & ~0x6F | 0x27
+
+    bus.on_cycle = deaf
+    ended: list[str] = []
+    with monkeypatch.context() as patched:
+        patched.setattr(network, "disable", refuse)
+        patched.setattr(network.link, "stop_heartbeat", lambda: ended.append("heartbeat"))
+        with pytest.raises(DriveFault):
+            run(moving, FAR)
+    assert not ended
+    bus.on_cycle = lambda _cycle: None
+
+
+def test_what_is_stopped_by_sdo_is_told_so_before_one_is_waited_for(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, _, bus, events = moving
+    disable, told = network.disable, []
+
+    def note(axis: Axis) -> None:
+        told.append([node.statusword & 0x6F for node in bus.nodes])
+        disable(axis)
+
+    def deaf(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events] and not told:
+            for node in bus.nodes:
+                node.statusword = node.statusword & ~0x6F | 0x27
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = deaf
+    monkeypatch.setattr(network, "disable", note)
+    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    assert told[0] == [0x07, 0x07]
+    assert powerless(bus)
+
+
+@pytest.mark.parametrize("error", [BusError("bus B", "bus-off"), NodeMisplaced(9, "A", "B")], ids=["bus", "misplaced"])
+def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_stopped(
+    moving: Moving, error: DriverError
+) -> None:
+    """Of several buses one that fails is told of once."""
+    _, _, bus, events = moving
+
+    def fail(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise error
+
+    for node in bus.nodes:
+        node.quick_stop_stays = True
+    bus.on_cycle = fail
+    with pytest.raises(type(error)):
+        run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    assert powerless(bus)
+    assert EventKind.BUS_LOST in [event.kind for event in events]
+    assert EventKind.STOP_UNCONFIRMED in [event.kind for event in events]

@@ -1,0 +1,140 @@
+"""Descriptions of simulated cells for the tests, and a plain master that speaks raw frames."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import can
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from drivers.simulation.cell import SimulatedCell
+from drivers.simulation.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
+
+FloatArray = NDArray[np.float64]
+
+CLEAN = Path(__file__).parents[3] / "configs" / "simulation" / "clean.yaml"
+
+STOPPED_CLOCK: Callable[[], float] = lambda: 0.0  # noqa: E731 - a clock that never runs, so heartbeats follow the plant
+
+
+def clean_cell(payload: str | None = None, effects: tuple[UndeclaredEffect, ...] = ()) -> CellSpec:
+    """The cell of configs/simulation/clean.yaml."""
+    content = yaml.safe_load(CLEAN.read_text(encoding="utf-8"))
+    body = content["payloads"][payload] if payload else None
+    return CellSpec(
+        urdf=(CLEAN.parent / content["urdf"]).read_text(encoding="utf-8"),
+        gravity_m_s2=tuple(content["gravity_m_s2"]),
+        ratio=np.array(content["ratio"], dtype=np.float64),
+        axes=tuple(AxisSpec(**axis) for axis in content["axes"]),
+        start_rad=np.deg2rad(content["start_deg"]),
+        payload=Body(body["mass_kg"], tuple(body["centre_m"]), tuple(body["inertia_kg_m2"])) if body else None,
+        effects=effects,
+        sync_period_us=content["sync_period_us"],
+        substeps=content["substeps"],
+        seed=content["seed"],
+    )
+
+
+@dataclass
+class Master:
+    """Raw frames to and from a cell; nothing of the driver under test elsewhere is used.
+
+    Attributes:
+        bus: of the master.
+        answers: TPDO frames of every SYNC, as (COB-ID, data), in the order of arrival.
+        others: every other frame that came.
+    """
+
+    bus: can.BusABC
+    answers: list[tuple[int, bytes]] = field(default_factory=list)
+    others: list[tuple[int, bytes]] = field(default_factory=list)
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """One frame."""
+        self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def receive(self) -> tuple[int, bytes]:
+        """The next frame; a cell that falls silent fails the test."""
+        message = self.bus.recv(30.0)
+        assert message is not None, "the cell is silent"
+        return message.arbitration_id, bytes(message.data)
+
+    def sdo(self, node_id: int, request: bytes) -> bytes:
+        """One SDO request and its answer."""
+        self.send(0x600 + node_id, request.ljust(8, b"\0"))
+        while True:
+            can_id, data = self.receive()
+            if can_id == 0x580 + node_id:
+                return data
+            self.others.append((can_id, data))
+
+    def write(self, node_id: int, index: int, subindex: int, kind: str, value: int) -> int:
+        """Expedited download; returns the abort code, or 0."""
+        data = struct.pack("<" + kind, value)
+        head = struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, subindex)
+        return abort_code(self.sdo(node_id, head + data))
+
+    def read(self, node_id: int, index: int, subindex: int, kind: str) -> int:
+        """Expedited upload of a number."""
+        answer = self.sdo(node_id, struct.pack("<BHB", 0x40, index, subindex))
+        assert abort_code(answer) == 0, f"{index:04X}h:{subindex:02X} {answer.hex()}"
+        return int(struct.unpack_from("<" + kind, answer, 4)[0])
+
+    def set_up(self, node_ids: range) -> None:
+        """Map position, current reference and statusword into TPDO1 and the controlword into RPDO1, both on SYNC."""
+        for node_id in node_ids:
+            steps = [(0x1017, 0, "H", 0), (0x6060, 0, "b", 1)]
+            steps += [(0x1800, 1, "I", 0xC0000180 + node_id), (0x1A00, 0, "B", 0)]
+            steps += [(0x1A00, k, "I", entry) for k, entry in enumerate((0x60640020, 0x60740010, 0x60410010), start=1)]
+            steps += [(0x1A00, 0, "B", 3), (0x1800, 2, "B", 1), (0x1800, 1, "I", 0x40000180 + node_id)]
+            steps += [(0x1400, 1, "I", 0x80000200 + node_id), (0x1400, 2, "B", 1), (0x1400, 1, "I", 0x200 + node_id)]
+            for step in steps:
+                assert self.write(node_id, *step) == 0, step
+        self.send(0x000, bytes([1, 0]))
+
+    def sync(self, count: int = 6) -> list[tuple[int, int, int]]:
+        """One SYNC; position, current reference and statusword of each axis."""
+        self.send(0x080, b"")
+        got: dict[int, tuple[int, int, int]] = {}
+        while len(got) < count:
+            can_id, data = self.receive()
+            if 0x180 < can_id < 0x200:
+                self.answers.append((can_id, data))
+                got[can_id] = struct.unpack("<ihH", data)
+            else:
+                self.others.append((can_id, data))
+        return [got[key] for key in sorted(got)]
+
+    def enable(self, node_ids: range) -> None:
+        """Shutdown, switch on, enable operation, all axes on the same SYNCs."""
+        for controlword in (0x06, 0x07, 0x0F):
+            self.control(node_ids, controlword)
+            answer = self.sync(len(node_ids))
+        assert all(word & 0x6F == 0x27 for _, _, word in answer), answer
+
+    def control(self, node_ids: range, controlword: int) -> None:
+        """Controlword of all nodes by RPDO; it acts on the next SYNC."""
+        for node_id in node_ids:
+            self.send(0x200 + node_id, struct.pack("<H", controlword))
+
+
+def abort_code(answer: bytes) -> int:
+    """0 where the answer is no abort."""
+    return int(struct.unpack_from("<I", answer, 4)[0]) if answer[0] == 0x80 else 0
+
+
+@contextmanager
+def running(spec: CellSpec, channel: str) -> Iterator[tuple[SimulatedCell, Master]]:
+    """A cell in a thread and a master on one virtual bus; the master's bus is open before the cell boots."""
+    with (
+        can.Bus(interface="virtual", channel=channel) as near,
+        can.Bus(interface="virtual", channel=channel) as far,
+        SimulatedCell(spec, far, clock=STOPPED_CLOCK) as cell,
+    ):
+        yield cell, Master(near)

@@ -1,0 +1,137 @@
+"""The driver against the simulated cell: two programs that share nothing but the standards, over two kinds of bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import can
+import pytest
+
+from daq.config.bus import drive_axes
+from daq.config.cell_file import load_cell
+from daq.simulation.simulation_file import load_simulation
+from drivers.canopen.bus import BusAddress, open_bus
+from drivers.canopen.hub import Hub
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import DriveFault
+from drivers.motion.execute import execute
+from drivers.motion.move import AxisLimits, MotionPermission, synchronised_move
+from drivers.profiles.cia402 import State
+from drivers.profiles.profile import Axis
+from drivers.simulation.cell import SimulatedCell
+from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.stream import SyncStream
+from drivers.stream.sync import LockstepSync
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+PERIOD_NS = 1_000_000
+ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
+PERMISSION = MotionPermission("the test", ROOM)
+
+
+@pytest.fixture(scope="module")
+def axes() -> tuple[Axis, ...]:
+    return drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+
+
+@pytest.fixture(params=["virtual", "socketcand"])
+def address(request: pytest.FixtureRequest) -> Iterator[BusAddress]:
+    if request.param == "virtual":
+        yield BusAddress("virtual", request.node.nodeid)
+    else:
+        with Hub(("can0",)) as hub:
+            yield hub.address()
+
+
+@pytest.fixture
+def cell(address: BusAddress) -> Iterator[SimulatedCell]:
+    bus: can.BusABC = open_bus(address)
+    try:
+        with SimulatedCell(load_simulation(CONFIGS / "simulation" / "clean.yaml"), bus) as running:
+            yield running
+    finally:
+        bus.shutdown()
+
+
+def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
+    """What ``prepare`` changes: heartbeat, mode, and the communication and mapping of the first PDOs."""
+    objects = ((0x1017, 0), (0x6060, 0), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1A00, 1), (0x1400, 2), (0x1600, 0))
+    return [
+        tuple(network.link.objects(node_id).read_bytes(index, sub) for index, sub in objects)
+        for node_id in network.node_ids
+    ]
+
+
+@pytest.mark.usefixtures("cell")
+def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, ...]) -> None:
+    events: list[CellEvent] = []
+    with CanopenNetwork(address, axes) as network:
+        found = network.scan(range(1, 20))
+        assert [(node.node_id, node.state) for node in found] == [(n, State.SWITCH_ON_DISABLED) for n in range(1, 7)]
+        assert [node.identity for node in found] == [axis.identity for axis in axes]
+        before = settings(network)
+        network.prepare()
+        assert settings(network) != before
+        assert network.ampere_per_unit() == pytest.approx((0.002, 0.002, 0.002, 0.0015, 0.0015, 0.0015))
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0), events.append)
+        start = next(stream).position_counts
+        target = tuple(position + step for position, step in zip(start, (1, -1, 0, 2, -2, 3), strict=True))
+        target = tuple(a + 30_000 * (b - a) for a, b in zip(start, target, strict=True))
+        moves = (
+            synchronised_move(start, target, ROOM, dwell_cycles=20),
+            synchronised_move(target, start, ROOM, dwell_cycles=20),
+        )
+        with closing(execute(network, stream, moves, PERMISSION)) as samples:
+            recorded = list(samples)
+        assert [sample.cycle for sample in recorded] == list(range(1, len(recorded) + 1))
+        assert stream.statistics.frames == 6 * stream.statistics.cycles
+        assert stream.statistics.missing == stream.statistics.duplicate == stream.statistics.surplus == 0
+        marks = [event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)]
+        assert [mark.code for mark in marks] == [0, 0, 1, 1]
+        arrived = next(sample for sample in recorded if sample.time_ns == marks[1].time_ns)
+        for position, wanted in zip(arrived.position_counts, target, strict=True):
+            assert abs(position - wanted) < 2000
+        assert any(any(sample.current_raw) for sample in recorded)
+    with CanopenNetwork(address, axes) as network:
+        assert {node.state for node in network.scan(range(1, 7))} == {State.SWITCH_ON_DISABLED}
+        assert settings(network) == before
+
+
+@pytest.mark.usefixtures("cell")
+def test_a_closed_run_leaves_no_axis_with_power(address: BusAddress, axes: tuple[Axis, ...]) -> None:
+    with CanopenNetwork(address, axes) as network:
+        network.prepare()
+        stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
+        start = next(stream).position_counts
+        far = synchronised_move(start, tuple(position + 300_000 for position in start), ROOM)
+        with closing(execute(network, stream, (far,), PERMISSION)) as samples:
+            for sample in samples:
+                if sample.position_counts[0] - start[0] > 50_000:
+                    break
+        stopped = next(stream)
+        assert max(stopped.position_counts[0] - start[0], 0) < 300_000
+        assert all(word & 0x6F == 0x40 for word in stopped.statusword)
+
+
+@pytest.mark.usefixtures("cell")
+def test_an_emergency_of_a_node_stops_the_others(address: BusAddress, axes: tuple[Axis, ...]) -> None:
+    intruder = open_bus(address)
+    try:
+        with CanopenNetwork(address, axes) as network:
+            network.prepare()
+            stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
+            start = next(stream).position_counts
+            far = synchronised_move(start, tuple(position + 300_000 for position in start), ROOM)
+            with (
+                pytest.raises(DriveFault, match=r"node 3: .*2310h"),
+                closing(execute(network, stream, (far,), PERMISSION)) as samples,
+            ):
+                for sample in samples:
+                    if sample.cycle == 100:
+                        emcy = can.Message(arbitration_id=0x83, is_extended_id=False, data=b"\x10\x23\x03" + bytes(5))
+                        intruder.send(emcy)
+            assert all(word & 0x6F == 0x40 for word in network.statuswords())
+    finally:
+        intruder.shutdown()

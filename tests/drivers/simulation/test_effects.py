@@ -1,0 +1,247 @@
+"""Every undeclared effect changes the torque with the signature it claims, and nothing else."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.simulation.effects import EFFECTS, Lag, Moment, Presliding, build_effect
+from drivers.simulation.plant import Plant, link_model, motor_rows
+from drivers.simulation.spec import EffectUnknown, SpecInvalid, UndeclaredEffect
+from tests.drivers.simulation.cells import FloatArray, clean_cell
+
+STEP_S = 0.25e-3
+POSTURE = np.array([0.3, -0.5, 1.2, 0.4, 0.7, -0.2])
+SPEED = np.array([0.6, -0.5, 0.8, -0.9, 0.7, 0.5])
+
+
+def extra_torque_nm(
+    effect: UndeclaredEffect,
+    speed: FloatArray = SPEED,
+    posture: FloatArray = POSTURE,
+    current: FloatArray | None = None,
+    load_nm: float = 0.0,
+    time_s: float = 0.0,
+) -> FloatArray:
+    """What the effect adds to the torque on each joint in one step, from the change of velocity that it makes."""
+    after = []
+    for effects in ((), (effect,)):
+        plant = Plant(clean_cell(effects=effects))
+        plant.set_brakes(np.zeros(6, dtype=np.bool_))
+        plant.position_rad[:] = posture
+        plant.velocity_rad_s[:] = speed
+        plant.motor_rad[:] = clean_cell().ratio @ posture
+        plant.load_torque_nm[:] = load_nm
+        plant.time_s = time_s
+        plant.step(np.zeros(6) if current is None else current)
+        after.append(plant.velocity_rad_s.copy())
+    spec = clean_cell()
+    rows = motor_rows(spec.ratio)
+    model = link_model(spec.urdf, spec.gravity_m_s2, None)
+    viscous = np.diag([axis.viscous_nm_s_rad for axis in spec.axes])
+    motor = [axis.motor_inertia_kg_m2 + STEP_S * axis.motor_viscous_nm_s_rad for axis in spec.axes]
+    inertia = pin.crba(model, model.createData(), posture) + rows.T @ np.diag(motor) @ rows + STEP_S * viscous
+    return np.asarray(inertia @ (after[1] - after[0]) / STEP_S)
+
+
+def only(axis: int, value: float) -> FloatArray:
+    """A torque on one joint."""
+    return np.asarray(value * np.eye(6)[axis])
+
+
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", range(6))
+def test_odd_friction_opposes_the_motion_with_its_law(axis: int, direction: float) -> None:
+    speed = direction * SPEED
+    v, s = abs(SPEED[axis]), np.sign(speed[axis])
+    cases = (
+        (UndeclaredEffect("stribeck", axis, {"rise_nm": 2.0, "speed_rad_s": 0.3}), 2.0 * math.exp(-v / 0.3)),
+        (
+            UndeclaredEffect("nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 1 / 3}),
+            1.5 * v ** (1 / 3),
+        ),
+        (UndeclaredEffect("nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 2.0}), 1.5 * v**2),
+    )
+    for effect, size in cases:
+        np.testing.assert_allclose(extra_torque_nm(effect, speed), only(axis, -s * size), atol=1e-6)
+
+
+@pytest.mark.parametrize("load_nm", [-20.0, 0.0, 5.0, 10.0])
+def test_load_friction_is_proportional_to_the_size_of_the_load(load_nm: float) -> None:
+    effect = UndeclaredEffect("load-friction", 2, {"coefficient": 0.12})
+    extra = extra_torque_nm(effect, load_nm=load_nm)
+    np.testing.assert_allclose(extra, only(2, -0.12 * abs(load_nm) * np.sign(SPEED[2])), atol=1e-6)
+
+
+def test_load_friction_knows_the_payload() -> None:
+    torque = {}
+    for payload in (None, "disc"):
+        plant = Plant(clean_cell(payload, (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),)))
+        plant.step(np.zeros(6))
+        model = link_model(clean_cell(payload).urdf, (0.0, 0.0, -9.81), clean_cell(payload).payload)
+        weight = pin.computeGeneralizedGravity(model, model.createData(), clean_cell().start_rad)
+        np.testing.assert_allclose(plant.load_torque_nm, weight, atol=1e-9)
+        torque[payload] = plant.load_torque_nm[1]
+    assert abs(torque["disc"]) > abs(torque[None]) + 10.0
+
+
+def test_asymmetric_viscous_is_even_in_speed() -> None:
+    effect = UndeclaredEffect("asymmetric-viscous", 1, {"coefficient_nm_s_rad": 0.8})
+    forwards, backwards = extra_torque_nm(effect, -SPEED), extra_torque_nm(effect, SPEED)
+    # Implicit in the step, so it acts on the speed at its end.
+    np.testing.assert_allclose(forwards, only(1, -0.8 * abs(SPEED[1])), atol=0.05)
+    np.testing.assert_allclose(backwards, forwards, atol=0.05)
+
+
+def test_spring_depends_on_position_alone() -> None:
+    effect = UndeclaredEffect("spring", 1, {"stiffness_nm_per_rad": 30.0, "rest_rad": 0.2})
+    for speed in (SPEED, -SPEED):
+        np.testing.assert_allclose(extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6)
+
+
+def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> None:
+    effect = UndeclaredEffect("position-friction", 2, {"amplitude_nm": 2.0, "phase_rad": 0.4})
+    for turn in (0.0, 1.0, 2.5):
+        posture = POSTURE + only(2, turn)
+        expected = only(2, -2.0 * math.cos(posture[2] - 0.4) * np.sign(SPEED[2]))
+        np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
+
+
+def test_cogging_repeats_with_the_motor_and_acts_along_its_gear() -> None:
+    effect = UndeclaredEffect("cogging", 5, {"amplitude_nm": 0.7, "order": 4.0})
+    ratio = clean_cell().ratio
+    for turn in (0.0, 0.01, 2 * np.pi / (4 * 32)):
+        posture = POSTURE + only(5, turn)
+        ripple = -0.7 * math.sin(4.0 * float(ratio[5] @ posture))
+        expected = np.array([0.0, 0.0, 0.0, 0.0, ripple, ripple])  # motor 6 pulls on joints 5 and 6 (eq. 24)
+        np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
+
+
+def test_saturation_takes_a_cubic_share_of_the_torque() -> None:
+    effect = UndeclaredEffect("saturation", 0, {"half_current_a": 6.0})
+    gain = clean_cell().axes[0].gain_nm_per_a
+    for current in (-3.0, -0.3, 0.3, 3.0, 6.0):
+        extra = extra_torque_nm(effect, current=only(0, current))
+        lost = gain * current * (1 - 1 / (1 + (current / 6.0) ** 2))
+        np.testing.assert_allclose(extra, only(0, -lost), atol=1e-6)
+
+
+def test_warm_up_fades_with_time() -> None:
+    effect = UndeclaredEffect("warm-up", 0, {"cold_fraction": 0.5, "time_constant_s": 100.0})
+    cold, later = extra_torque_nm(effect)[0], extra_torque_nm(effect, time_s=100.0)[0]
+    axis = clean_cell().axes[0]
+    assert cold == pytest.approx(-0.5 * (axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[0]), rel=0.02)
+    assert later / cold == pytest.approx(math.exp(-1.0), rel=1e-3)
+
+
+def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
+    effect = Presliding(axis=0, torque_nm=3.0, distance_rad=0.01, bristle=-1.0)
+    moment = Moment(0.0, STEP_S, *(np.zeros(1) for _ in range(9)))
+    moment.velocity_rad_s[0] = 0.4
+    travelled, torque = 0.0, []
+    while travelled < 0.05:
+        moment.bound_nm[0], moment.torque_nm[0] = 5.0, 0.0
+        effect.act(moment)
+        travelled += 0.4 * STEP_S
+        torque.append(float(moment.torque_nm[0]))
+        assert moment.bound_nm[0] == 2.0
+        assert torque[-1] == pytest.approx(-3.0 * (1.0 - 2.0 * math.exp(-travelled / 0.01)))
+    assert torque[0] > 2.5
+    assert torque[-1] < -2.9
+
+
+def test_coupling_rubs_on_the_sum_of_two_joints() -> None:
+    effect = UndeclaredEffect("coupling", 3, {"other_axis": 5, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3})
+    same = SPEED.copy()
+    same[3:5] = [0.5, 0.9]
+    size = -(0.4 + 0.3 * 1.4)
+    np.testing.assert_allclose(extra_torque_nm(effect, same), only(3, size) + only(4, size), atol=1e-6)
+    against = SPEED.copy()
+    against[3:5] = [0.9, -0.4]
+    size = -(0.4 + 0.3 * 0.5)
+    np.testing.assert_allclose(extra_torque_nm(effect, against), only(3, size) + only(4, size), atol=1e-6)
+
+
+def held_twist_rad(effect: UndeclaredEffect, current_a: float) -> float:
+    """How far motor 1 stands from its joint when its brake is open, joint 1 free of load, and a current pushes."""
+    spec = clean_cell(effects=(effect,))
+    # A joint that does not move under this current: the twist is the drive's alone.
+    axes = (replace(spec.axes[0], coulomb_nm=500.0, offset_nm=0.0), *spec.axes[1:])
+    plant = Plant(replace(spec, axes=axes))
+    plant.set_brakes(np.array([False, True, True, True, True, True]))
+    for _ in range(4000):
+        plant.step(only(0, current_a))
+    assert plant.position_rad[0] == spec.start_rad[0]
+    return float(plant.position_rad[6] - plant.position_rad[0])
+
+
+def test_an_elastic_drive_twists_by_torque_over_stiffness() -> None:
+    effect = UndeclaredEffect("elasticity", 0, {"stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0})
+    gain = clean_cell().axes[0].gain_nm_per_a
+    for current in (-1.0, 2.0):
+        assert held_twist_rad(effect, current) == pytest.approx(gain * current / 8000.0, rel=1e-6)
+
+
+def test_a_drive_with_backlash_has_its_gap_between_both_flanks() -> None:
+    parameters = {"gap_rad": 0.002, "stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0}
+    effect = UndeclaredEffect("backlash", 0, parameters)
+    gain = clean_cell().axes[0].gain_nm_per_a
+    lost = held_twist_rad(effect, 1.0) - held_twist_rad(effect, -1.0)
+    assert lost == pytest.approx(0.002 + 2 * gain / 8000.0, rel=1e-3)
+
+
+def test_lag_is_of_first_order() -> None:
+    lag = Lag(axis=1, time_constant_s=0.005)
+    for k in range(1, 60):
+        reported = np.array([1.0, 1.0])
+        lag.report(reported, STEP_S)
+        assert reported[0] == 1.0
+        assert reported[1] == pytest.approx(1.0 - math.exp(-k * STEP_S / 0.005))
+
+
+@given(speed=st.floats(-3.0, 3.0), load=st.floats(-60.0, 60.0), angle=st.floats(-3.0, 3.0), time=st.floats(0.0, 1e4))
+@settings(max_examples=60, deadline=None)
+def test_bounds_of_dry_friction_never_become_negative(speed: float, load: float, angle: float, time: float) -> None:
+    for name, parameters in (
+        ("stribeck", {"rise_nm": 2.0, "speed_rad_s": 0.1}),
+        ("load-friction", {"coefficient": 0.2}),
+        ("nonlinear-viscous", {"torque_at_1_rad_s_nm": 1.0, "exponent": 0.5}),
+        ("position-friction", {"amplitude_nm": 4.0, "phase_rad": 0.0}),
+        ("warm-up", {"cold_fraction": 1.0, "time_constant_s": 10.0}),
+        ("presliding", {"torque_nm": 9.0, "distance_rad": 0.01}),
+    ):
+        moment = Moment(time, STEP_S, *(np.zeros(1) for _ in range(9)))
+        moment.bound_nm[0], moment.load_torque_nm[0] = 1.0, load
+        moment.velocity_rad_s[0], moment.position_rad[0] = speed, angle
+        effect = build_effect(UndeclaredEffect(name, 0, parameters), 1)
+        assert not isinstance(effect, Lag)
+        effect.act(moment)
+        assert moment.bound_nm[0] >= 0.0
+
+
+def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
+    with pytest.raises(EffectUnknown, match="stribeck, load-friction"):
+        build_effect(UndeclaredEffect("striebeck", 0, {}), 6)
+    with pytest.raises(
+        EffectUnknown, match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, speed_rad_s"
+    ):
+        build_effect(UndeclaredEffect("stribeck", 0, {"rise": 1.0, "speed_rad_s": 0.1}), 6)
+    with pytest.raises(EffectUnknown, match="axis 7"):
+        build_effect(UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6)
+    with pytest.raises(EffectUnknown, match="other_axis"):
+        build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
+    with pytest.raises(EffectUnknown, match="unknown parameter bristle"):
+        build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
+    assert len(dict(EFFECTS)) == len(EFFECTS) == 14
+
+
+def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
+    effect = UndeclaredEffect("elasticity", 5, {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0})
+    with pytest.raises(SpecInvalid, match="too stiff"):
+        Plant(clean_cell(effects=(effect,)))

@@ -1,0 +1,55 @@
+"""What a simulated amplifier keeps: a gain that somebody entered, stored by 1010h, there again after power-on."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import pytest
+
+from drivers.simulation.faults import FaultKind, FaultSpec
+from tests.drivers.simulation.cells import clean_cell, running
+
+GAIN, SAVE, NOT_IN_THIS_STATE = 0x2003, int.from_bytes(b"save", "little"), 0x08000022
+
+
+def test_the_entered_gain_is_told_in_both_objects(request: pytest.FixtureRequest) -> None:
+    spec = clean_cell()
+    axes = (replace(spec.axes[0], entered_gain_nm_per_a=-11.52), *spec.axes[1:])
+    with running(replace(spec, axes=axes), request.node.name) as (_, master):
+        assert master.read(1, GAIN, 1, "i") == -11520
+        assert struct.unpack("<f", struct.pack("<I", master.read(1, GAIN, 2, "I")))[0] == pytest.approx(-11.52)
+        assert master.read(2, GAIN, 1, "i") == 0  # nobody has entered it, and the cell does not tell its truth
+
+
+def test_what_was_stored_comes_back_with_the_power(request: pytest.FixtureRequest) -> None:
+    with running(clean_cell(), request.node.name) as (cell, master):
+        assert master.write(3, GAIN, 1, "i", 24200) == 0
+        assert cell.nodes[2].saved.values[GAIN, 1] == 0
+        assert master.write(3, 0x1010, 1, "I", SAVE) == 0
+        assert cell.nodes[2].saved.values[GAIN, 1] == 24200
+        assert master.write(3, GAIN, 1, "i", 7) == 0
+        master.send(0x000, bytes([0x81, 3]))
+        while master.receive()[0] != 0x703:
+            pass
+        assert master.read(3, GAIN, 1, "i") == 24200
+
+
+def test_nothing_is_stored_while_the_motor_has_power(request: pytest.FixtureRequest) -> None:
+    with running(clean_cell(), request.node.name) as (_, master):
+        for controlword in (0x06, 0x07, 0x0F):
+            assert master.write(2, 0x6040, 0, "H", controlword) == 0
+        assert master.write(2, 0x1010, 1, "I", SAVE) == NOT_IN_THIS_STATE
+        assert master.write(2, 0x6040, 0, "H", 0) == 0
+        assert master.write(2, 0x1010, 1, "I", SAVE) == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "gain", "save"),
+    [(FaultKind.REFUSES_WRITE, NOT_IN_THIS_STATE, 0), (FaultKind.REFUSES_SAVE, 0, NOT_IN_THIS_STATE)],
+)
+def test_an_amplifier_may_refuse(request: pytest.FixtureRequest, kind: FaultKind, gain: int, save: int) -> None:
+    spec = replace(clean_cell(), faults=(FaultSpec(kind, 1),))
+    with running(spec, request.node.name) as (_, master):
+        assert (master.write(2, GAIN, 1, "i", 5), master.write(2, 0x1010, 1, "I", SAVE)) == (gain, save)
+        assert (master.write(1, GAIN, 1, "i", 5), master.write(1, 0x1010, 1, "I", SAVE)) == (0, 0)

@@ -1,0 +1,78 @@
+"""Who sends SYNC for us, and that they are told to stop."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.errors import BusError, ObjectAccessError
+from drivers.stream.sync import PRODUCES, DriveProducer, KernelProducer
+from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
+
+PERIOD_US = 2000
+
+
+def with_sync_objects(node: ScriptedNode, cob_id: int = 0x80, period_us: int = 0) -> ScriptedNode:
+    node.objects[0x1005, 0] = (cob_id, 4)
+    node.objects[0x1006, 0] = (period_us, 4)
+    return node
+
+
+def written(bus: ScriptedBus, node_id: int) -> list[tuple[int, int]]:
+    """Index and value of every object that was written, in their order."""
+    requests = [bytes(m.data) for m in bus.sent if m.arbitration_id == 0x600 + node_id and m.data[0] >> 5 == 1]
+    return [(int.from_bytes(data[1:3], "little"), int.from_bytes(data[4:8], "little")) for data in requests]
+
+
+@pytest.mark.parametrize(("cob_id", "period_us"), [(0x80, 0), (0x80, 500), (0x80 | PRODUCES, 1000), (0x85, 0)])
+def test_a_drive_is_told_last_to_produce_and_gets_its_objects_back(cob_id: int, period_us: int) -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[1], cob_id, period_us)
+    with network:
+        with DriveProducer(network, 1, PERIOD_US) as producer:
+            assert network.link.sync_producer is None
+            producer.start()
+            assert network.link.sync_producer == "J2"
+            assert written(bus, 2) == [(0x1005, 0x80), (0x1006, PERIOD_US), (0x1005, 0x80 | PRODUCES)]
+            bus.sent.clear()
+        assert network.link.sync_producer is None
+        assert written(bus, 2)[0] == (0x1005, cob_id & ~PRODUCES)  # it falls silent first
+        assert (node.value(0x1005, 0), node.value(0x1006, 0)) == (cob_id, period_us)
+
+
+def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[0], period_us=7)
+    node.aborts[0x1006, 0] = 0x06010002
+    refused = pytest.raises(ObjectAccessError, match="1006h")
+    with network, refused as refusal, DriveProducer(network, 0, PERIOD_US) as producer:
+        producer.start()
+    assert node.value(0x1005, 0) == 0x80
+    assert network.link.sync_producer is None
+    assert "while stopping SYNC" in " ".join(refusal.value.__notes__)
+
+
+def test_a_drive_that_has_fallen_silent_is_not_asked() -> None:
+    network, bus = cell()
+    with_sync_objects(bus.nodes[0])
+    with network:
+        with DriveProducer(network, 0, PERIOD_US) as producer:
+            producer.start()
+            bus.sent.clear()
+            network.link.silent.add(1)
+        assert written(bus, 1) == []
+
+
+def test_a_producer_that_was_not_started_changes_nothing() -> None:
+    network, bus = cell()
+    with network:
+        with DriveProducer(network, 0, PERIOD_US), KernelProducer(network, PERIOD_US):
+            pass
+        assert bus.sent == []
+
+
+def test_the_kernel_sends_on_its_own_buses_alone() -> None:
+    network, _ = cell()
+    with network, KernelProducer(network, PERIOD_US) as producer:
+        with pytest.raises(BusError, match="needs one bus of interface socketcan"):
+            producer.start()
+        assert network.link.sync_producer is None

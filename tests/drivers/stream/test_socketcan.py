@@ -1,0 +1,313 @@
+"""The end of a SocketCAN bus and its capture process, with a pair of packet sockets in place of the kernel's CAN."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.canopen.bus import BusAddress
+from drivers.canopen.link import SYNC_COB_ID, Link
+from drivers.canopen.sdo import SdoPolicy
+from drivers.errors import BusError
+from drivers.stream.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime, Record
+from drivers.stream.sample import EventKind
+from drivers.stream.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
+from tests.drivers.scripted import FakeClock
+
+ADDRESS = BusAddress("socketcan", "pair")
+WAIT_S = 10.0
+FRAME = struct.Struct("=IB3x8s")
+NO_INTERFACE = "no-such-interface"
+Pair = tuple[SocketcanBus, socket.socket]
+
+u64 = st.integers(0, 2**64 - 1)
+times = st.integers(-(2**63), 2**63 - 1)
+records = st.builds(
+    Record,
+    times,
+    times,
+    u64,
+    u64,
+    u64,
+    st.integers(0, 2**32 - 1),
+    st.sampled_from(Kind).map(int),
+    st.integers(0, 8),
+    st.booleans(),
+    st.booleans(),
+    st.binary(min_size=8, max_size=8),
+)
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    """A bus whose wire is the other socket."""
+    ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with wire:
+        bus = SocketcanBus(NO_INTERFACE, ours)
+        yield bus, wire
+        bus.shutdown()
+
+
+def received(bus: SocketcanBus) -> CapturedMessage:
+    message = bus.recv(WAIT_S)
+    assert isinstance(message, CapturedMessage)
+    return message
+
+
+@given(records)
+def test_a_record_comes_out_as_it_went_in(record: Record) -> None:
+    assert Record(*RECORD.unpack(RECORD.pack(*record))) == record
+
+
+@given(st.lists(st.integers(0, 2**31 - 1), max_size=20))
+def test_the_drop_counter_goes_on_beyond_its_32_bits(steps: list[int]) -> None:
+    counter, total = DropCounter(), 0
+    for step in steps:
+        before, total = total, total + step
+        assert counter.see(total & 0xFFFF_FFFF) == total
+        assert counter.see(before & 0xFFFF_FFFF) == total  # a frame that was queued before the drops
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 10**9), st.integers(0, 10**7)), min_size=1, max_size=30),
+    st.integers(0, 29),
+    st.integers(-(10**15), 10**15),
+)
+def test_no_setting_of_the_wall_clock_moves_a_stamp(frames: list[tuple[int, int]], when: int, jump_ns: int) -> None:
+    """Each frame comes some time after the last and waits to be read; once somebody sets the clock while one waits."""
+    now_ns = offset_ns = last_ns = 10**18
+    time = MonotonicTime(now_ns + offset_ns, now_ns)
+    for number, (gap_ns, wait_ns) in enumerate(frames):
+        true_ns = now_ns + gap_ns
+        stamp_ns = true_ns + offset_ns
+        now_ns = true_ns + wait_ns
+        offset_ns += jump_ns if number == when else 0
+        found_ns = time.of(stamp_ns, now_ns + offset_ns, now_ns)
+        assert last_ns <= found_ns <= now_ns
+        # A step that could as well be time that has passed since the last frame cannot be told from that.
+        doubt_ns = abs(jump_ns) if number == when and abs(jump_ns) <= gap_ns + wait_ns + 10**6 else 0
+        assert abs(found_ns - true_ns) <= doubt_ns
+        last_ns = found_ns
+
+
+frames = st.builds(
+    lambda extended, remote, number, data: can.Message(
+        arbitration_id=number if extended else number & 0x7FF,
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        data=b"" if remote else data,
+        dlc=len(data),
+    ),
+    st.booleans(),
+    st.booleans(),
+    st.integers(0, 0x1FFF_FFFF),
+    st.binary(max_size=8),
+)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.lists(frames, min_size=1, max_size=20))
+def test_what_is_sent_is_what_the_other_end_receives(burst: list[can.Message]) -> None:
+    # Two buses over one wire: what the first packs the second unpacks.
+    ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    first, second = SocketcanBus(NO_INTERFACE, ours), SocketcanBus(NO_INTERFACE, wire)
+    for frame in burst:
+        first.send(frame)
+    for frame in burst:
+        assert received(second).equals(frame, timestamp_delta=None, check_channel=False, check_direction=False)
+    assert second.recv(0.0) is None
+    first.shutdown()
+    second.shutdown()
+
+
+def test_stamps_are_whole_nanoseconds_that_never_go_back(pair: Pair) -> None:
+    bus, wire = pair
+    for number in range(300):
+        wire.send(FRAME.pack(0x181, 2, number.to_bytes(8, "little")))
+    messages = [received(bus) for _ in range(300)]
+    assert [int.from_bytes(message.data, "little") for message in messages] == list(range(300))
+    stamps = [message.monotonic_ns for message in messages]
+    assert all(type(stamp) is int for stamp in stamps)
+    assert stamps == sorted(stamps)
+    assert losses_of(bus) == Losses()
+    assert remarks_of(bus) == ()
+
+
+def test_a_full_backlog_is_counted_to_the_frame() -> None:
+    """Nobody reads: what neither the backlog nor the pair holds is lost, and the count comes with what follows."""
+    wire, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    out, parent = socket.socketpair()
+    sent = 0
+    with wire, bus, out, parent:
+        capture = Capture(bus, out, NO_INTERFACE, backlog_records=10)
+        for _ in range(2000):
+            for _ in range(8):
+                wire.send(FRAME.pack(0x181, 0, bytes(8)))
+            sent += 8
+            assert capture.receive() == 0
+            assert capture.forward()
+        parent.setblocking(False)
+        chunks = b""
+        while capture.forward():
+            try:
+                chunks += parent.recv(1 << 20)
+            except BlockingIOError:
+                break
+        told = [Record(*fields) for fields in RECORD.iter_unpack(chunks)]
+        got = sum(record.kind == Kind.FRAME for record in told)
+        assert got < sent
+        assert got + told[-1].backlog_dropped == sent
+        lost = [record.backlog_dropped for record in told]
+        assert lost == sorted(lost)
+
+
+def test_a_capture_process_that_dies_is_named(pair: Pair) -> None:
+    bus, wire = pair
+    wire.send(FRAME.pack(0x181, 0, bytes(8)))
+    assert received(bus).arbitration_id == 0x181
+    os.kill(bus.capture_pid, signal.SIGKILL)
+    with pytest.raises(can.CanOperationError, match=r"capture process ended by itself \(-9\)"):
+        bus.recv(WAIT_S)
+    with pytest.raises(can.CanOperationError, match="capture process ended"):
+        bus.recv(0.0)
+
+
+def test_an_interface_that_goes_is_named_after_its_last_frames() -> None:
+    ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    bus = SocketcanBus(NO_INTERFACE, ours)
+    wire.send(FRAME.pack(0x181, 0, bytes(8)))
+    wire.close()
+    assert received(bus).arbitration_id == 0x181
+    with pytest.raises(can.CanOperationError, match="interface has gone \\(ENODEV\\)"):
+        bus.recv(WAIT_S)
+    bus.shutdown()
+
+
+def test_an_interrupt_while_records_are_read_loses_and_misaligns_none(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus, wire = pair
+    make, calls = bus._message, 0
+
+    def interrupted(*fields: Any) -> CapturedMessage:
+        nonlocal calls
+        calls += 1
+        if calls in (1, 3):
+            raise KeyboardInterrupt
+        return make(*fields)
+
+    monkeypatch.setattr(bus, "_message", interrupted)
+    for number in range(20):
+        wire.send(FRAME.pack(0x181, 1, bytes((number,)) * 8))
+    got: list[int] = []
+    while len(got) < 20:
+        with suppress(KeyboardInterrupt):
+            got.append(received(bus).data[0])
+    assert got == list(range(20))
+    assert calls > 20
+
+
+def test_ctrl_c_does_not_end_the_capture(pair: Pair) -> None:
+    bus, wire = pair
+    assert os.getsid(bus.capture_pid) != os.getsid(0)
+    os.kill(bus.capture_pid, signal.SIGINT)
+    wire.send(FRAME.pack(0x181, 0, bytes(8)))
+    assert received(bus).arbitration_id == 0x181
+
+
+def test_shutdown_ends_the_capture(pair: Pair) -> None:
+    bus, _ = pair
+    bus.shutdown()
+    with pytest.raises(ProcessLookupError):
+        os.kill(bus.capture_pid, 0)
+    with pytest.raises(can.CanOperationError):
+        bus.recv(0.0)
+    bus.shutdown()
+
+
+def _dispatch(*frames: bytes) -> Link:
+    """A link that has heard these frames."""
+    ours, wire = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    link = Link(ADDRESS, SdoPolicy(), FakeClock(), lambda _address: SocketcanBus(NO_INTERFACE, ours))
+    link.open()
+    with wire:
+        for frame in frames:
+            wire.send(frame)
+        try:
+            for _ in frames:
+                link.pump(WAIT_S)
+        finally:
+            link.close()
+    return link
+
+
+def _error_frame(kind: int, controller: int = 0) -> bytes:
+    return FRAME.pack(0x2000_0000 | kind, 8, bytes((0, controller, 0, 0, 0, 0, 0, 0)))
+
+
+def test_bus_off_ends_it() -> None:
+    with pytest.raises(BusError, match="bus-off"):
+        _dispatch(_error_frame(0x40))
+
+
+@pytest.mark.parametrize(
+    ("frame", "kind", "says"),
+    [
+        (_error_frame(0x4, 0x10), EventKind.BUS_PASSIVE, "error passive"),
+        (_error_frame(0x4, 0x20), EventKind.BUS_PASSIVE, "error passive"),
+        (_error_frame(0x4, 0x01), EventKind.CONTROLLER, "overflows"),
+        (_error_frame(0x4, 0x08), EventKind.CONTROLLER, "counts errors"),
+        (_error_frame(0x4, 0x40), EventKind.CONTROLLER, "recovered"),
+        (_error_frame(0x100), EventKind.CONTROLLER, "restarted"),
+    ],
+)
+def test_what_the_controller_says_of_itself_is_an_event(frame: bytes, kind: EventKind, says: str) -> None:
+    (event,) = _dispatch(frame).take_events(5, ())
+    assert (event.kind, event.axis, event.time_ns) == (kind, None, 5)
+    assert says in event.text
+
+
+def test_a_sync_of_somebody_else_is_foreign_until_we_asked_for_it() -> None:
+    frame = FRAME.pack(SYNC_COB_ID, 0, bytes(8))
+    assert _dispatch(frame).foreign == {SYNC_COB_ID: 1}
+
+
+@pytest.mark.parametrize("number", [errno.ENOBUFS, errno.EAGAIN])
+def test_a_full_transmit_queue_is_waited_for_and_then_named(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    bus, _ = pair
+    tries = 0
+
+    class Full:
+        def send(self, _frame: bytes, flags: int) -> int:
+            assert flags & socket.MSG_DONTWAIT
+            nonlocal tries
+            tries += 1
+            if tries == 3:
+                return 16
+            raise OSError(number, "full")
+
+    monkeypatch.setattr(bus, "_socket", Full())
+    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    assert tries == 3
+    with pytest.raises(can.CanOperationError, match="does any node acknowledge"):
+        bus.send(can.Message(arbitration_id=1, is_extended_id=False), timeout=0.001)
+    monkeypatch.undo()
+
+
+def test_an_interface_that_is_not_there() -> None:
+    with pytest.raises(OSError):
+        open_socketcan(NO_INTERFACE)

@@ -1,0 +1,683 @@
+"""The stream against frames that are lost, late, doubled, cut and unasked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.errors import BusBusy, BusError, DriveFault, DriverError, HeartbeatLost, SampleLost
+from drivers.stream.sample import CellEvent, EventKind
+from drivers.stream.socketcan import CapturedMessage, Losses
+from drivers.stream.stream import StreamStatistics, SyncStream
+from drivers.stream.sync import FollowedSync, LockstepSync, SyncRate, TimedSync, steered_us
+from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
+
+Prepared = tuple[SyncStream, ScriptedBus, list[CellEvent]]
+
+
+def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
+    """A lockstep (or timed) stream of a prepared network; the position of every axis is its cycle number."""
+    network, bus = cell(axes)
+    events: list[CellEvent] = []
+
+    def count_cycles(cycle: int) -> None:
+        for node in bus.nodes:
+            node.position = cycle
+
+    with network:
+        network.prepare()
+        bus.cycle = -1
+        bus.on_cycle = count_cycles
+        pacing = TimedSync(PERIOD_NS, 77, bus.clock) if timed else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
+        yield SyncStream(network, pacing, events.append), bus, events
+        bus.tamper = lambda message: (message,)
+        for node in bus.nodes:
+            node.beats, node.nmt = True, 5
+
+
+@pytest.fixture
+def lockstep() -> Iterator[Prepared]:
+    yield from prepared()
+
+
+@pytest.fixture
+def timed() -> Iterator[Prepared]:
+    yield from prepared(timed=True)
+
+
+def faults_of(stream: SyncStream) -> Iterator[str]:
+    """What waits to be raised, taken out."""
+    while True:
+        try:
+            stream.check()
+        except DriverError as fault:
+            yield str(fault)
+        else:
+            return
+
+
+def drop(bus: ScriptedBus, cob_id: int, cycles: range) -> None:
+    bus.tamper = lambda m: () if m.arbitration_id == cob_id and bus.cycle in cycles else (m,)
+
+
+def test_samples_carry_the_syncs_time_and_all_axes(lockstep: Prepared) -> None:
+    stream, _, _ = lockstep
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.cycle for sample in samples] == [0, 1, 2, 3, 4]
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+
+
+def test_a_missing_frame_is_a_bit_and_repeats_the_last_value(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    drop(bus, 0x182, range(2, 3))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
+    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
+    assert [sample.position_counts[0] for sample in samples] == [0, 1, 2, 3, 4]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1)
+    lost = [event for event in events if event.kind is EventKind.SAMPLE_LOST]
+    assert [(event.axis, event.code, event.time_ns) for event in lost] == [(1, 2, samples[2].time_ns)]
+
+
+def test_a_late_frame_is_never_taken_for_the_next_cycles(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    held: list[can.Message] = []
+
+    def hold_one(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x182 and bus.cycle == 2:
+            held.append(message)
+            return ()
+        return (held.pop(), message) if held and message.arbitration_id == 0x182 else (message,)
+
+    bus.tamper = hold_one
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
+    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1, late=1)
+
+
+def test_a_late_frame_between_two_syncs_is_dropped(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    drop(bus, 0x181, range(1, 2))
+    assert [next(stream).missing for _ in range(2)] == [0, 1]
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))
+    sample = next(stream)
+    assert (sample.missing, sample.position_counts[0]) == (0, 2)
+    assert stream.statistics.late == 1
+
+
+def test_a_duplicate_is_counted_and_changes_nothing(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x181 and bus.cycle == 1 else (m,)
+    samples = [next(stream) for _ in range(4)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
+    assert stream.statistics == StreamStatistics(cycles=4, frames=8, duplicate=1)
+
+
+def test_a_duplicate_of_the_last_axis_is_found_before_the_next_sync(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
+    samples = [next(stream) for _ in range(4)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
+    assert stream.statistics.duplicate == 1
+
+
+@pytest.mark.parametrize("length", [0, 7])
+def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> None:
+    stream, bus, _ = lockstep
+
+    def cut(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x181 and bus.cycle == 1:
+            return (can.Message(arbitration_id=0x181, is_extended_id=False, data=message.data[:length]),)
+        return (message,)
+
+    bus.tamper = cut
+    assert [next(stream).missing for _ in range(3)] == [0, 1, 0]
+    assert stream.statistics == StreamStatistics(cycles=3, frames=5, missing=1, wrong_length=1)
+
+
+def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))  # before the first SYNC
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))  # of a foreign node
+    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))  # another identifier
+    assert next(stream).position_counts == (1, 1)
+    assert stream.statistics == StreamStatistics(cycles=2, frames=4, foreign=3)
+
+
+def test_a_frame_that_an_axis_was_not_told_to_send_is_surplus(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))  # TPDO4 of node 1
+    assert next(stream).position_counts == (1, 1)
+    assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=1)
+
+
+def test_too_many_missing_cycles_in_a_row_end_the_stream(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    drop(bus, 0x182, range(1, 100))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 2, 2, 2, 2]
+    with pytest.raises(SampleLost, match="cycle 4: no answer from axis 2"):
+        next(stream)
+
+
+def test_emcy_is_an_event_then_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.inject(bus.nodes[1].emcy(0x7305))
+    sample = next(stream)
+    emcy = next(event for event in events if event.kind is EventKind.EMCY)
+    assert (emcy.axis, emcy.code, emcy.time_ns) == (1, 0x7305, sample.time_ns)
+    with pytest.raises(DriveFault, match=r"node 2: .*7305h") as fault:
+        next(stream)
+    assert fault.value.emcy_code == 0x7305
+
+
+@pytest.mark.parametrize("following_error", [False, True])
+def test_a_new_fault_is_seen_in_the_sample_and_raised_after_it(lockstep: Prepared, following_error: bool) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.nodes[0].fault(following_error)
+    assert next(stream).statusword[0] & 0x08
+    assert any(event.kind is EventKind.STATE and "FAULT" in event.text for event in events)
+    with pytest.raises(DriveFault, match="FAULT"):
+        next(stream)
+
+
+def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.nodes[0].fault()
+    assert [next(stream).cycle for _ in range(3)] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("following_error", [False, True])
+def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(lockstep: Prepared, following_error: bool) -> None:
+    """Its statusword before its first answer is nobody's: what it says then is no change."""
+    stream, bus, events = lockstep
+    bus.nodes[1].fault(following_error)
+    drop(bus, 0x182, range(2))
+    samples = [next(stream) for _ in range(6)]
+    assert [sample.missing for sample in samples] == [2, 2, 0, 0, 0, 0]
+    states = [event for event in events if event.kind is EventKind.STATE and event.axis == 1]
+    assert [(event.time_ns, event.code) for event in states] == [(samples[2].time_ns, samples[2].statusword[1])]
+    bus.nodes[1].fault()
+    bus.nodes[0].fault()
+    next(stream)
+    with pytest.raises(DriveFault, match="node 1"):
+        next(stream)
+
+
+def test_a_limit_that_acts_is_an_event_alone(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.nodes[0].statusword |= 1 << 11
+    next(stream)
+    bus.nodes[0].statusword &= ~(1 << 11)
+    next(stream)
+    assert [event.text for event in events if event.kind is EventKind.LIMIT] == [
+        "J1: a limit acts",
+        "J1: the limit acts no more",
+    ]
+
+
+def test_heartbeat_loss_is_noticed_within_two_and_a_half_periods(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    for _ in range(100):
+        next(stream)
+        bus.clock.now_ns += PERIOD_NS
+    silent_since = stream.time_ns
+    bus.nodes[1].beats = False
+    with pytest.raises(HeartbeatLost, match="node 2"):
+        for _ in range(1000):
+            next(stream)
+            bus.clock.now_ns += PERIOD_NS
+    lost = next(event for event in events if event.kind is EventKind.HEARTBEAT_LOST)
+    assert lost.axis == 1
+    assert lost.time_ns - silent_since <= 2.5 * stream.network.heartbeat_ms * 1_000_000
+
+
+def test_a_fast_simulation_is_no_heartbeat_loss(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    bus.nodes[0].beats = bus.nodes[1].beats = False
+    begin = bus.clock.now_ns
+    for _ in range(100):  # 100 ms of samples in 25 ms of the clock
+        next(stream)
+    assert bus.clock.now_ns - begin < 2 * stream.network.heartbeat_ms * 1_000_000
+
+
+def test_a_node_that_falls_back_is_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    for _ in range(3):
+        next(stream)
+    bus.inject(can.Message(arbitration_id=0x702, is_extended_id=False, data=b"\x7f"))
+    next(stream)
+    assert events[-1].kind is EventKind.NMT
+    with pytest.raises(DriveFault, match="left OPERATIONAL, is PRE-OPERATIONAL"):
+        next(stream)
+
+
+def test_a_cut_wire_is_a_bus_error(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    next(stream)
+    bus.broken = True
+    with pytest.raises(BusError, match="wire was cut"):
+        next(stream)
+    bus.broken = False
+
+
+def test_timed_syncs_keep_to_the_schedule(timed: Prepared) -> None:
+    stream, _, _ = timed
+    times = [next(stream).time_ns for _ in range(20)]
+    assert times == [77 + PERIOD_NS * k for k in range(20)]
+
+
+def test_before_the_first_sync_it_is_already_the_start(timed: Prepared, lockstep: Prepared) -> None:
+    assert timed[0].time_ns == lockstep[0].time_ns == 77
+
+
+def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    first = next(stream).time_ns
+    bus.clock.now_ns += round(3.5 * PERIOD_NS)
+    second, third = next(stream), next(stream)
+    assert stream.statistics.skipped_periods == 2
+    assert (second.cycle, third.cycle) == (3, 4)  # periods 1 and 2 had no SYNC
+    assert (third.time_ns - first) == third.cycle * PERIOD_NS
+
+
+def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    drop(bus, 0x181, range(1, 3))
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.missing for sample in samples] == [0, 1, 1, 0, 0]
+    assert [sample.time_ns - samples[0].time_ns for sample in samples] == [PERIOD_NS * k for k in range(5)]
+
+
+@settings(deadline=None)
+@given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
+def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
+    for stream, bus, _ in prepared():
+        stream.max_missing_cycles = 30
+        bus.tamper = lambda m, bus=bus: () if (bus.cycle, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
+        samples = [next(stream) for _ in range(30)]
+        for sample in samples:
+            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (sample.cycle, cob) in dropped)
+            assert sample.missing == expected
+            for axis in range(2):
+                if not sample.missing >> axis & 1:
+                    assert sample.position_counts[axis] == sample.cycle
+        assert stream.statistics.missing == len(dropped)
+        bus.tamper = lambda m: (m,)
+
+
+class Producer:
+    """Somebody who sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
+
+    Attributes:
+        pulses: SYNCs sent.
+        steered: what the stream said that it saw.
+    """
+
+    def __init__(self, bus: ScriptedBus) -> None:
+        self._bus = bus
+        self.pulses = 0
+        self.at_ns = bus.clock.now_ns
+        self.steered: list[tuple[int, int]] = []
+
+    def pulse(self, after_ns: int = PERIOD_NS, local: bool = True) -> None:
+        """A SYNC so long after the last one, and its answers."""
+        self.at_ns += after_ns
+        sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False)
+        sync.kernel_ns, sync.monotonic_ns, sync.local = 0, self.at_ns, local
+        self._bus.inject(sync)
+        for node in self._bus.nodes:
+            node.position = self.pulses
+            for answer in node.on_sync(self.pulses):
+                for frame in self._bus.tamper(answer):
+                    self._bus.inject(frame)
+        self.pulses += 1
+
+    def seen(self, monotonic_ns: int, periods: int) -> None:
+        self.steered.append((monotonic_ns, periods))
+
+
+Followed = tuple[SyncStream, ScriptedBus, Producer, list[CellEvent]]
+
+
+def followed_stream() -> Iterator[Followed]:
+    network, bus = cell()
+    events: list[CellEvent] = []
+    with network:
+        network.prepare()
+        network.link.sync_producer = "J1"
+        producer = Producer(bus)
+        pacing = FollowedSync(PERIOD_NS, "J1", timeout_s=0.01, seen=producer.seen, start_ns=77, clock=bus.clock)
+        stream = SyncStream(network, pacing, events.append)
+        receive = bus.recv
+
+        def recv(timeout: float | None = None) -> can.Message | None:
+            message = receive(timeout)
+            if message is None and timeout == 0.0 and producer.pulses == 0:
+                producer.pulse()  # the first: once the stream has thrown away what waited before it began
+            return message
+
+        bus.recv = recv  # type: ignore[method-assign]
+        yield stream, bus, producer, events
+        bus.tamper = lambda message: (message,)
+        for node in bus.nodes:
+            node.beats, node.nmt = True, 5
+
+
+@pytest.fixture
+def followed() -> Iterator[Followed]:
+    yield from followed_stream()
+
+
+def test_a_followed_sync_opens_a_cycle_with_its_own_time(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    sent = len(bus.sent)
+    samples = [next(stream)]
+    for _ in range(4):
+        producer.pulse()
+        bus.clock.now_ns += 7 * PERIOD_NS  # when it is read is nobody's concern
+        samples.append(next(stream))
+    assert [sample.cycle for sample in samples] == list(range(5))
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
+    assert len(bus.sent) == sent
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    assert [periods for _, periods in producer.steered] == [0, 1, 1, 1, 1]
+
+
+def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
+    """A thousand cycles wait; they are told apart by their order, not by the clock."""
+    stream, bus, producer, _ = followed
+    next(stream)
+    for _ in range(1000):
+        producer.pulse()
+    bus.clock.now_ns += 10**12
+    samples = [stream.advance() for _ in range(1000)]
+    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(1, 1001)]
+    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(1, 1001)]
+    assert stream.statistics == StreamStatistics(cycles=1001, frames=2002)
+    with pytest.raises(BusError, match=r"read 1000\.0 s late"):  # but axes do not move on such old news
+        stream.check()
+    stream.check()
+
+
+def test_a_sync_that_did_not_come_is_a_period_that_was_left_out(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    next(stream)
+    producer.pulse(3 * PERIOD_NS)
+    producer.pulse(PERIOD_NS // 2 * 3 - 1)  # late, but none is missing
+    samples = [next(stream), next(stream)]
+    assert [sample.cycle for sample in samples] == [3, 4]
+    assert stream.statistics.skipped_periods == 2
+
+
+def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.tamper = lambda m: () if m.arbitration_id == 0x182 else (m,)
+    producer.pulse()
+    bus.tamper = lambda message: (message,)
+    producer.pulse()
+    producer.pulse()
+    samples = [next(stream) for _ in range(3)]
+    assert [sample.missing for sample in samples] == [2, 0, 0]
+    assert [sample.position_counts for sample in samples] == [(1, 0), (2, 2), (3, 3)]
+    assert stream.statistics == StreamStatistics(cycles=4, frames=7, missing=1)
+
+
+def test_what_is_to_be_sent_goes_out_at_once(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    frame = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6))
+    stream.send((frame,))
+    producer.pulse()
+    next(stream)
+    assert bus.sent[-1] is frame
+
+
+def test_a_producer_that_dies_is_a_fault_and_the_axes_can_still_be_stopped(followed: Followed) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    last_ns = stream.time_ns
+    assert stream.advance().missing == 0  # by a SYNC of ours
+    lost = next(event for event in events if event.kind is EventKind.SYNC_LOST)
+    assert lost.time_ns == last_ns
+    with pytest.raises(BusError, match=r"no SYNC from J1 for 0\.01 s"):
+        next(stream)
+    before = bus.cycle
+    assert [stream.advance().missing for _ in range(3)] == [0, 0, 0]
+    assert bus.cycle == before + 3
+
+
+def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
+    """A bus is never silent for as long as a producer may be: the drives' heartbeats come in between."""
+    for stream, bus, _, events in followed_stream():
+        bus.nodes[0].store(0x1017, 0, 8)
+        bus.nodes[1].store(0x1017, 0, 8)
+        bus.nodes[1].next_beat_ns = bus.clock.now_ns + 4_000_000
+        next(stream)
+        stream.network.link.start_heartbeat(127, 5)
+        begun_ns, sent = bus.clock.now_ns, len(bus.sent)
+        assert stream.advance().missing == 0
+        assert bus.clock.now_ns - begun_ns <= 12_000_000
+        assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
+        assert 0x77F in [frame.arbitration_id for frame in bus.sent[sent:]]  # and ours goes on
+
+
+def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(followed: Followed) -> None:
+    stream, bus, producer, events = followed
+    next(stream)
+    bus.tamper = lambda m: () if m.arbitration_id == 0x182 else (m,)
+    producer.pulse()
+    bus.tamper = lambda message: (message,)
+    begun_ns = bus.clock.now_ns
+    assert stream.advance().missing == 2
+    assert stream.advance().missing == 0
+    assert bus.clock.now_ns - begun_ns <= 17_000_000
+    assert EventKind.SYNC_LOST in [event.kind for event in events]
+
+
+def test_a_flood_of_other_frames_is_no_sign_of_a_producer(followed: Followed) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    receive = bus.recv
+
+    def flood(timeout: float | None = None) -> can.Message | None:
+        if not any(event.kind is EventKind.SYNC_LOST for event in events):
+            bus.clock.now_ns += 20_000
+            return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+        return receive(timeout)
+
+    bus.recv = flood  # type: ignore[method-assign]
+    stream.advance()
+    bus.recv = receive  # type: ignore[method-assign]
+    with pytest.raises(BusError, match="no SYNC from J1"):
+        stream.check()
+
+
+def test_a_bus_that_never_falls_silent_does_not_keep_the_sync_for_ever(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    next(stream)
+    receive, before = bus.recv, bus.cycle
+
+    def flood(timeout: float | None = None) -> can.Message | None:
+        if bus.cycle > before:
+            return receive(timeout)
+        bus.clock.now_ns += 20_000_000
+        return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+
+    bus.recv = flood  # type: ignore[method-assign]
+    stream.advance()
+    bus.recv = receive  # type: ignore[method-assign]
+    with pytest.raises(BusError, match=r"read 1\.0 s late"):
+        stream.check()
+
+
+def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared) -> None:
+    stream, bus, _ = timed
+    next(stream)
+    told: list[str] = []
+    for late_ns in (900_000_000, 1_100_000_000):
+        bus.clock.now_ns += late_ns
+        stream.advance()
+        told.append("; ".join(faults_of(stream)))  # nobody read the heartbeats either
+    assert ["read 1.1 s late" in each for each in told] == [False, True]
+
+
+def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x27F, is_extended_id=False, data=bytes(6)))  # of a node that is no axis
+    own = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6), is_rx=False)
+    bus.inject(own)
+    next(stream)
+    stream.check()
+    bus.inject(can.Message(arbitration_id=0x402, is_extended_id=False, data=bytes(6)))
+    next(stream)
+    assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x402]
+    with pytest.raises(BusBusy, match=r"a set-point of node 2 \(402h\)"):
+        next(stream)
+    assert stream.statistics.surplus == 0
+
+
+def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.losses = Losses()  # type: ignore[attr-defined]
+    bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
+    next(stream)
+    next(stream)
+    before, sent, begun_ns = stream.statistics, len(bus.sent), bus.clock.now_ns
+    bus.losses = Losses(interface=3)  # type: ignore[attr-defined]
+    stream.read_on(0.25)
+    assert bus.clock.now_ns - begun_ns == 250_000_000
+    assert len(bus.sent) == sent
+    assert stream.statistics == replace(before, duplicate=1, interface_dropped=3)
+    assert EventKind.FRAMES_DROPPED in [event.kind for event in events]
+
+
+def test_cycles_of_a_producer_that_goes_on_are_nobodys(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+    bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))  # doubled, before the next SYNC
+    for _ in range(5):
+        producer.pulse()
+    stream.read_on(0.05)
+    assert stream.statistics == StreamStatistics(cycles=1, frames=2, duplicate=1)
+
+
+def test_a_second_producer_is_another_master(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    next(stream)
+    with pytest.raises(BusBusy, match="a SYNC"):
+        for _ in range(20):
+            producer.pulse(PERIOD_NS // 2)
+            next(stream)
+    assert producer.pulses < 12
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(-400_000, 400_000), min_size=50, max_size=50))
+def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
+    rate, before_ns = SyncRate(PERIOD_NS), 0
+    for number, late in enumerate(late_ns, start=1):
+        at_ns = number * PERIOD_NS * 9999 // 10000 + late  # and its clock is 100 ppm fast
+        assert not rate.too_fast(at_ns - before_ns)
+        before_ns = at_ns
+
+
+def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
+    stream, _, producer, _ = followed
+    stream.pacing = FollowedSync(PERIOD_NS, "the kernel", in_kernel=True, timeout_s=0.01, clock=stream.pacing.clock)
+    next(stream)
+    producer.pulse(local=False)
+    next(stream)
+    with pytest.raises(BusBusy, match="a SYNC"):
+        next(stream)
+
+
+@settings(deadline=None)
+@given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
+def test_every_answer_dropped_from_a_followed_cycle_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
+    for stream, bus, producer, _ in followed_stream():
+        stream.max_missing_cycles = 40
+        next(stream)
+        bus.tamper = lambda m, p=producer: () if (p.pulses - 1, m.arbitration_id) in dropped else (m,)  # type: ignore[misc]
+        for _ in range(31):
+            producer.pulse()
+        samples = [next(stream) for _ in range(30)]
+        for number, sample in enumerate(samples):
+            expected = sum(axis for axis, cob in ((1, 0x181), (2, 0x182)) if (number, cob) in dropped)
+            assert sample.missing == expected
+            for axis in range(2):
+                if not sample.missing >> axis & 1:
+                    assert sample.position_counts[axis] == number + 1
+        assert stream.statistics.missing == len(dropped)
+        assert stream.statistics.late == 0
+
+
+@settings(deadline=None)
+@given(st.integers(250, 100_000), st.floats(0.0, 0.1), st.floats(-0.002, 0.002))
+def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise: float) -> None:
+    """Each interval becomes longer by what the timer is late: the schedule still keeps the period."""
+    interval_us, phase_ns, window = period_us, 0.0, max(8, round(250_000 / period_us))
+    for number in range(40):
+        lasts_ns = window * 1000 * (interval_us + late * period_us + (noise if number % 2 else -noise) * period_us)
+        late_ns = lasts_ns - window * 1000 * period_us
+        phase_ns += late_ns
+        interval_us = steered_us(period_us, interval_us, round(late_ns), round(phase_ns), window)
+    assert abs(phase_ns) < window * 1000 * (1.0 + 5 * abs(noise) * period_us)
+
+
+def test_frames_that_this_machine_lost_are_counted_and_told(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: nobody misses those
+    next(stream)
+    bus.losses = Losses(kernel=7, backlog=1, interface=4)  # type: ignore[attr-defined]
+    sample = next(stream)
+    next(stream)
+    assert stream.statistics == StreamStatistics(
+        cycles=3, frames=6, kernel_dropped=2, backlog_dropped=1, interface_dropped=4
+    )
+    told = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
+    assert [(event.code, event.time_ns) for event in told] == [(count, sample.time_ns) for count in (2, 4, 1)]
+
+
+def test_what_is_to_be_known_of_the_bus_is_told_at_the_start(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    bus.remarks = ("a small buffer",)  # type: ignore[attr-defined]
+    next(stream)
+    next(stream)
+    assert [event.text for event in events if event.kind is EventKind.CAPTURE] == ["a small buffer"]
+
+
+def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
+    """Our own SYNC comes back with it, before its answers."""
+    stream, bus, _ = timed
+    send = bus.send
+
+    def echo(msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x80:
+            sync = CapturedMessage(arbitration_id=0x80, is_extended_id=False, is_rx=False)
+            sync.kernel_ns, sync.local = 0, True
+            sync.monotonic_ns = bus.clock.now_ns + 1000 + 10 * (bus.cycle + 1)
+            bus.inject(sync)
+        send(msg, timeout)
+
+    bus.send = echo  # type: ignore[method-assign]
+    samples = [next(stream) for _ in range(5)]
+    assert [sample.time_ns for sample in samples] == [77 + (PERIOD_NS + 10) * k for k in range(5)]
+    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    bus.send = send  # type: ignore[method-assign]

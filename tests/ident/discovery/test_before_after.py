@@ -1,0 +1,207 @@
+"""Before and after: one metric for every error, and a change of a gain that is told from noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.run import Run
+from ident.discovery.before_after import Account, account, assess, before_after, declared, floor_on
+from ident.discovery.current_error import CurrentError, error_left_out, error_on, left_out_runs
+from ident.discovery.loop import Evidence, Step, gather, with_effects
+from ident.discovery.noise_floor import NoiseFloor
+from ident.effects.effect import PlacedEffect
+from ident.effects.electrical import Saturation
+from ident.effects.position import Spring
+from ident.equations.linearisation import cut, linearise
+from ident.estimators.identify import identify
+from tests.ident.recordings import CONDITIONING, GAINS, Truth, gathered
+
+FloatArray = NDArray[np.float64]
+
+SPRING = PlacedEffect(Spring(), 2)
+SPRING_NM_RAD = 4.0
+
+
+@pytest.fixture(scope="module")
+def sprung(noisy_runs: tuple[Run, ...]) -> tuple[Run, ...]:
+    """The noisy runs with a spring on joint 3."""
+    made = []
+    for run in noisy_runs:
+        current = run.current_a.copy()
+        current[:, 2] += SPRING_NM_RAD * run.position_rad[:, 2] / GAINS[2]
+        made.append(replace(run, current_a=current))
+    return tuple(made)
+
+
+@pytest.fixture(scope="module")
+def start(truth: Truth, sprung: tuple[Run, ...]) -> Evidence:
+    return gathered(truth, sprung[:3], sprung[3:])
+
+
+@pytest.fixture(scope="module")
+def after(start: Evidence) -> Evidence:
+    return with_effects(start, (SPRING,))
+
+
+@pytest.fixture(scope="module")
+def told(start: Evidence, after: Evidence) -> Account:
+    limits = np.zeros(6)
+    steps = (Step((), (), limits, None, after), Step((), (), limits, None, after))
+    return account(start, steps)
+
+
+def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, told: Account) -> None:
+    """From the definition: e_i = v_i − (T τ)_i/g_i over the motor's rows, motor by motor, and weighed by the gains."""
+    estimate = start.estimate
+    for rows, error in ((start.training, told.total.before.in_sample), (start.holdout, told.total.before.holdout)):
+        assert rows is not None
+        assert error is not None
+        torque = np.linalg.solve(rows.drive_train.direction.T, estimate.predicted_torque(rows))
+        left, size = [], []
+        for motor in range(6):
+            used = rows.motor_use[motor]
+            v = rows.current[motor, used]
+            left.append(np.linalg.norm(v - torque[motor, used] / estimate.gains[motor]))
+            size.append(np.linalg.norm(v))
+        assert error.axes == pytest.approx(100.0 * np.array(left) / size)
+        weighed = np.linalg.norm(estimate.gains * left) / np.linalg.norm(estimate.gains * size)
+        assert error.total == pytest.approx(100.0 * weighed)
+
+
+def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, told: Account) -> None:
+    """Motors 1 to 4 drive their joints alone: ‖e‖/‖v‖ is ‖ρ‖/‖Y‖ there."""
+    assert told.total.before.in_sample.axes[:4] == pytest.approx(start.training_error.axes[:4], rel=1e-6)
+
+
+def test_parts_of_the_data_add_up(start: Evidence) -> None:
+    rows, weights = start.training, start.estimate.gains
+    whole = error_on(rows, start.estimate)
+    parts = CurrentError(np.zeros(6), np.zeros(6))
+    for run in range(3):
+        parts = parts + error_on(rows.only(rows.run == run), start.estimate)
+    assert parts.relative(weights).total == pytest.approx(whole.relative(weights).total)
+    assert parts.relative(weights).axes == pytest.approx(whole.relative(weights).axes)
+
+
+def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> None:
+    estimate = start.estimate
+    problem = linearise(start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
+    folds = cut(problem)
+    seen = replace(folds, residual=folds.problem.residual)
+    assert error_left_out(seen).left == pytest.approx(error_on(start.training, estimate).left)
+    assert np.all(error_left_out(folds).left > error_left_out(seen).left)
+
+
+def test_the_effect_helps_its_axis_alone_wherever_it_is_looked_at(told: Account) -> None:
+    before, after = told.total.before, told.total.after
+    pairs = (
+        (before.in_sample, after.in_sample),
+        (before.cross_validated, after.cross_validated),
+        (before.holdout, after.holdout),
+    )
+    for first, second in pairs:
+        assert first is not None
+        assert second is not None
+        assert second.axes[2] < 0.8 * first.axes[2]
+        assert second.axes[0] == pytest.approx(first.axes[0], rel=0.02)
+        assert second.total < first.total
+    assert told.total.added == (SPRING,)
+    assert told.total.removed == ()
+
+
+def test_a_turn_that_adds_nothing_has_no_before_and_after(told: Account) -> None:
+    first, last = told.turns
+    assert last is None
+    assert first == told.total
+
+
+def test_what_is_taken_out_again_is_told(start: Evidence, after: Evidence) -> None:
+    weights = start.estimate.gains
+    back = before_after(assess(after, weights), assess(start, weights))
+    assert (back.added, back.removed) == ((), (SPRING,))
+
+
+def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, after: Evidence) -> None:
+    again = declared(after, start.estimate)
+    assert np.array_equal(again.training.robot, start.training.robot)
+    assert again.holdout is not None
+    assert start.holdout is not None
+    assert np.array_equal(again.holdout.current, start.holdout.current)
+    assert again.effects == ()
+
+
+def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, told: Account) -> None:
+    for motor, gain in enumerate(told.total.gains):
+        assert (gain.before, gain.before_std) == (start.estimate.gains[motor], start.estimate.gains_std[motor])
+        assert (gain.after, gain.after_std) == (after.estimate.gains[motor], after.estimate.gains_std[motor])
+        assert gain.change_percent == pytest.approx(100.0 * (gain.after - gain.before) / gain.before)
+
+
+def test_the_jackknife_of_a_gain_is_that_of_its_estimate(start: Evidence) -> None:
+    """The shifts behind σ_Δ are those behind σ."""
+    shifts = assess(start, start.estimate.gains).shifts
+    moves = len(shifts)
+    std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    assert std == pytest.approx(start.estimate.gains_std, rel=0.02)
+
+
+def test_an_effect_that_is_not_there_changes_no_gain_and_one_that_is_does(
+    truth: Truth, noisy_runs: tuple[Run, ...]
+) -> None:
+    saturation = PlacedEffect(Saturation(), 1)
+    clean = gathered(truth, noisy_runs)
+    weights = clean.estimate.gains
+    idle = before_after(assess(clean, weights), assess(with_effects(clean, (saturation,)), weights))
+    assert not any(gain.significant for gain in idle.gains)
+    # The change shares its noise with both estimates: it is known better than either where the effect says little.
+    assert idle.gains[0].change_std < 0.5 * idle.gains[0].before_std
+    runs = []
+    for run in noisy_runs:
+        current = run.current_a.copy()
+        current[:, 1] *= 1.0 + 0.004 * current[:, 1] ** 2
+        runs.append(replace(run, current_a=current))
+    bent = gathered(truth, tuple(runs))
+    changed = before_after(assess(bent, weights), assess(with_effects(bent, (saturation,)), weights))
+    assert changed.gains[1].significant
+    assert abs(changed.gains[1].after / GAINS[1] - 1.0) < abs(changed.gains[1].before / GAINS[1] - 1.0)
+
+
+def test_a_left_out_run_is_predicted_by_the_others_alone(
+    truth: Truth, sprung: tuple[Run, ...], after: Evidence
+) -> None:
+    weights = after.estimate.gains
+    found = left_out_runs(after, weights)
+    assert [run.run for run in found.runs] == ["run0", "run1", "run2"]
+    # By another way: run 0 given as a hold-out run.
+    by_hand = with_effects(gathered(truth, sprung[1:3], sprung[:1]), (SPRING,))
+    assert by_hand.holdout is not None
+    expected = error_on(by_hand.holdout, by_hand.estimate).relative(weights)
+    (first, loaded, _) = found.runs
+    assert first.error is not None
+    assert first.error.axes == pytest.approx(expected.axes, rel=1e-4)
+    # Run 1 alone carries the payload: without it the gains have no scale.
+    assert loaded.error is None
+    assert "payload" in loaded.reason or "mounting" in loaded.reason
+    assert found.together is not None
+
+
+def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
+    floors = (NoiseFloor(0.05, 20, 100.0),) * 5 + (None,)
+    error = floor_on(start.training, floors).relative(start.estimate.gains)
+    used = start.training.motor_use[0]
+    rms_a = np.sqrt(np.mean(start.training.current[0, used] ** 2))
+    assert error.axes[0] == pytest.approx(100.0 * 0.05 / rms_a)
+    assert np.isnan(error.axes[5])
+    assert np.isnan(error.total)
+
+
+def test_fixed_gains_do_not_change(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    runs = noisy_runs[:2]
+    found = identify(truth.model, runs, CONDITIONING, fixed_gains=GAINS)
+    start = gather(found, runs)
+    changed = before_after(assess(start, GAINS), assess(with_effects(start, (SPRING,)), GAINS))
+    assert all(gain.change_std == 0.0 and not gain.significant for gain in changed.gains)

@@ -1,0 +1,345 @@
+"""Every family, planted with the true load and current: named on its axis, with the right size and sign."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.data.run import Run
+from ident.discovery.candidates import ColumnCache
+from ident.discovery.loop import Evidence, close_the_loop, with_effects
+from ident.discovery.search import Gates, find
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect, PlacedEffect, Side
+from ident.errors import RankDeficient, TooFewMoves
+from ident.estimators.identify import identify
+from ident.estimators.maximum_likelihood import ml
+from ident.model.kinematics import Motion
+from ident.model.model import DriveTrain, Model
+from tests.ident.recordings import (
+    CONDITIONING,
+    GAINS,
+    PAYLOAD_TRUTH,
+    RATIO,
+    Truth,
+    acting_on,
+    bent,
+    gathered,
+    inquiry_of,
+    with_current,
+)
+
+FloatArray = NDArray[np.float64]
+
+PAUSE_S = 40.0
+"""From the start of one run to that of the next."""
+GATES = Gates(draws=199)
+
+
+@dataclass(frozen=True)
+class True1:
+    """What really acts on a run, from the truth alone; arrays of all axes, shape (n, k), and the axis in question."""
+
+    axis: int
+    positions: FloatArray
+    velocities: FloatArray
+    accelerations: FloatArray
+    motor_angles: FloatArray
+    loads: FloatArray
+    frictions: FloatArray
+    motor_torques: FloatArray
+    time_s: FloatArray
+    started_s: float
+    rate_hz: float
+    pull: Callable[[], FloatArray]
+
+    @property
+    def position(self) -> FloatArray:
+        """Of the axis."""
+        return np.asarray(self.positions[self.axis])
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Of the axis."""
+        return np.asarray(self.velocities[self.axis])
+
+    @property
+    def load(self) -> FloatArray:
+        """Of the axis."""
+        return np.asarray(self.loads[self.axis])
+
+    @property
+    def motor_torque(self) -> FloatArray:
+        """Of the axis."""
+        return np.asarray(self.motor_torques[self.axis])
+
+    @property
+    def motor_angle(self) -> FloatArray:
+        """Of the axis."""
+        return np.asarray(self.motor_angles[self.axis])
+
+    def accelerated(self, of_time: FloatArray) -> FloatArray:
+        """Second derivative."""
+        step = 1.0 / self.rate_hz
+        middle = (of_time[2:] - 2.0 * of_time[1:-1] + of_time[:-2]) / step**2
+        return np.concatenate((middle[:1], middle, middle[-1:]))
+
+
+@dataclass(frozen=True)
+class Planted:
+    """An effect in a formula of the test's own, with the coefficients that must come back.
+
+    The formula gives the torque of its axis, shape (k,), or of all joints or motors, shape (n, k).
+    """
+
+    family: str
+    axis: int
+    torque: Callable[[True1], FloatArray]
+    expected: tuple[float, ...]
+
+
+def _bristle(t: True1, distance_rad: float) -> FloatArray:
+    """z of Dahl's model, sample by sample: dz = (1 − z s) dq/η with the exact solution over one step."""
+    z, out = 0.0, np.empty_like(t.velocity)
+    for k, step in enumerate(t.velocity / t.rate_hz):
+        way = np.sign(step)
+        z = way - (way - z) * np.exp(-abs(step) / distance_rad)
+        out[k] = z
+    return np.asarray(out)
+
+
+def _pushed(t: True1, half_gap_rad: float) -> FloatArray:
+    """Torque of all joints for the joint behind a gap, which follows its motor from flank to flank."""
+    through = t.load + t.frictions[t.axis]
+    width = 0.15 * np.sqrt(np.mean(through**2))
+    flank = 1.0 - 2.0 / (1.0 + np.exp(2.0 * through / width))
+    return np.asarray(-half_gap_rad * t.pull() * t.accelerated(flank))
+
+
+def _between(t: True1, other: int, along: FloatArray) -> FloatArray:
+    """The same friction on two joints."""
+    torque = np.zeros_like(t.positions)
+    torque[[t.axis, other]] = along
+    return torque
+
+
+def _rubbing(t: True1, other: int) -> FloatArray:
+    both = t.velocities[t.axis] + t.velocities[other]
+    return _between(t, other, 2.0 * np.sign(both) + 0.8 * both)
+
+
+def _inertial(t: True1, other: int) -> FloatArray:
+    torque = np.zeros_like(t.positions)
+    torque[t.axis], torque[other] = 0.25 * t.accelerations[other], 0.25 * t.accelerations[t.axis]
+    return torque
+
+
+def _cold(t: True1, clock_s: FloatArray, constant_s: float) -> FloatArray:
+    return np.asarray(np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity))
+
+
+CASES = (
+    Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
+    Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),
+    # g v (1 − c v²) = τ with v = τ/g to first order: the current must be larger by c v³.
+    Planted("saturation", 1, lambda t: 0.02 * t.motor_torque * (t.motor_torque / GAINS[1]) ** 2, (0.02,)),
+    Planted("lag", 0, lambda t: -0.01 * np.gradient(t.motor_torque) * t.rate_hz, (0.01,)),
+    Planted("time-skew", 0, lambda t: -0.004 * np.gradient(t.motor_torques, axis=1) * t.rate_hz, (0.004,)),
+)  # fmt: skip
+SMALL_CASES = (
+    Planted("stribeck", 1, lambda t: 6.0 * np.sign(t.velocity) / np.exp(np.abs(t.velocity) / 0.2), (6.0,)),
+    Planted("nonlinear-viscous", 2, lambda t: 1.5 * t.velocity * np.abs(t.velocity), (1.5,)),
+    Planted("asymmetric-viscous", 2, lambda t: 0.9 * np.maximum(t.velocity, -t.velocity), (0.9,)),
+    Planted("load-friction", 2, lambda t: 0.15 * np.abs(t.load) * np.sign(t.velocity), (0.15,)),
+    Planted("position-friction", 2, lambda t: np.sign(t.velocity) * 1.5 * np.cos(t.position + 0.7), (1.147, -0.966)),
+    Planted("warm-up", 1, lambda t: _cold(t, t.time_s, 20.0), (5.0, 2.0)),
+    Planted("warm-up", 2, lambda t: _cold(t, t.started_s + t.time_s, 80.0), (5.0, 2.0)),
+    Planted("presliding", 1, lambda t: 9.0 * (_bristle(t, 0.08) - np.sign(t.velocity)), (9.0,)),
+    Planted("backlash", 1, lambda t: _pushed(t, 0.004), (0.004,)),
+    Planted("elasticity", 1, lambda t: -0.0005 * t.pull() * t.accelerated(t.load), (0.0005,)),
+    Planted("coupling", 1, lambda t: _rubbing(t, 2), (2.0, 0.8)),
+    Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
+    Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),
+    Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),
+)  # fmt: skip
+"""On the arm of three axes, which needs a third of the time."""
+
+
+@pytest.fixture(scope="module")
+def clean(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
+    return gathered(truth, noisy_runs)
+
+
+@pytest.fixture(scope="module")
+def small_session(small_truth: Truth, small_runs: tuple[Run, ...]) -> Evidence:
+    """One in which every run began a while after the one before."""
+    return gathered(small_truth, tuple(replace(run, started_s=PAUSE_S * index) for index, run in enumerate(small_runs)))
+
+
+@pytest.fixture(scope="module")
+def cache() -> ColumnCache:
+    """Of the one motion that all cases share."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def small_cache() -> ColumnCache:
+    """Of the small arm's."""
+    return {}
+
+
+def _true(truth: Truth, data: Dataset, axis: int) -> True1:
+    names = [column.name for column in truth.model.columns]
+    parameters = truth.parameters.copy()
+    if data.payload is not None:
+        parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
+    rigid = np.array([name[:2] not in ("Ia", "fv", "fs", "of") for name in names])
+    rubbing = np.array([name[:2] in ("fv", "fs") and name[2] != "m" for name in names])
+    motion = data.motion()
+    columns = truth.model.regressor(motion)
+
+    def pull() -> FloatArray:
+        """Torque of every joint per unit of acceleration of the axis, at every sample."""
+        still = np.zeros_like(motion.position_rad)
+        one = still.copy()
+        one[axis] = 1.0
+        moved, at_rest = (
+            np.einsum("jck,c->jk", truth.model.regressor(Motion(motion.position_rad, still, a)), parameters * rigid)
+            for a in (one, still)
+        )
+        return np.asarray(moved - at_rest)
+
+    return True1(
+        axis=axis,
+        positions=motion.position_rad,
+        velocities=motion.velocity_rad_s,
+        accelerations=motion.acceleration_rad_s2,
+        motor_angles=truth.model.drive_train.ratio @ motion.position_rad,
+        loads=np.einsum("jck,c->jk", columns, parameters * rigid),
+        frictions=np.einsum("jck,c->jk", columns, parameters * rubbing),
+        motor_torques=truth.model.drive_train.to_motor @ np.einsum("jck,c->jk", columns, parameters),
+        time_s=data.time_s - data.time_s[0],
+        started_s=data.started_s or 0.0,
+        rate_hz=data.rate_hz,
+        pull=pull,
+    )
+
+
+def _with(clean: Evidence, truth: Truth, planted: Planted) -> Evidence:
+    def torque(data: Dataset) -> FloatArray:
+        made = planted.torque(_true(truth, data, planted.axis))
+        on_all = made if made.ndim == 2 else acting_on(planted.axis, len(truth.gains), made)
+        if _family(planted.family)[0].side in {Side.MOTOR, Side.ALL_MOTORS}:
+            return np.asarray(truth.model.drive_train.direction.T @ on_all)
+        return on_all
+
+    return bent(clean, truth, torque)
+
+
+def _family(name: str) -> tuple[Effect, ...]:
+    return next(family for family in EFFECTS if family[0].name == name)
+
+
+def test_every_family_is_planted() -> None:
+    assert {case.family for case in (*CASES, *SMALL_CASES)} == {family[0].name for family in EFFECTS}
+
+
+@pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
+def test_it_is_named_with_its_size_and_sign(
+    clean: Evidence, truth: Truth, planted: Planted, cache: ColumnCache
+) -> None:
+    _is_named(_with(clean, truth, planted), planted, cache)
+
+
+@pytest.mark.parametrize("planted", SMALL_CASES, ids=lambda planted: f"{planted.family}-{planted.axis}")
+def test_so_it_is_on_a_smaller_arm(
+    small_session: Evidence, small_truth: Truth, planted: Planted, small_cache: ColumnCache
+) -> None:
+    _is_named(_with(small_session, small_truth, planted), planted, small_cache)
+
+
+def _is_named(start: Evidence, planted: Planted, cache: ColumnCache) -> None:
+    findings = find(inquiry_of(start, cache), np.random.default_rng(0), GATES)
+    best = findings[0]
+    assert best.passed
+    names = [(placed.effect.name, placed.axis) for placed in (PlacedEffect(best.effect, best.axis), *best.ambiguity)]
+    assert (planted.family, planted.axis) in names
+    own = next(f for f in findings if (f.effect.name, f.axis) == (planted.family, planted.axis))
+    after = with_effects(start, (PlacedEffect(own.effect, own.axis),))
+    count = len(planted.expected)
+    found = after.estimate.parameters[len(after.bare.columns) :][:count]
+    assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))
+    assert after.training_error.axes[planted.axis] < start.training_error.axes[planted.axis]
+
+
+def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth, cache: ColumnCache) -> None:
+    """A spring on joint 2 must pass its gates on whichever motor gives the torque."""
+    order = np.array([2, 0, 1, 3, 5, 4])
+    start = _with(clean, truth, CASES[0])
+    train = DriveTrain(RATIO[order])
+    training = replace(
+        start.training,
+        drive_train=train,
+        current=start.training.current[order],
+        motor_use=start.training.motor_use[order],
+    )
+    turned = replace(start, model=Model(truth.model.robot, train), training=training, estimate=ml(training.system()))
+    families = (_family("spring"), _family("stribeck"), _family("load-friction"))
+    findings = find(inquiry_of(turned), np.random.default_rng(0), GATES, families)
+    assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
+    same = find(inquiry_of(start, cache), np.random.default_rng(0), GATES, families)
+    assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
+
+
+def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    dead = tuple(replace(run, current_a=run.current_a * np.array([1, 1, 1, 0, 1, 1])) for run in noisy_runs)
+    with pytest.raises(RankDeficient, match="motor 4 is zero") as caught:
+        identify(truth.model, dead, CONDITIONING)
+    assert caught.value.unknowns == ("gain 4",)
+
+
+def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
+    truth: Truth, clean_runs: tuple[Run, ...], noisy_runs: tuple[Run, ...]
+) -> None:
+    never_still = replace(CONDITIONING, standstill_rad_s=())
+    whole = identify(truth.model, noisy_runs, never_still)
+    assert len(whole.system.moves) >= 4 * 11
+    assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
+    short = tuple(
+        replace(run, time_s=run.time_s[:5000], position_rad=run.position_rad[:5000], current_a=run.current_a[:5000])
+        for run in clean_runs
+    )
+    with pytest.raises(TooFewMoves, match="record longer"):
+        identify(truth.model, short, never_still)
+
+
+def test_sigma_is_true_for_correlated_noise(clean: Evidence, truth: Truth) -> None:
+    """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
+    rng = np.random.default_rng(5)
+    bare, estimate = clean.bare, clean.estimate
+    exact = truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
+    gains, claimed = [], []
+    for _ in range(24):
+        noise = np.empty_like(exact)
+        noise[:, 0] = rng.normal(size=6)
+        drawn = rng.normal(size=exact.shape)
+        for row in range(1, exact.shape[1]):
+            noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
+        found = with_current(clean, exact + 0.05 * noise - bare.current).estimate
+        gains.append(found.gains)
+        claimed.append(found.gains_std)
+    ratio = np.mean(claimed, axis=0) / np.std(gains, axis=0, ddof=1)
+    # 24 draws know a deviation to 15 % (1/√46); three of those on either side.
+    assert np.all(ratio > 0.6)
+    assert np.all(ratio < 1.6)
+
+
+def test_the_loop_ends_where_nothing_is_left(small_session: Evidence, small_truth: Truth) -> None:
+    start = _with(small_session, small_truth, next(case for case in SMALL_CASES if case.family == "load-friction"))
+    steps = close_the_loop(start, np.random.default_rng(1))
+    assert [step.accepted is not None for step in steps] == [True, False]

@@ -1,0 +1,119 @@
+"""What effects are made of: clocks, inertia and torques, against the truth and the mechanics library."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery.loop import Evidence
+from ident.discovery.signals import Signals, declared_signals, session_began_s, signals
+from ident.model.kinematics import Motion
+from tests.ident.recordings import PAYLOAD_TRUTH, Truth
+
+FloatArray = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def data(small: Evidence) -> Dataset:
+    """The first second of a loaded run."""
+    whole = small.datasets[1]
+    part = slice(0, 1000)
+    return replace(
+        whole,
+        time_s=whole.time_s[part],
+        position_rad=whole.position_rad[:, part],
+        velocity_rad_s=whole.velocity_rad_s[:, part],
+        acceleration_rad_s2=whole.acceleration_rad_s2[:, part],
+    )
+
+
+def _loaded(truth: Truth) -> FloatArray:
+    parameters = truth.parameters.copy()
+    parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
+    return parameters
+
+
+def _without(truth: Truth, *prefixes: str) -> FloatArray:
+    kept = [not column.name.startswith(prefixes) for column in truth.model.columns]
+    return np.asarray(_loaded(truth) * kept)
+
+
+def _made(truth: Truth, data: Dataset, began_s: float | None = None) -> Signals:
+    return declared_signals(truth.model, data, _loaded(truth), truth.gains, began_s)
+
+
+def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: Truth, data: Dataset) -> None:
+    made, columns = _made(small_truth, data), small_truth.model.regressor(data.motion())
+    load, geared, whole = (
+        np.einsum("jck,c->jk", columns, parameters)
+        for parameters in (
+            _without(small_truth, "Ia", "fv", "fs", "off"),
+            _without(small_truth, "Ia", "off"),
+            _loaded(small_truth),
+        )
+    )
+    assert made.load_torque_nm == pytest.approx(load)
+    assert made.geared_torque_nm == pytest.approx(geared)
+    assert made.motor_torque_nm == pytest.approx(small_truth.model.drive_train.to_motor @ whole)
+    assert made.current_a * small_truth.gains[:, None] == pytest.approx(made.motor_torque_nm)
+    assert made.motor_position_rad == pytest.approx(np.diag([40.0, 50.0, -45.0]) @ data.position_rad)
+
+
+def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, data: Dataset) -> None:
+    """Of links and payload; drawn between postures, so it follows to a hundredth."""
+    parameters = _without(small_truth, "Ia", "fv", "fs", "off")
+    still = np.zeros_like(data.position_rad)
+    rng = np.random.default_rng(1)
+    acceleration = rng.normal(size=data.position_rad.shape)
+    moved, held = (
+        np.einsum("jck,c->jk", small_truth.model.regressor(Motion(data.position_rad, still, a)), parameters)
+        for a in (acceleration, still)
+    )
+    inertia = _made(small_truth, data).inertia_kg_m2
+    found = np.einsum("ijk,jk->ik", inertia, acceleration)
+    assert np.max(np.abs(found - (moved - held))) < 0.01 * np.max(np.abs(moved - held))
+    assert inertia == pytest.approx(np.swapaxes(inertia, 0, 1), abs=1e-9)
+    for sample in range(0, 1000, 100):
+        assert np.all(np.linalg.eigvalsh(inertia[:, :, sample]) > 0)
+
+
+def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
+    small: Evidence, small_truth: Truth, data: Dataset
+) -> None:
+    """Ia of joints 1 and 2 cannot be told from their links; that of joint 3 is a parameter of its own."""
+    found = signals(small.model, data, small.training, small.estimate).inertia_kg_m2
+    true = _made(small_truth, data).inertia_kg_m2
+    rotors = np.array([0.03, 0.03, 0.0])
+    expected = true + np.diag(rotors)[:, :, None]
+    assert np.max(np.abs(found - expected)) < 0.05 * np.max(np.abs(true))
+    assert found[1, 1].mean() - true[1, 1].mean() == pytest.approx(0.03, abs=0.02)
+
+
+def test_the_session_clock_counts_from_the_first_run(small_truth: Truth, data: Dataset) -> None:
+    runs = [replace(data, started_s=started_s) for started_s in (1000.0, 1060.0, 1130.0)]
+    began_s = session_began_s(runs)
+    assert began_s == 1000.0
+    made = [_made(small_truth, run, began_s) for run in runs]
+    for later, run in zip((0.0, 60.0, 130.0), made, strict=True):
+        assert run.time_s[0] == 0.0
+        assert run.session_s == pytest.approx(run.time_s + later)
+        assert np.all(np.diff(run.session_s) > 0)
+
+
+def test_without_a_clock_the_session_is_the_run(small_truth: Truth, data: Dataset) -> None:
+    runs = [replace(data, started_s=1000.0), replace(data, started_s=None)]
+    assert session_began_s(runs) is None
+    assert session_began_s([]) is None
+    made = _made(small_truth, runs[1], session_began_s(runs))
+    assert np.array_equal(made.session_s, made.time_s)
+
+
+def test_one_run_without_a_clock_leaves_all_without(small_truth: Truth, data: Dataset) -> None:
+    """Else the runs that know would stand a clock's reading, not a session, away from those that do not."""
+    runs = [replace(data, started_s=1.7e9), replace(data, started_s=None)]
+    made = _made(small_truth, runs[0], session_began_s(runs))
+    assert np.array_equal(made.session_s, made.time_s)

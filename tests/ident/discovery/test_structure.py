@@ -1,0 +1,120 @@
+"""What has no name: found as a smooth or periodic term on the right axis and variable, and silence with its size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.dataset import Dataset
+from ident.discovery import loop
+from ident.discovery.loop import Evidence, Step, close_the_loop
+from ident.discovery.search import Gates, choose, find
+from ident.discovery.structure import detection_limits_nm
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Abscissa, Effect
+from ident.effects.unnamed import Smooth
+from tests.ident.recordings import Truth, acting_on, bent, inquiry_of
+
+FloatArray = NDArray[np.float64]
+Torque = Callable[[Dataset], FloatArray]
+GATES = Gates(draws=199)
+
+
+def _without(*names: str) -> tuple[tuple[Effect, ...], ...]:
+    return tuple(family for family in EFFECTS if family[0].name not in names)
+
+
+def _needing(small: Evidence, truth: Truth, axis: int, torque: Torque) -> Evidence:
+    return bent(small, truth, lambda data: acting_on(axis, 3, torque(data)))
+
+
+def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -> Sequence[Step]:
+    return close_the_loop(start, np.random.default_rng(0), GATES, families)
+
+
+def _low_speed(axis: int) -> Torque:
+    return lambda data: 7.0 * np.sign(data.velocity_rad_s[axis]) * np.exp(-np.abs(data.velocity_rad_s[axis]) / 0.3)
+
+
+def _ripples(data: Dataset) -> FloatArray:
+    q = data.position_rad[1]
+    return np.asarray(6.0 * np.sin(3.0 * q) * np.exp(-(q**2)))
+
+
+def _bump(data: Dataset) -> FloatArray:
+    v = data.velocity_rad_s[2]
+    return np.asarray(5.0 * np.sign(v) * np.exp(-(((np.abs(v) - 1.5) / 0.5) ** 2)))
+
+
+@dataclass(frozen=True)
+class Nameless:
+    """A torque of one axis that no family left in the dictionary is of."""
+
+    axis: int
+    torque: Torque
+    removed: tuple[str, ...]
+    name: str
+
+
+NAMELESS = (
+    Nameless(1, _ripples, (), "smooth-position"),
+    Nameless(2, _bump, (), "smooth-velocity"),
+    Nameless(1, _low_speed(1), ("stribeck", "nonlinear-viscous"), "smooth-velocity"),
+    Nameless(0, lambda data: 4.0 * np.sin(120.0 * data.position_rad[0]), ("cogging",), "periodic-motor-angle"),
+)
+
+
+@pytest.mark.parametrize("case", NAMELESS, ids=("ripples", "bump", "stribeck removed", "cogging removed"))
+def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
+    small: Evidence, small_truth: Truth, case: Nameless, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "MAX_EFFECTS", 1)
+    start = _needing(small, small_truth, case.axis, case.torque)
+    (step,) = _loop(start, _without(*case.removed))
+    assert step.accepted is not None
+    assert (step.accepted.effect.name, step.accepted.axis) == (case.name, case.axis)
+    # Most of the excess of that axis' squared error is gone.
+    before, after, clean = (e.training_error.axes[case.axis] ** 2 for e in (start, step.after, small))
+    assert before - after > 0.6 * (before - clean)
+
+
+def test_a_name_that_is_right_wins_over_a_term_that_fits_anything(small: Evidence, small_truth: Truth) -> None:
+    steps = _loop(_needing(small, small_truth, 1, _low_speed(1)))
+    assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [("stribeck", 1)]
+    assert any(finding.passed for finding in steps[0].structures)  # it was asked, and had its say
+
+
+@pytest.mark.parametrize("variable", [Abscissa.VELOCITY, Abscissa.POSITION, Abscissa.LOAD, Abscissa.TIME])
+@pytest.mark.parametrize("signed", [0, 1])
+def test_no_variable_is_lost_because_a_part_of_its_term_is_declared(
+    small: Evidence, variable: Abscissa, signed: int
+) -> None:
+    """Offset and dry friction are a constant times one and times sign(q̇): the rest of the term must still be tried."""
+    inquiry = inquiry_of(small)
+    limits = {Abscissa.VELOCITY: (0.0, 3.0), Abscissa.TIME: (0.0, 20.0)}.get(variable, (-1.0, 1.0))
+    for at_rows in (False, True):
+        assert inquiry.test([(Smooth(variable, *limits, signed),)], 1, at_rows=at_rows)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_detection_limit_parts_what_is_found_from_what_is_not(
+    small: Evidence, small_truth: Truth, axis: int
+) -> None:
+    limit = detection_limits_nm(inquiry_of(small), GATES)[axis]
+    families = tuple(family for family in EFFECTS if family[0].name in {"cogging", "stribeck", "spring"})
+
+    def found(times: float) -> tuple[str, int] | None:
+        ratio = small_truth.model.drive_train.ratio[axis, axis]
+        start = _needing(
+            small, small_truth, axis,
+            lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[axis]),
+        )  # fmt: skip
+        best = choose(find(inquiry_of(start), np.random.default_rng(0), GATES, families))
+        return None if best is None else (best.effect.name, best.axis)
+
+    assert found(3.0) == ("cogging", axis)
+    assert found(0.3) is None

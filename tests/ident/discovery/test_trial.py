@@ -1,0 +1,150 @@
+"""A trial's block formulas against projections and refits written out, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.discovery.candidates import Trial, put_to_test
+from ident.equations.linearisation import Linearisation, cut
+
+FloatArray = NDArray[np.float64]
+
+MOTORS, MOVES, WIDTH = 3, 16, 5
+
+
+def _problem(rng: np.random.Generator) -> Linearisation:
+    """Rows of three motors in sixteen moves of uneven length; the residual is what a fit leaves."""
+    parts = [(motor, move) for motor in range(MOTORS) for move in range(MOVES) for _ in range(rng.integers(8, 20))]
+    motor, cluster = (np.array(part, dtype=np.int64) for part in zip(*parts, strict=True))
+    jacobian = rng.normal(size=(len(motor), WIDTH)) * (1.0 + motor[:, None])
+    raw = rng.normal(size=len(motor)) + 0.3 * np.sin(np.arange(len(motor)))
+    return Linearisation(
+        jacobian=jacobian,
+        residual=raw - jacobian @ np.linalg.lstsq(jacobian, raw, rcond=None)[0],
+        current=5.0 * rng.normal(size=len(motor)),
+        motor=motor,
+        cluster=cluster,
+        source=np.arange(len(motor)),
+        gamma=np.ones(MOTORS),
+        noise=np.ones(MOTORS),
+        free=np.arange(WIDTH),
+        scale=np.ones(WIDTH),
+    )
+
+
+def _fit(columns: FloatArray, target: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(columns, target, rcond=None)[0])
+
+
+def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) -> Trial:
+    """The same by projection and by one whole refit a fold."""
+    j, e = problem.jacobian, problem.residual
+    left = columns - j @ _fit(j, columns)
+    coefficients = _fit(left, e)
+    after = e - left @ coefficients
+
+    def by_motor(residual: FloatArray, rows: NDArray[np.bool_]) -> list[float]:
+        return [float(np.sum(residual[rows & (problem.motor == i)] ** 2)) for i in range(MOTORS)]
+
+    everything = np.ones(len(e), dtype=np.bool_)
+    both = np.concatenate((j, columns), axis=1)
+    training, held = [], []
+    for fold in range(count):
+        out = problem.cluster % count == fold
+        without = e[~out] - j[~out] @ _fit(j[~out], e[~out])
+        fitted = _fit(both[~out], e[~out])
+        training.append(float(np.sum(without**2) - np.sum((e[~out] - both[~out] @ fitted) ** 2)))
+        held.append(by_motor(e - both @ fitted, out))
+    moves = [problem.cluster == move for move in range(MOVES)]
+    return Trial(
+        coefficients=coefficients,
+        fallen=np.array(by_motor(e, everything)) - np.array(by_motor(after, everything)),
+        training_fall=np.array(training),
+        held_out=np.array(held),
+        score=left.T @ e,
+        scatter=np.stack([left[rows].T @ after[rows] for rows in moves]),
+        gram=np.stack([left[rows].T @ left[rows] for rows in moves]),
+    )
+
+
+def _agree(found: Trial | None, expected: Trial) -> None:
+    assert found is not None
+    for name in Trial.__slots__:
+        wanted = getattr(expected, name)
+        scale = float(np.max(np.abs(wanted)))
+        assert getattr(found, name) == pytest.approx(wanted, rel=1e-8, abs=1e-8 * scale), name
+
+
+@given(seed=st.integers(0, 2**32 - 1), widths=st.lists(st.integers(1, 4), min_size=1, max_size=3))
+@settings(max_examples=15, deadline=None)
+def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
+    """Of candidates of one and of several columns side by side, on all motors or on one alone."""
+    rng = np.random.default_rng(seed)
+    folds = cut(_problem(rng))
+    problem = folds.problem
+    columns = rng.normal(size=(len(problem.motor), sum(widths)))
+    columns[:, 0] *= problem.motor == 1
+    columns += 0.4 * problem.jacobian[:, :1] + 0.2 * problem.residual[:, None]
+    ends = np.cumsum(widths)
+    slices = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
+    for trial, chosen in zip(put_to_test(folds, columns, slices), slices, strict=True):
+        _agree(trial, _written_out(problem, columns[:, chosen]))
+
+
+def test_what_the_model_says_already_is_no_candidate() -> None:
+    rng = np.random.default_rng(1)
+    folds = cut(_problem(rng))
+    j = folds.problem.jacobian
+    own = rng.normal(size=len(j))
+    said = j @ rng.normal(size=WIDTH)
+    columns = np.stack((said, own, said + own, own, 2.0 * own, said + 1e-2 * own), axis=1)
+    slices = [slice(0, 1), slice(1, 2), slice(1, 3), slice(3, 5), slice(5, 6)]
+    absorbed, good, twin, double, nearly = put_to_test(folds, columns, slices)
+    assert absorbed is None
+    assert twin is None
+    assert double is None
+    _agree(good, _written_out(folds.problem, columns[:, 1:2]))
+    assert nearly is not None
+
+
+def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
+    rng = np.random.default_rng(2)
+    folds = cut(_problem(rng))
+    problem = folds.problem
+    seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
+    (trial,) = put_to_test(folds, seen, [slice(0, 1)])
+    assert trial is not None
+    expected = _written_out(problem, seen)  # of the least size, where the others do not say: zero
+    assert trial.training_fall[3] == pytest.approx(0.0, abs=1e-9)
+    assert trial.held_out == pytest.approx(expected.held_out, rel=1e-6)
+    assert trial.held_out[3] == pytest.approx(folds.square_sum(folds.residual)[3])
+
+
+def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> None:
+    rng = np.random.default_rng(3)
+    folds = cut(_problem(rng))
+    problem = folds.problem
+    whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
+    seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
+    pair = np.stack((whole, seen), axis=1)
+    (trial,) = put_to_test(folds, pair, [slice(0, 2)])
+    assert trial is not None
+    assert trial.held_out == pytest.approx(_written_out(problem, pair).held_out, rel=1e-6)
+
+
+def test_the_unit_of_a_candidate_does_not_matter() -> None:
+    rng = np.random.default_rng(4)
+    folds = cut(_problem(rng))
+    columns = rng.normal(size=(len(folds.problem.motor), 2))
+    (one,) = put_to_test(folds, columns, [slice(0, 2)])
+    (other,) = put_to_test(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
+    assert one is not None
+    assert other is not None
+    _agree(replace(other, score=one.score, scatter=one.scatter, gram=one.gram,
+                   coefficients=other.coefficients * np.array([1e5, 1e-4])), one)  # fmt: skip

@@ -1,0 +1,235 @@
+"""Every effect claims a property of its columns; here is the one test that tries to refute them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.discovery.signals import Signals
+from ident.discovery.structure import VARIABLES
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Abscissa, Effect, Property, Side, values
+from ident.effects.electrical import Cogging, Saturation
+from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
+from ident.effects.placement import at_joints, is_placeable
+from ident.effects.position import Hinge, Spring
+from ident.effects.timing import TimeSkew
+from ident.effects.transmission import Elasticity
+from ident.effects.unnamed import INTERVALS, Periodic, Smooth
+from ident.model.model import DriveTrain
+from ident.model.robot import robot_from_urdf
+from tests.ident.arms import GANTRY, THREE_AXES
+
+FloatArray = NDArray[np.float64]
+
+JOINTS, SAMPLES = 13, 400
+
+
+def random_signals(seed: int) -> Signals:
+    """Of eleven joints that no mechanics binds together."""
+    rng = np.random.default_rng(seed)
+    position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
+    torque = np.cumsum(motor, axis=1)
+    time_s = np.arange(SAMPLES) / 100.0
+    return Signals(
+        rate_hz=100.0,
+        time_s=time_s,
+        session_s=5.0 + time_s,
+        position_rad=2.0 * position,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
+        motor_position_rad=30.0 * position,
+        inertia_kg_m2=rng.normal(size=(JOINTS, JOINTS, SAMPLES)),
+        load_torque_nm=load,
+        geared_torque_nm=geared,
+        motor_torque_nm=torque,
+        current_a=torque / 20.0,
+    )
+
+
+def _scaled(s: Signals, factor: float) -> Signals:
+    return replace(
+        s,
+        time_s=factor * s.time_s,
+        session_s=factor * s.session_s,
+        position_rad=factor * s.position_rad,
+        velocity_rad_s=factor * s.velocity_rad_s,
+        motor_position_rad=factor * s.motor_position_rad,
+        load_torque_nm=factor * s.load_torque_nm,
+        motor_torque_nm=factor * s.motor_torque_nm,
+        current_a=factor * s.current_a,
+    )
+
+
+def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
+    x = np.abs(values(variable, random_signals(5), 0, other_axis - 1 if other_axis else None))
+    return Smooth(variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis)
+
+
+GENERIC: tuple[tuple[Effect, ...], ...] = (
+    *(tuple(_over_its_range(variable, signed) for signed in signs) for variable, signs in VARIABLES),
+    tuple(_over_its_range(Abscissa.OTHER_VELOCITY, signed, other_axis=4) for signed in (0, 1)),
+    (Periodic(0), Periodic(1)),
+)
+MEMBERS = [
+    pytest.param(effect, id=f"{effect.name}-{index}")
+    for family in (*EFFECTS, *GENERIC)
+    for index, effect in enumerate(family)
+]
+
+
+def _same(one: FloatArray, other: FloatArray) -> bool:
+    # A motor angle of a hundred radians and the square of a rate each cost some digits.
+    return np.allclose(one, other, rtol=1e-8, atol=1e-10 * float(np.max(np.abs(other))) + 1e-12)
+
+
+def _is_odd(columns: Callable[[Signals], FloatArray], signals: Signals, reversed_: Signals) -> bool:
+    return _same(columns(reversed_), -columns(signals)) and bool(np.any(columns(signals)))
+
+
+def _is_zero_where(columns: Callable[[Signals], FloatArray], signals: Signals, held: Signals) -> bool:
+    """Held over the middle half; a second difference reaches two samples beyond."""
+    middle = columns(held)[..., SAMPLES // 4 + 2 : -SAMPLES // 4 - 2]
+    return not np.any(middle) and bool(np.any(columns(signals)))
+
+
+def _held(value: FloatArray) -> FloatArray:
+    held = value.copy()
+    held[:, SAMPLES // 4 : -SAMPLES // 4] = 1.5
+    return held
+
+
+def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
+    """Whether a property can be seen in an effect's columns; what it is said of must have a say in them."""
+    s = random_signals(seed)
+    v, angle = s.velocity_rad_s, s.motor_position_rad
+
+    def columns(signals: Signals) -> FloatArray:
+        return effect.columns(signals, axis)
+
+    match claim:
+        case Property.ODD_IN_VELOCITY:
+            holds = _is_odd(columns, s, replace(s, velocity_rad_s=-v))
+        case Property.EVEN_IN_VELOCITY:
+            has_a_say = not _same(columns(replace(s, velocity_rad_s=2.0 * v)), columns(s))
+            holds = has_a_say and _same(columns(replace(s, velocity_rad_s=-v)), columns(s))
+        case Property.INDEPENDENT_OF_VELOCITY:
+            holds = _same(columns(replace(s, velocity_rad_s=3.0 + v**2)), columns(s))
+        case Property.PERIODIC_IN_MOTOR_ANGLE:
+            has_a_say = not _same(columns(replace(s, motor_position_rad=angle + 0.3)), columns(s))
+            holds = has_a_say and _same(columns(replace(s, motor_position_rad=angle + 2.0 * np.pi)), columns(s))
+        case Property.ODD_IN_CURRENT:
+            holds = _is_odd(columns, s, replace(s, motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a))
+        case Property.ODD_IN_LOAD:
+            turned = replace(s, load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm)
+            holds = _is_odd(columns, s, turned)
+        case Property.RATE_OF_TORQUE:
+            holds = _is_zero_where(columns, s, replace(s, motor_torque_nm=_held(s.motor_torque_nm)))
+        case Property.RATE_OF_LOAD:
+            holds = _is_zero_where(columns, s, replace(s, load_torque_nm=_held(s.load_torque_nm)))
+        case Property.SMOOTH:
+            # A uniform cubic spline's slope is less than one an interval, and no variable here is more than a hundred
+            # times its range; a change by a small part of itself turns no sign.
+            change = columns(_scaled(s, 1.0 + 1e-8)) - columns(s)
+            holds = bool(np.any(change)) and float(np.max(np.abs(change))) <= 1e-8 * 100.0 * INTERVALS
+    return holds
+
+
+@pytest.mark.parametrize("effect", MEMBERS)
+def test_claims_hold(effect: Effect) -> None:
+    for seed in range(3):
+        assert _claim_holds(effect, effect.holds, 0, seed)
+
+
+WRONG: tuple[tuple[Effect, Property], ...] = (
+    (AsymmetricViscous(), Property.ODD_IN_VELOCITY),
+    (Spring(), Property.ODD_IN_VELOCITY),
+    (Stribeck(0.1), Property.EVEN_IN_VELOCITY),
+    (Spring(), Property.EVEN_IN_VELOCITY),
+    (LoadFriction(0), Property.INDEPENDENT_OF_VELOCITY),
+    (Coupling(2, -1), Property.INDEPENDENT_OF_VELOCITY),
+    (Hinge(0.5, 1), Property.PERIODIC_IN_MOTOR_ANGLE),
+    (Saturation(), Property.PERIODIC_IN_MOTOR_ANGLE),
+    (Cogging(2), Property.ODD_IN_CURRENT),
+    (LoadFriction(0), Property.ODD_IN_LOAD),
+    (Elasticity(), Property.RATE_OF_TORQUE),
+    (Saturation(), Property.RATE_OF_TORQUE),
+    (LoadFriction(0), Property.RATE_OF_LOAD),
+    (Spring(), Property.RATE_OF_LOAD),
+    (Cogging(10**9), Property.SMOOTH),
+)
+
+
+@pytest.mark.parametrize(("effect", "claim"), WRONG, ids=lambda value: getattr(value, "name", None))
+def test_a_wrong_claim_is_refuted(effect: Effect, claim: Property) -> None:
+    assert not _claim_holds(effect, claim, 0, 0)
+
+
+def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
+    assert {claim for _, claim in WRONG} == set(Property)
+    assert {effect.holds for family in (*EFFECTS, *GENERIC) for effect in family} == set(Property)
+
+
+@pytest.mark.parametrize("effect", MEMBERS)
+def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
+    signals, strange = random_signals(5), random_signals(6)
+    columns = effect.columns(signals, 0)
+    joints = {Side.TWO_JOINTS: (2,), Side.ALL_JOINTS: (JOINTS,), Side.ALL_MOTORS: (JOINTS,)}.get(effect.side, ())
+    assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
+    assert np.all(np.isfinite(columns))
+    assert np.all(np.ptp(columns, axis=-1) > 0)
+
+    def changed(axes: list[int]) -> Signals:
+        arrays = {}
+        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "motor_position_rad", "load_torque_nm",
+                     "geared_torque_nm", "motor_torque_nm", "current_a"):  # fmt: skip
+            array = getattr(signals, name).copy()
+            array[axes] = getattr(strange, name)[axes]
+            arrays[name] = array
+        return replace(signals, **arrays)
+
+    own = [0, int(effect.settings["other_axis"]) - 1] if effect.settings.get("other_axis") else [0]
+    own = list(range(JOINTS)) if effect.side is Side.ALL_MOTORS else own
+    assert np.array_equal(effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns)
+    # What depends on the clock alone is the same on all axes.
+    of_the_clock = effect.holds is Property.SMOOTH and effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
+    if not of_the_clock or effect.settings["signed"]:
+        assert not np.allclose(effect.columns(changed(own), 0), columns)
+
+
+def test_columns_act_where_the_effect_says() -> None:
+    ratio = np.diag([30.0, 40.0, 50.0])
+    ratio[2, 1] = 25.0
+    train, rng = DriveTrain(ratio), np.random.default_rng(1)
+    one, two, all_ = rng.normal(size=(2, 7)), rng.normal(size=(2, 2, 7)), rng.normal(size=(3, 1, 7))
+    at_joint = at_joints(Cogging(1), 2, one, train)
+    # Motor 3 turns with joints 2 and 3, the second at half the ratio.
+    assert at_joint == pytest.approx(np.stack((0.0 * one, 0.5 * one, one)))
+    assert at_joints(Spring(), 1, one, train) == pytest.approx(np.stack((0.0 * one, one, 0.0 * one)))
+    assert at_joints(Coupling(3, 1), 0, two, train) == pytest.approx(np.stack((two[0], 0.0 * one, two[1])))
+    assert np.array_equal(at_joints(Elasticity(), 1, all_, train), all_)
+    of_motors = np.stack((all_[0], all_[1] + 0.5 * all_[2], all_[2]))
+    assert at_joints(TimeSkew(), 0, all_, train) == pytest.approx(of_motors)
+
+
+def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None:
+    three, gantry = robot_from_urdf(THREE_AXES.urdf), robot_from_urdf(GANTRY.urdf)
+    placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
+    assert placed == [0, 1]
+    assert not is_placeable(Coupling(4, 1), 0, three)
+    assert is_placeable(Spring(), 2, three)
+    # What all motors share is tried once.
+    assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)] == [0]
+    assert is_placeable(PositionFriction(), 0, three)
+    assert not is_placeable(PositionFriction(), 0, gantry)
+    assert is_placeable(Spring(), 0, gantry)
+
+
+def test_families_hold_one_name_and_names_are_unique() -> None:
+    names = [{effect.name for effect in family} for family in EFFECTS]
+    assert all(len(name) == 1 for name in names)
+    assert len(set.union(*names)) == len(names)

@@ -1,0 +1,103 @@
+"""Triangles instead of rows: the same equations, whatever the pieces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ident.data.run import Run
+from ident.equations import reduction as reduction_module
+from ident.equations.reduction import Reduction, layout, reduce_runs
+from ident.equations.system import System
+from ident.equations.triangles import triangle
+from ident.estimators.maximum_likelihood import ml
+from ident.model.model import DriveTrain, Model
+from tests.ident.recordings import CONDITIONING, Truth, gathered
+
+
+def _system(reduction: Reduction) -> System:
+    return reduction.system(reduction.base(), reduction.payload_columns())
+
+
+@pytest.fixture(scope="module")
+def whole(truth: Truth, noisy_runs: tuple[Run, ...]) -> System:
+    """In pieces of the usual length."""
+    return _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
+
+
+def test_the_triangles_are_those_of_the_rows(truth: Truth, noisy_runs: tuple[Run, ...], whole: System) -> None:
+    rows = gathered(truth, noisy_runs).training.system()
+    for one, other in ((whole.joints, rows.joints), (whole.motors, rows.motors)):
+        assert one.rows.tolist() == other.rows.tolist()
+        for a, b in zip(one.factors, other.factors, strict=True):
+            assert a.T @ a == pytest.approx(b.T @ b, rel=1e-9, abs=1e-9 * np.max(np.abs(b)) ** 2)
+    assert len(whole.moves) == len(rows.moves)
+    assert ml(whole).gains_std == pytest.approx(ml(rows).gains_std, rel=1e-6)
+
+
+@given(st.integers(min_value=1, max_value=400))
+@settings(max_examples=6, deadline=None)
+def test_results_do_not_depend_on_the_chunk(
+    truth: Truth, noisy_runs: tuple[Run, ...], whole: System, chunk: int
+) -> None:
+    other = ml(_system(reduce_runs(truth.model, noisy_runs, CONDITIONING, chunk_rows=chunk)))
+    assert other.gains == pytest.approx(ml(whole).gains, rel=1e-9)
+    assert other.gains_std == pytest.approx(ml(whole).gains_std, rel=1e-6)
+
+
+def test_many_moves_are_joined_and_say_the_same(
+    truth: Truth, noisy_runs: tuple[Run, ...], whole: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reduction_module, "MOST_CLUSTERS", 20)
+    joined = _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
+    assert len(joined.moves) < len(whole.moves)
+    assert ml(joined).gains == pytest.approx(ml(whole).gains, rel=1e-9)
+    assert ml(joined).gains_std == pytest.approx(ml(whole).gains_std, rel=0.5)
+
+
+def test_runs_are_read_one_after_the_other(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    held: list[int] = []
+    read: list[Run] = []
+
+    def reading() -> Run:
+        read.append(noisy_runs[len(held)])
+        held.append(len(held))
+        return read.pop()
+
+    found = reduce_runs(truth.model, (reading() for _ in noisy_runs), CONDITIONING)
+    assert found.runs == tuple(run.name for run in noisy_runs)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])
+def test_the_layout_leaves_nothing_out(truth: Truth, noisy_runs: tuple[Run, ...], order: tuple[int, ...]) -> None:
+    """Columns outside a joint's or a motor's layout are zero for any motion."""
+    model = Model(truth.model.robot, DriveTrain(truth.model.drive_train.ratio[list(order)]))
+    rng = np.random.default_rng(0)
+    motion = replace(
+        gathered(truth, noisy_runs[:2]).datasets[0].motion(slice(0, 1)),
+        position_rad=rng.normal(size=(6, 50)),
+        velocity_rad_s=rng.normal(size=(6, 50)),
+        acceleration_rad_s2=rng.normal(size=(6, 50)),
+    )
+    columns = model.regressor(motion)
+    assert not columns[~model.support].any()
+    mixed = np.einsum("ij,jck->ick", model.drive_train.to_motor, columns)
+    for motor, held in enumerate(layout(model).motor):
+        left_out = np.setdiff1d(np.arange(columns.shape[1]), held)
+        assert np.max(np.abs(mixed[motor][left_out]), initial=0.0) < 1e-9
+
+
+@given(st.integers(0, 40), st.integers(1, 12), st.integers(0, 2**32 - 1))
+@settings(deadline=None)
+def test_a_triangle_of_pieces_has_the_norms_of_the_whole(rows: int, columns: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(rows, columns))
+    cut = int(rng.integers(0, rows + 1))
+    found = triangle((triangle((matrix[:cut],), columns), matrix[cut:]), columns)
+    x = rng.normal(size=columns)
+    assert np.linalg.norm(found @ x) == pytest.approx(np.linalg.norm(matrix @ x), rel=1e-12, abs=1e-12)
+    assert len(found) <= max(columns, rows)

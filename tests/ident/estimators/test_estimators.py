@@ -1,0 +1,179 @@
+"""Estimators: what they must give back, and what must not change them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ident.data.run import Run
+from ident.equations.system import require_distinct
+from ident.errors import DataUnfit, RankDeficient
+from ident.estimators.estimate import Estimate, Method
+from ident.estimators.identify import estimate_with, identify
+from ident.estimators.least_squares import Scaling, tls, wls
+from ident.estimators.maximum_likelihood import ml
+from ident.model.bodies import Payload
+from ident.model.model import DriveTrain, Model
+from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record
+
+FloatArray = NDArray[np.float64]
+
+
+def _fit(truth: Truth, runs: tuple[Run, ...], method: Method = Method.ML) -> Estimate:
+    return identify(truth.model, runs, CONDITIONING, method=method).estimate
+
+
+@pytest.mark.parametrize("method", Method)
+def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: tuple[Run, ...], method: Method) -> None:
+    estimate = _fit(truth, clean_runs, method)
+    assert estimate.gains == pytest.approx(GAINS, rel=2e-4)
+    names = [column.name for column in estimate.unknowns]
+    for name in ("mx", "my", "mz", "Izz"):
+        found = estimate.parameters[names.index(f"{name}:a")]
+        assert found == pytest.approx(PAYLOAD_TRUTH[name], rel=5e-3, abs=1e-3)
+
+
+def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    for method in (Method.LS, Method.WLS, Method.ML):
+        result = identify(truth.model, clean_runs[:1], CONDITIONING, method=method, fixed_gains=GAINS)
+        expected = result.system.base.grouping @ truth.parameters
+        assert result.estimate.parameters == pytest.approx(expected, rel=1e-3, abs=2e-3)
+        assert np.all(result.estimate.gains_std == 0.0)
+
+
+def test_ml_beats_the_papers_tls_and_both_beat_wls(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    errors = {m: float(np.mean(np.abs(_fit(truth, noisy_runs, m).gains / GAINS - 1.0))) for m in Method}
+    assert errors[Method.ML] < errors[Method.TLS] < errors[Method.WLS]
+    assert errors[Method.ML] < 0.012
+
+
+def test_gains_scale_with_the_payload_mass(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    heavier = Payload("disc", "a", {"m": 4.59 * 1.05})
+    runs = tuple(replace(run, payload=heavier) if run.payload else run for run in noisy_runs)
+    assert _fit(truth, runs).gains == pytest.approx(1.05 * _fit(truth, noisy_runs).gains, rel=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1000.0, 2.0**-0.5, -1.0])
+def test_a_change_of_current_unit_scales_exactly_that_gain(
+    truth: Truth, noisy_runs: tuple[Run, ...], factor: float
+) -> None:
+    scale = np.ones(6)
+    scale[3] = factor
+    before = _fit(truth, noisy_runs)
+    after = _fit(truth, tuple(replace(run, current_a=run.current_a * scale) for run in noisy_runs))
+    assert after.gains == pytest.approx(before.gains / scale, rel=1e-6)
+    assert after.parameters == pytest.approx(before.parameters, rel=1e-5, abs=1e-8)
+    assert after.gains_std == pytest.approx(before.gains_std / np.abs(scale), rel=1e-4)
+
+
+def test_the_order_of_runs_does_not_matter(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    before, after = _fit(truth, noisy_runs), _fit(truth, noisy_runs[::-1])
+    assert after.gains == pytest.approx(before.gains, rel=1e-9)
+    assert after.gains_std == pytest.approx(before.gains_std, rel=1e-6)
+
+
+def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    order = np.array([0, 2, 1, 3, 5, 4])
+    model = Model(truth.model.robot, DriveTrain(truth.model.drive_train.ratio[order]))
+    runs = tuple(replace(run, current_a=run.current_a[:, order]) for run in noisy_runs)
+    conditioning = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
+    before = identify(truth.model, noisy_runs, conditioning).estimate
+    after = identify(model, runs, conditioning).estimate
+    assert after.gains == pytest.approx(before.gains[order], rel=1e-9)
+    assert after.parameters == pytest.approx(before.parameters, rel=1e-7, abs=1e-9)
+
+
+def test_the_covariance_covers_the_error(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    estimate = _fit(truth, noisy_runs)
+    scores = (estimate.gains - GAINS) / estimate.gains_std
+    assert np.all(np.abs(scores) < 4.0)
+    assert np.all(estimate.gains_std / np.abs(GAINS) < 0.02)
+
+
+def test_ml_solves_the_instrumental_variable_equations(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    """Instruments are the columns of W and the predicted currents (docs/decisions/0010)."""
+    system = identify(truth.model, noisy_runs, CONDITIONING).system
+    estimate = ml(system)
+    gamma = 1.0 / estimate.gains
+    columns = np.zeros(len(estimate.parameters))
+    size = np.zeros_like(columns)
+    for factor, g, sigma in zip(system.motors.factors, gamma, estimate.axis_noise, strict=True):
+        predicted = g * (factor[:, 1:-1] @ estimate.parameters + factor[:, -1])
+        error = factor[:, 0] - predicted
+        assert abs(predicted @ error) < 1e-6 * np.linalg.norm(predicted) * np.linalg.norm(error)
+        columns += g / sigma**2 * (factor[:, 1:-1].T @ error)
+        size += abs(g) / sigma**2 * np.linalg.norm(factor[:, 1:-1], axis=0) * np.linalg.norm(error)
+    assert np.all(np.abs(columns) < 1e-6 * size)
+
+
+@pytest.mark.parametrize("scaling", Scaling)
+def test_tls_scalings_agree_without_noise(truth: Truth, clean_runs: tuple[Run, ...], scaling: Scaling) -> None:
+    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
+    assert tls(system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
+
+
+def test_without_a_known_payload_there_is_no_scale(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    for method in Method:
+        with pytest.raises(DataUnfit, match="weighed payload"):
+            _fit(truth, clean_runs[:1], method)
+
+
+def test_loaded_runs_alone_are_rank_deficient(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    with pytest.raises(RankDeficient, match="without load too") as caught:
+        _fit(truth, clean_runs[1:])
+    assert any(name.endswith(":a") for name in caught.value.unknowns)
+
+
+def test_a_mounting_has_one_payload(truth: Truth) -> None:
+    rng = np.random.default_rng(2)
+    other = Payload("disc", "a", {"m": 5.0})
+    runs = (
+        record(truth, "one", rng, MOUNTED, seconds=3.0),
+        replace(record(truth, "two", rng, seconds=3.0), payload=other),
+    )
+    with pytest.raises(DataUnfit, match="name of its own"):
+        _fit(truth, runs)
+
+
+def test_tls_has_nothing_to_do_with_fixed_gains(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
+    with pytest.raises(DataUnfit, match="free gains"):
+        estimate_with(Method.TLS, system, GAINS)
+
+
+def test_more_runs_of_one_mounting_share_its_unknowns(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    system = identify(truth.model, noisy_runs, CONDITIONING).system
+    assert len(system.unknowns) == 61 + 9
+    assert ml(system).rows == int(system.motors.rows.sum())
+
+
+def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
+    truth: Truth, clean_runs: tuple[Run, ...]
+) -> None:
+    """Joint 6 stands while joint 5 moves: no row of the coupled motors is free of an undetermined dry friction."""
+    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.WLS).system
+    apart = replace(
+        system,
+        motors=replace(
+            system.motors,
+            factors=tuple(f if m < 4 else np.zeros((0, f.shape[1])) for m, f in enumerate(system.motors.factors)),
+            rows=np.where(np.arange(6) < 4, system.motors.rows, 0),
+        ),
+    )
+    require_distinct(apart, gains=True)
+    assert wls(apart).gains == pytest.approx(wls(system).gains)
+    with pytest.raises(DataUnfit, match=r"joints 5 and 6.*never move at the same time"):
+        ml(apart)
+
+
+def test_an_axis_that_never_moves_is_named(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    still = []
+    for run in clean_runs:
+        position = run.position_rad.copy()
+        position[:, 3] = 0.4
+        still.append(replace(run, position_rad=position))
+    with pytest.raises(DataUnfit, match="joint 4 never moves"):
+        _fit(truth, tuple(still))

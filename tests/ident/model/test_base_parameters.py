@@ -1,0 +1,47 @@
+"""Base parameters: as many as the literature counts, and saying the same torque."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ident.data.dataset import differentiate
+from ident.data.run import Run
+from ident.equations.observation import observe
+from ident.equations.reduction import reduce_runs
+from ident.model.base import base_parameters
+from tests.ident.recordings import CONDITIONING, Truth
+
+
+def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    data = differentiate(clean_runs[0], truth.model.drive_train, CONDITIONING)
+    reduction = reduce_runs(truth.model, clean_runs[:1], CONDITIONING)
+    observation = observe(truth.model, [data], CONDITIONING, reduction.system(reduction.base(), ()))
+    assert len(observation.columns) == 61
+    assert observation.columns[0].name.startswith("Izz1 + 1.0*Ia1 + 1.0*Iyy2")
+    torque = np.einsum("jcr,c->jr", observation.robot, observation.base.grouping @ truth.parameters)
+    # The currents of this run were made from the standard parameters, without noise.
+    measured = observation.torque(truth.gains)
+    size = np.max(np.abs(measured[:, observation.use.any(axis=0)]))
+    assert np.max(np.abs((torque - measured)[observation.use])) < 2e-3 * size
+
+
+def test_a_tiny_column_is_zero_and_not_a_parameter() -> None:
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(50, 3))
+    matrix[:, 1] = 1e-12 * rng.normal(size=50)
+    found = base_parameters(matrix, ("a", "b", "c"))
+    assert found.independent == (0, 2)
+    assert found.names == ("a", "c")
+
+
+def test_regrouping_keeps_the_product() -> None:
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(60, 5))
+    matrix[:, 2] = 2.0 * matrix[:, 0] - 0.5 * matrix[:, 1]
+    found = base_parameters(matrix, ("a", "b", "c", "d", "e"))
+    assert found.independent == (0, 1, 3, 4)
+    assert found.names[0] == "a + 2.0*c"
+    assert found.names[1] == "b - 0.5*c"
+    parameters = rng.normal(size=5)
+    assert matrix[:, [0, 1, 3, 4]] @ (found.grouping @ parameters) == pytest.approx(matrix @ parameters)

@@ -1,0 +1,96 @@
+"""The regressor against Pinocchio's inverse dynamics, for arms of all kinds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from ident.model import regressor
+from ident.model.regressor import fill_rigid, moved_links, rigid_regressor
+from ident.model.robot import robot_from_urdf
+from tests.ident.arms import ARMS, GRAVITIES, Arm
+
+
+def _pinocchio_parameters(model: pin.Model) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    parameters: list[float] = []
+    for inertia in list(model.inertias)[1:]:
+        mass, mx, my, mz, ixx, ixy, iyy, ixz, iyz, izz = inertia.toDynamicParameters()
+        parameters.extend((ixx, ixy, ixz, iyy, iyz, izz, mx, my, mz, mass))
+    return np.array(parameters)
+
+
+@pytest.mark.parametrize("gravity", GRAVITIES)
+@pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
+def test_agrees_with_inverse_dynamics_to_1e9(arm: Arm, gravity: tuple[float, float, float]) -> None:
+    model = pin.buildModelFromXML(arm.urdf)
+    model.gravity.linear = np.array(gravity)
+    data = model.createData()
+    rng = np.random.default_rng(7)
+    q, v, a = rng.uniform(-3, 3, (3, model.nv, 40))
+    torque = np.einsum(
+        "jck,c->jk", rigid_regressor(robot_from_urdf(arm.urdf, gravity), q, v, a), _pinocchio_parameters(model)
+    )
+    expected = np.stack([pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(40)], axis=1)
+    assert np.max(np.abs(torque - expected)) < 1e-9 * max(1.0, np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
+def test_blocks_do_not_show(arm: Arm, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = robot_from_urdf(arm.urdf)
+    q, v, a = np.random.default_rng(8).uniform(-2, 2, (3, robot.joint_count, 25))
+    whole = rigid_regressor(robot, q, v, a)
+    monkeypatch.setattr(regressor, "BLOCK_SAMPLES", 10)
+    assert np.max(np.abs(rigid_regressor(robot, q, v, a) - whole)) < 1e-12 * np.max(np.abs(whole))
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
+def test_writes_what_a_joint_moves_and_nothing_else(arm: Arm) -> None:
+    robot = robot_from_urdf(arm.urdf)
+    count = robot.joint_count
+    q, v, a = np.random.default_rng(9).uniform(-2, 2, (3, count, 5))
+    wide = np.full((count, count, 12, 5), np.nan)
+    fill_rigid(robot, q, v, a, wide[:, :, 1:11])
+    moved = np.zeros((count, count), dtype=np.bool_)
+    for joint, links in enumerate(moved_links(robot)):
+        moved[joint, list(links)] = True
+    expected = rigid_regressor(robot, q, v, a).reshape(count, count, 10, 5)
+    assert np.array_equal(wide[moved][:, 1:11], expected[moved])
+    assert np.isnan(wide[~moved]).all()
+    assert np.isnan(wide[:, :, [0, 11]]).all()
+    assert not expected[~moved].any()
+
+
+def test_in_a_tree_a_joint_moves_its_own_branch_alone() -> None:
+    """Two arms on one torso: against Pinocchio, and what one arm does not move of the other."""
+    urdf = (
+        '<robot name="two"><link name="base"/>'
+        + "".join(
+            f'<joint name="q{name}" type="{kind}"><origin xyz="0.1 {y} 0.3" rpy="0.3 0.1 {y}"/>'
+            f'<parent link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/>'
+            '<limit lower="-3" upper="3" velocity="3" effort="9"/></joint>'
+            f'<link name="{name}"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="2"/>'
+            '<inertia ixx="0.03" ixy="0.001" ixz="-0.002" iyy="0.04" iyz="0.003" izz="0.02"/></inertial></link>'
+            for name, kind, parent, y, axis in (
+                ("torso", "revolute", "base", "0", "0 0 1"),
+                ("a1", "revolute", "torso", "0.2", "0 1 0"),
+                ("a2", "prismatic", "a1", "0.1", "0.6 0 0.8"),
+                ("b1", "revolute", "torso", "-0.2", "1 0 0"),
+                ("b2", "revolute", "b1", "-0.1", "0 0 1"),
+            )
+        )
+        + "</robot>"
+    )
+    robot = robot_from_urdf(urdf)
+    assert moved_links(robot) == ((0, 1, 2, 3, 4), (1, 2), (2,), (3, 4), (4,))
+    model = pin.buildModelFromXML(urdf)
+    data = model.createData()
+    q, v, a = np.random.default_rng(10).uniform(-2, 2, (3, 5, 20))
+    torque = np.einsum("jck,c->jk", rigid_regressor(robot, q, v, a), _pinocchio_parameters(model))
+    expected = np.stack([pin.rnea(model, data, q[:, k], v[:, k], a[:, k]) for k in range(20)], axis=1)
+    assert np.max(np.abs(torque - expected)) < 1e-9 * np.max(np.abs(expected))
+
+
+def test_no_samples_are_no_rows() -> None:
+    robot = robot_from_urdf(ARMS[0].urdf)
+    assert rigid_regressor(robot, *np.zeros((3, robot.joint_count, 0))).shape == (6, 60, 0)

@@ -1,0 +1,286 @@
+"""Physical parameters: the same torque where that is possible, the nearest possible one where it is not."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ident.errors import ModelError
+from ident.model.base import BaseParameters, base_parameters
+from ident.model.bodies import body_of, link_parameters, pseudo_inertia
+from ident.model.kinematics import Motion
+from ident.model.model import DriveTrain, Model
+from ident.model.robot import robot_from_urdf
+from ident.physical.inertia_prior import DEFAULT_MASS_KG, inertia_prior
+from ident.physical.physical import SLACK, PhysicalParameters, physical_parameters
+from ident.physical.programme import MARGIN, NotPhysical
+from ident.physical.regrouping import random_motion, regroup
+from tests.ident.arms import ARMS, GANTRY, GRAVITIES, TX40, Arm
+from tests.ident.recordings import RATIO
+
+FloatArray = NDArray[np.float64]
+
+
+def _model(arm: Arm, gravity: tuple[float, float, float] = GRAVITIES[0], *, coupled: bool = True) -> Model:
+    robot = robot_from_urdf(arm.urdf, gravity)
+    ratio = np.eye(robot.joint_count)
+    if coupled:
+        ratio[-1, -2] = 0.7
+    return Model(robot, DriveTrain(RATIO if arm is TX40 else ratio))
+
+
+def _motion(model: Model, seed: int, samples: int = 200) -> Motion:
+    count = model.robot.joint_count
+    return random_motion(np.repeat([[0.1], [1.5], [2.0], [6.0]], count, axis=1), samples, seed)
+
+
+def _link(rng: np.random.Generator, size_m: float = 0.1) -> FloatArray:
+    """Twelve points of mass."""
+    masses, points = rng.uniform(0.05, 0.4, 12), rng.uniform(-size_m, size_m, (12, 3))
+    inertia = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, points, strict=True))
+    return np.concatenate((np.asarray(inertia)[np.triu_indices(3)], masses @ points, [masses.sum()]))
+
+
+def _truth(model: Model, seed: int) -> FloatArray:
+    """A robot that can exist: bodies, rotors, friction that loses power."""
+    rng = np.random.default_rng(seed)
+    values = dict.fromkeys((column.name for column in model.columns), 0.0)
+    count = model.robot.joint_count
+    out = np.zeros(len(values))
+    for joint in range(count):
+        out[14 * joint : 14 * joint + 10] = _link(rng)
+        out[14 * joint + 10 : 14 * joint + 14] = (*rng.uniform(0.01, 0.3, 3), rng.uniform(-0.3, 0.3))
+    for index, motor in enumerate(model.drive_train.coupled):
+        own = rng.uniform(0.01, 0.2, 3)
+        out[14 * count + 3 * index :][:3] = own
+        # Seen at the joints that it turns, a rotor is on the diagonal too (paper eq. 25).
+        for joint, r in enumerate(model.drive_train.direction[motor]):
+            out[14 * joint + 10 : 14 * joint + 12] += r**2 * own[:2]
+    return out
+
+
+def _rows(columns: FloatArray) -> FloatArray:
+    return columns.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+
+
+def _base(model: Model, columns: FloatArray) -> BaseParameters:
+    triangle = np.asarray(np.linalg.qr(_rows(columns), mode="r"))
+    rounded = base_parameters(triangle, tuple(column.name for column in model.columns))
+    return regroup(model, rounded.names, _rows(columns))
+
+
+def _check_possible(found: PhysicalParameters) -> None:
+    """Said in another way than by the matrix inequality of the programme."""
+    for link in found.links:
+        assert link[9] > 0.0
+        moments = np.linalg.eigvalsh(body_of(link).inertia_kg_m2)
+        assert moments[0] > 0.0
+        assert moments[0] + moments[1] > moments[2]
+    model = found.model
+    values = dict(zip((column.name for column in model.columns), found.standard, strict=True))
+    assert all(value >= 0.0 for name, value in values.items() if name.startswith(("fs", "Iam", "fvm")))
+    rng = np.random.default_rng(0)
+    for velocity in rng.normal(size=(50, model.robot.joint_count)):
+        for single, shared in (("Ia", "Iam"), ("fv", "fvm")):
+            power = sum(values[f"{single}{j + 1}"] * v**2 for j, v in enumerate(velocity))
+            for motor in model.drive_train.coupled:
+                r = model.drive_train.direction[motor]
+                power += values[f"{shared}{motor + 1}"] * ((r @ velocity) ** 2 - r**2 @ velocity**2)
+            assert power >= -1e-9
+
+
+@settings(deadline=None, max_examples=4, derandomize=True)
+@given(seed=st.integers(0, 10**6), gravity=st.sampled_from(GRAVITIES))
+@pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
+def test_a_possible_robot_keeps_its_torque(arm: Arm, seed: int, gravity: tuple[float, float, float]) -> None:
+    model = _model(arm, gravity)
+    truth = _truth(model, seed)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    found = physical_parameters(model, base, base.grouping @ truth, columns, inertia_prior(arm.urdf))
+    assert found.exact
+    _check_possible(found)
+    assert np.all(found.eigenvalues >= 0.5 * MARGIN)
+    other = model.regressor(_motion(model, 2))
+    expected = np.einsum("jck,c->jk", other, truth)
+    torque = np.einsum("jck,c->jk", other, found.standard)
+    assert np.linalg.norm(torque - expected) <= 1e-6 * np.linalg.norm(expected)
+
+
+@settings(deadline=None, max_examples=4, derandomize=True)
+@given(seed=st.integers(0, 10**6))
+@pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
+def test_noise_is_projected_and_the_distance_told(arm: Arm, seed: int) -> None:
+    model = _model(arm)
+    truth = _truth(model, seed)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    true_values = base.grouping @ truth
+    noise = 0.1 * np.random.default_rng(seed).normal(size=len(true_values)) * np.abs(true_values).mean()
+    noisy = true_values + noise
+    found = physical_parameters(model, base, noisy, columns, inertia_prior(arm.urdf))
+    _check_possible(found)
+    given_torque, found_torque, true_torque = (
+        np.einsum("jck,c->jk", columns[:, list(base.independent)], values)
+        for values in (noisy, found.realised, true_values)
+    )
+    assert np.allclose(found_torque, np.einsum("jck,c->jk", columns, found.standard))
+    size = np.linalg.norm(given_torque, axis=1)
+    change = np.linalg.norm(found_torque - given_torque, axis=1) / size
+    assert found.torque_change_percent.axes == pytest.approx(100.0 * change, abs=1e-9)
+    assert found.exact == bool(np.max(change) <= 1e-6)
+    # The robot without the noise is possible: nothing that is farther away than it may be called the nearest.
+    true_change = np.linalg.norm(true_torque - given_torque, axis=1) / size
+    assert np.linalg.norm(change) <= (1.0 + SLACK) * np.linalg.norm(true_change) + 1e-6
+
+
+def test_a_robot_that_is_as_its_urdf_says_is_found_as_such() -> None:
+    model = _model(TX40)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    prior = inertia_prior(TX40.urdf)
+    truth = _truth(model, 5)
+    for joint, link in enumerate(prior.links):
+        truth[14 * joint : 14 * joint + 10] = link
+    found = physical_parameters(model, base, base.grouping @ truth, columns, prior)
+    assert found.exact
+    assert found.links == pytest.approx(prior.links, abs=1e-3)
+
+
+def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
+    model = _model(TX40)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    prior = inertia_prior(TX40.urdf)
+    found = physical_parameters(model, base, base.grouping @ _truth(model, 5), columns, prior)
+
+    def distance(standard: FloatArray) -> float:
+        total = 0.0
+        for joint, link in enumerate(prior.links):
+            seen = np.linalg.solve(pseudo_inertia(link), pseudo_inertia(standard[14 * joint : 14 * joint + 10]))
+            total += np.trace(seen) - np.linalg.slogdet(seen)[1] - 4.0
+        return total
+
+    _, _, right = np.linalg.svd(base.grouping)
+    scalars = [14 * joint + place for joint in range(6) for place in range(10, 14)] + [84, 85, 86]
+    inertial = np.array([row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)])
+    least = distance(found.standard)
+    for direction in np.random.default_rng(0).normal(size=(100, len(inertial))) @ inertial:
+        assert distance(found.standard + 1e-3 * direction) >= least - 1e-7
+
+
+def test_friction_that_would_push_is_taken_to_zero_unless_it_is_only_a_part() -> None:
+    model = _model(TX40)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    index = {column.name: number for number, column in enumerate(model.columns)}
+    truth = _truth(model, 6)
+    truth[index["fs3"]] = -0.05
+    values = base.grouping @ truth
+    prior = inertia_prior(TX40.urdf)
+    found = physical_parameters(model, base, values, columns, prior)
+    assert 0.0 <= found.standard[index["fs3"]] < 0.01
+    assert not found.exact
+    partly = physical_parameters(model, base, values, columns, prior, frozenset({2}))
+    assert partly.exact
+    assert partly.standard[index["fs3"]] == pytest.approx(-0.05)
+
+
+def test_a_coupled_rotor_cannot_give_energy() -> None:
+    model = _model(TX40)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    index = {column.name: number for number, column in enumerate(model.columns)}
+    truth = _truth(model, 7)
+    truth[index["Iam6"]] = 3.0 * np.sqrt(truth[index["Ia5"]] * truth[index["Ia6"]])
+    found = physical_parameters(model, base, base.grouping @ truth, columns, inertia_prior(TX40.urdf))
+    assert not found.exact
+    _check_possible(found)
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    model = _model(GANTRY)
+    columns = model.regressor(_motion(model, 1))
+    base = _base(model, columns)
+    values = base.grouping @ _truth(model, 8)
+    values[3] = np.nan
+    with pytest.raises(NotPhysical, match="finite"):
+        physical_parameters(model, base, values, columns, inertia_prior(GANTRY.urdf))
+
+
+@given(seed=st.integers(0, 10**6))
+def test_the_pseudo_inertia_knows_a_body(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    link = _link(rng)
+    matrix = pseudo_inertia(link)
+    assert np.linalg.eigvalsh(matrix)[0] > 0.0
+    assert link_parameters(matrix) == pytest.approx(link)
+    body = body_of(link)
+    assert body.parameters == pytest.approx(link)
+    moments, axes = np.linalg.eigh(body.inertia_kg_m2)
+    moments[2] = 1.01 * (moments[0] + moments[1])
+    broken = type(body)(body.mass_kg, body.centre_m, axes @ np.diag(moments) @ axes.T)
+    assert np.linalg.eigvalsh(pseudo_inertia(broken.parameters))[0] < 0.0
+
+
+def test_the_prior_is_the_urdf_or_a_ball() -> None:
+    prior = inertia_prior(TX40.urdf)
+    assert prior.assumed == ()
+    assert prior.links[:, 9] == pytest.approx([10.0, 3.5, 4.0, 3.5, 1.0, 0.2])
+    bare = re.sub(r"(?s)<inertial>.*?</inertial>", "", TX40.urdf)
+    ball = inertia_prior(bare)
+    assert ball.assumed == (0, 1, 2, 3, 4, 5)
+    assert np.all(ball.links[:, 9] == DEFAULT_MASS_KG)
+    broken = inertia_prior(TX40.urdf.replace('izz="0.04"', 'izz="0.4"', 1))
+    assert broken.assumed == (0,)
+    assert broken.links[0, 6:] == pytest.approx(prior.links[0, 6:])
+
+
+@pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
+def test_the_grouping_comes_back_from_the_names(arm: Arm) -> None:
+    model = _model(arm)
+    columns = model.regressor(_motion(model, 1))
+    base = base_parameters(np.asarray(np.linalg.qr(_rows(columns), mode="r")), tuple(c.name for c in model.columns))
+    shuffled = np.random.default_rng(0).permutation(base.names)
+    found = regroup(model, tuple(map(str, shuffled)), _rows(model.regressor(_motion(model, 2))))
+    assert found.independent == base.independent
+    assert found.names == base.names
+    assert found.grouping == pytest.approx(base.grouping, abs=2e-6)
+
+
+def test_names_of_another_robot_are_refused() -> None:
+    model = _model(TX40)
+    rows = _rows(model.regressor(_motion(model, 1)))
+    names = _base(model, model.regressor(_motion(model, 1))).names
+    with pytest.raises(ModelError, match="has not: Izz9"):
+        regroup(model, (*names, "Izz9"), rows)
+    with pytest.raises(ModelError, match="says nothing of fv2"):
+        regroup(model, tuple(name for name in names if name != "fv2"), rows)
+    with pytest.raises(ModelError, match=f"this robot only {len(names)}"):
+        regroup(model, (*names, "Iyy3"), rows)
+    longer = Model(robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), model.drive_train)
+    with pytest.raises(ModelError, match="geometry"):
+        regroup(longer, names, _rows(longer.regressor(_motion(longer, 1))))
+
+
+def test_links_of_the_prior_are_those_that_pinocchio_moves() -> None:
+    """Pinocchio's own inverse dynamics with the URDF's inertias against the regressor with the prior's."""
+    model = _model(GANTRY, coupled=False)
+    motion = _motion(model, 3, samples=20)
+    standard = np.zeros(len(model.columns))
+    for joint, link in enumerate(inertia_prior(GANTRY.urdf).links):
+        standard[14 * joint : 14 * joint + 10] = link
+    torque = np.einsum("jck,c->jk", model.regressor(motion), standard)
+    robot = pin.buildModelFromXML(GANTRY.urdf)
+    data = robot.createData()
+    for k in range(20):
+        expected = pin.rnea(
+            robot, data, motion.position_rad[:, k], motion.velocity_rad_s[:, k], motion.acceleration_rad_s2[:, k]
+        )
+        assert torque[:, k] == pytest.approx(expected, abs=1e-9)
