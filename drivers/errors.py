@@ -276,14 +276,15 @@ class DataFrozen(DriverError):
 class DataStale(DriverError):
     """An amplifier's toggle bit stands; a stop that could not be confirmed is noted on the error."""
 
-    def __init__(self, node_id: int, bit: int, stood_s: float, cycles: int) -> None:
+    def __init__(self, node_id: int, bit: int, unchanged_s: float, cycles: int) -> None:
         super().__init__(
-            f"node {node_id}: statusword bit {bit} has not toggled for {cycles} cycles, {1e3 * stood_s:g} ms: it sends "
-            "old values; stopping all axes; restart the drive, and check toggle_bit and update_period_us of its profile"
+            f"node {node_id}: statusword bit {bit} has not toggled for {cycles} cycles, {1e3 * unchanged_s:g} ms: it "
+            "sends old values; stopping all axes; restart the drive, and check toggle_bit and update_period_us of its "
+            "profile"
         )
         self.node_id = node_id
         self.bit = bit
-        self.stood_s = stood_s
+        self.unchanged_s = unchanged_s
         self.cycles = cycles
 
 

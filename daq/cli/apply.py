@@ -22,21 +22,21 @@ from daq.cli.writing import (
     RamOnlyOption,
     SaveUnknownOption,
     applier,
-    ask_history,
     audit_of,
-    kept,
     on_the_bus,
     outcome,
+    query_history,
+    record_in_history,
     saving_of,
-    tell_history,
+    saving_text,
 )
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.policy import ApplyPolicy
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
 from daq.files import sha256
-from daq.ledger.audit import told_of
-from daq.ledger.entry import Deed, Event
+from daq.ledger.audit import find_write_entry
+from daq.ledger.entry import Event, WriteAction
 from daq.ledger.judgement import Known
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import enter_applied
@@ -46,7 +46,7 @@ from daq.writeback.drive_proposal import DriveProposal, drives_of, propose_to_dr
 from daq.writeback.drive_proposal import refused as drives_refused
 from daq.writeback.drive_record import record_folder
 from daq.writeback.drive_target import DrivesWritten, apply_to_drives
-from daq.writeback.file_access import followed
+from daq.writeback.file_access import resolve_links
 from daq.writeback.file_proposal import Proposal, apply, propose_for, refused
 from daq.writeback.file_target import Written
 from daq.writeback.gates.table import Gate
@@ -62,7 +62,7 @@ def apply_drives(
     cell_file: Path,
     request: Request,
     *,
-    doer: Applier,
+    actor: Applier,
     saving: Saving,
     audit: Path | None,
     yes: bool,
@@ -83,16 +83,16 @@ def apply_drives(
     with on_the_bus(declared) as network:
         proposal = propose_to_drives(declared, request, network)
         if not json:
-            _show(proposal, ask_history(declared, drives_of(declared.name), request, proposal.changes), Console())
+            _show(proposal, query_history(declared, drives_of(declared.name), request, proposal.changes), Console())
         if yes and proposal.refusals and json:
             print_json(_described(proposal, None))
         if yes:
             try:
-                written = apply_to_drives(proposal, network, request.now, saving=saving, audit=audit, who=str(doer))
+                written = apply_to_drives(proposal, network, request.now, saving=saving, audit=audit, who=str(actor))
             except OSError as error:
                 raise OutputFailed.of(record_folder(declared), error) from error
     if written is not None:
-        _enter_drives(declared, request, doer, written)
+        _enter_drives(declared, request, actor, written)
     if json:
         print_json(_described(proposal, written))
     if proposal.refusals:
@@ -130,15 +130,17 @@ def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[s
     }
 
 
-def _enter_drives(declared: Cell, request: Request, doer: Applier, written: DrivesWritten) -> None:
+def _enter_drives(declared: Cell, request: Request, actor: Applier, written: DrivesWritten) -> None:
     digest = sha256(request.signed)
 
     def enter(store: HistoryStore) -> None:
         store.add(request.calibration, digest=digest, at=request.now)
         told, after = written.audit_sha256, written.sha256_after
-        enter_applied(declared, store, Event(digest, Deed.APPLIED, request.now, str(doer), written.target, told, after))
+        enter_applied(
+            declared, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), written.target, told, after)
+        )
 
-    tell_history(declared, enter)
+    record_in_history(declared, enter)
 
 
 def _say_drives_outcome(
@@ -146,7 +148,9 @@ def _say_drives_outcome(
 ) -> None:
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if written is not None:
-        console.print(f"Written to the drives and read back; {written.record} says what stood there. {kept(saving)}")
+        console.print(
+            f"Written to the drives and read back; {written.record} has the values before. {saving_text(saving)}"
+        )
         console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell_file))} --drives")
         return
     if proposal.unchanged:
@@ -190,7 +194,7 @@ def apply_verb(
 
     The gates are those of the cell's `policy: {apply: ...}`; see docs/write-back.md.
     """
-    declared, doer = load_cell(cell), applier(by)
+    declared, actor = load_cell(cell), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
     request = Request(
@@ -200,7 +204,7 @@ def apply_verb(
         configuration_changed=configuration_changed,
         entered_kg=entered_masses(payload_mass or (), fitted),
         looked_at=base,
-        appliers=doer.names,
+        appliers=actor.names,
         file=calibration,
         content=content,
     )
@@ -211,25 +215,25 @@ def apply_verb(
                 "--drives", found="--to beside it", expected="one target", remedy="leave out one of the two"
             )
         saving = saving_of(ram_only, save_unknown)
-        apply_drives(declared, cell, request, doer=doer, saving=saving, audit=book, yes=yes, json=json)
+        apply_drives(declared, cell, request, actor=actor, saving=saving, audit=book, yes=yes, json=json)
         return
     proposal = propose_for(declared, request, to)
-    known = ask_history(declared, str(followed(proposal.file)), request, proposal.changes)
+    known = query_history(declared, str(resolve_links(proposal.file)), request, proposal.changes)
     if not json:
         show(proposal, Console(), known)
     try:
-        written = _write(proposal, request.now, book, doer) if yes else None
+        written = _write(proposal, request.now, book, actor) if yes else None
     except CalibrationRefused:
         if json:
             print_json({**describe(proposal, None, known), "base": proposal.looked_at})
         raise
     if yes and not proposal.refusals:
-        tell_history(declared, partial(_enter, declared, proposal, written, request, doer, book))
+        record_in_history(declared, partial(_enter, declared, proposal, written, request, actor, book))
     if json:
         print_json({**describe(proposal, written, known), "base": proposal.looked_at})
     if proposal.refusals:
         if not yes and not json:
-            _say_way_on(proposal)
+            _show_next_command(proposal)
         raise refused(proposal)
     if not json:
         _say_outcome(proposal, written, yes, cell, to, book)
@@ -291,9 +295,9 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
     return found
 
 
-def _write(proposal: Proposal, now: datetime, audit: Path | None, doer: Applier) -> Written | None:
+def _write(proposal: Proposal, now: datetime, audit: Path | None, actor: Applier) -> Written | None:
     try:
-        return apply(proposal, now, audit=audit, who=str(doer))
+        return apply(proposal, now, audit=audit, who=str(actor))
     except OSError as error:
         raise OutputFailed.of(proposal.file, error) from error
 
@@ -303,23 +307,23 @@ def _enter(
     proposal: Proposal,
     written: Written | None,
     request: Request,
-    doer: Applier,
+    actor: Applier,
     audit: Path | None,
     store: HistoryStore,
 ) -> None:
     """The controller has these gains; also where an earlier command wrote them and was killed before it told so."""
-    digest, target = sha256(request.signed), str(followed(proposal.file))
+    digest, target = sha256(request.signed), str(resolve_links(proposal.file))
     store.add(request.calibration, digest=digest, at=request.now)
     if written is None and store.in_force(target) == digest:
         return
     after = sha256(proposal.after_content)
-    told = None if written is None else written.audit_sha256
+    audit_digest = None if written is None else written.audit_sha256
     if written is None and audit is not None:
-        told = told_of(audit, target, after)
-    enter_applied(cell, store, Event(digest, Deed.APPLIED, request.now, str(doer), target, told, after))
+        audit_digest = find_write_entry(audit, target, after)
+    enter_applied(cell, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), target, audit_digest, after))
 
 
-def _say_way_on(proposal: Proposal) -> None:
+def _show_next_command(proposal: Proposal) -> None:
     """Where nothing but a look at the changed file is wanted: this was the look."""
     if {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
         console = Console(soft_wrap=True, highlight=False, markup=False)

@@ -18,7 +18,7 @@ from daq.errors import OutputFailed
 from daq.files import replace_file
 from daq.report.gains import gain_table
 from daq.report.proposal import show as show_proposal
-from daq.simulation.demo import Outcome, Settings, Telling, demonstrate, summary
+from daq.simulation.demo import Outcome, ProgressReporter, Settings, demonstrate, summary
 from daq.simulation.simulation_file import shipped_simulation
 
 
@@ -34,7 +34,7 @@ def demo(
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
     try:
         with Stepper() as stepper:
-            outcome = demonstrate(settings, lambda: datetime.now(UTC), Telling(stepper.step, stepper.progress))
+            outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}
         replace_file(out / "summary.json", json_text(document).encode())
     except OSError as error:

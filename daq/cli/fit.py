@@ -24,16 +24,16 @@ from daq.log.reader import LossyLogs
 from daq.report.fit import (
     actual_current_note,
     advice,
-    cannot_tell,
     comparison_document,
     comparison_tables,
     draw,
+    identifiability_notes,
     verdict_document,
 )
 from daq.report.gains import gain_table, partial_note
 from daq.report.paper_tables import PaperTable, page, parameter_table
 from daq.report.paper_tables import gain_table as paper_gain_table
-from daq.report.residual_document import spelt
+from daq.report.residual_document import percent_text
 from daq.workflow.calibration_file import as_document, save
 from daq.workflow.cases import CASES, Case, CaseFit, Known, calibration_of_case, essential_fit, fit_case, reduce_logs
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, check_explained, compare_estimators, fit, needed_verdicts
@@ -77,11 +77,11 @@ def fit_cases(
     check_output(page_file, (*logs, *holdout), TABLES)
     for file in files.values():
         check_output(file, (*logs, *holdout), format_)
-    with status("identifying") as telling:
+    with status("identifying") as report_step:
         reduced = reduce_logs(logs, holdout, cell)
         fits: dict[str, CaseFit] = {}
         for case in CASES:
-            telling(case.title)
+            report_step(case.title)
             fits[case.name] = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=ratio)
         calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
     tables = case_tables(calibrations)
@@ -228,14 +228,14 @@ def fit_verb(
         save_pictures(fitted, calibration, pictures)
     side_by_side = None
     if compare:
-        with status("comparing estimators") as told:
-            side_by_side = compare_estimators(fitted, told)
+        with status("comparing estimators") as report_step:
+            side_by_side = compare_estimators(fitted, report_step)
     if json:
         print_json({**as_document(calibration), **report(found, side_by_side)})
     else:
         console = Console(soft_wrap=True, highlight=False)
         show(fitted, calibration, console)
-        tell(found, side_by_side, console)
+        show_notes(found, side_by_side, console)
         say_written(console, out, pictures)
 
 
@@ -243,17 +243,17 @@ def report(found: CaseFit, comparison: Comparison | None) -> dict[str, Any]:
     """What --json says beside the calibration."""
     fitted = found.fitted
     axes = fitted.cell.axis_names
-    told = {**compared(fitted), "removed": removed(found)}
-    told["verdicts"] = [verdict_document(gain, axes) for gain in needed_verdicts(fitted)]
+    document = {**compared(fitted), "removed": removed(found)}
+    document["verdicts"] = [verdict_document(gain, axes) for gain in needed_verdicts(fitted)]
     if comparison is not None:
-        told["comparison"] = comparison_document(comparison, axes)
-    return told
+        document["comparison"] = comparison_document(comparison, axes)
+    return document
 
 
-def tell(found: CaseFit, comparison: Comparison | None, console: Console) -> None:
+def show_notes(found: CaseFit, comparison: Comparison | None, console: Console) -> None:
     """What the fit rests on and what it cannot tell, for a person."""
     fitted = found.fitted
-    for line in (*cannot_tell(fitted), *advice(fitted, needed_verdicts(fitted))):
+    for line in (*identifiability_notes(fitted), *advice(fitted, needed_verdicts(fitted))):
         console.print(line, markup=False)
     if comparison is not None:
         for table in comparison_tables(comparison, fitted.cell.axis_names):
@@ -348,7 +348,7 @@ def error_table(fitted: Fit, calibration: Calibration) -> Table:
     rows = [("fit", calibration.relative_error_percent), ("unused", calibration.holdout_error_percent)]
     for name, error in rows:
         if error is not None:
-            table.add_row(name, *map(spelt, (*error.axes, error.total)))
+            table.add_row(name, *map(percent_text, (*error.axes, error.total)))
     return table
 
 

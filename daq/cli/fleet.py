@@ -17,10 +17,10 @@ from daq.cli.terminal import progress_bar, say_written
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.errors import ExitCode, OutputExists, OutputFailed
 from daq.files import replace_file
-from daq.jobs.cell_fit import Failure, Loop, open_shelf
+from daq.jobs.cell_fit import Failure, Loop, open_cache
 from daq.jobs.fleet import FleetRow, fit_fleet
 from daq.jobs.fleet_survey import Summary, list_logs
-from daq.jobs.workers import crew_of
+from daq.jobs.workers import worker_pool
 from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.report.gains import with_deviation
 
@@ -57,11 +57,11 @@ def fleet_verb(
     """
     loop = Loop.CLOSED if residual else Loop.OPEN
     check_table(csv)
-    wanted = crew_of(scheduler, workers)
+    wanted = worker_pool(scheduler, workers)
     found = list_logs(logs)
-    shelf = None if out is None else open_shelf(out, loop)
-    with progress_bar("fitting the fleet") as told, wanted.engaged() as crew:
-        rows = fit_fleet(found, crew, loop, shelf, lambda: datetime.now(UTC), told)
+    cache = None if out is None else open_cache(out, loop)
+    with progress_bar("fitting the fleet") as report_progress, wanted.start_pool() as pool:
+        rows = fit_fleet(found, pool, loop, cache, lambda: datetime.now(UTC), report_progress)
     if csv is not None:
         try:
             replace_file(csv, fleet_csv(rows).encode())

@@ -35,9 +35,9 @@ from daq.ledger.store import HistoryStore
 from daq.ledger.verify import AuditedWrite, acknowledgement_flaws, catch_up, event_flaws, unknown_writes, writes_to
 from daq.ledger.watch import Series, watch
 from daq.report.history import COLUMNS, csv_text, plot_history
-from daq.report.history_view import deed_words, describe, in_force, show, show_axis
+from daq.report.history_view import describe, describe_actions, in_force, show, show_axis
 from daq.workflow.calibration_file import decode, read
-from daq.writeback.file_access import followed
+from daq.writeback.file_access import resolve_links
 
 # `drivegain history --verify`: whether audit and history are what was written, and what became of killed writes.
 
@@ -168,8 +168,8 @@ def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Chec
     if not verdict.holds:  # its entries prove nothing
         return Checked(place.audit, place.store, verdict, broken)
     entries = verdict.entries
-    told = {one.sha256: one for one in entries}
-    events = [(number, event, told.get(event.audit or "")) for number, event in enumerate(store.events(), start=1)]
+    by_digest = {one.sha256: one for one in entries}
+    events = [(number, event, by_digest.get(event.audit or "")) for number, event in enumerate(store.events(), start=1)]
     broken += tuple(
         printable(f"event {number}: {says}")
         for number, event, entry in events
@@ -179,7 +179,7 @@ def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Chec
     broken += tuple(
         printable(f"acknowledgement of {noted.axis} at {iso(noted.at)}: {says}")
         for noted in store.acknowledgements()
-        if (entry := told.get(noted.audit)) is not None
+        if (entry := by_digest.get(noted.audit)) is not None
         for says in acknowledgement_flaws(noted, entry)
     )
     unknown, late = unknown_writes(writes_to(cell, entries), store.audited())
@@ -255,10 +255,10 @@ def history_verb(
             _write_csv(csv, chosen)
         entries = store.entries()
         current = in_force(declared, store)
-        deeds = deed_words(entries, store.events(), current)
+        actions = describe_actions(entries, store.events(), current)
         if verify and declared.controller_path is not None:
             # Where its links lead decides which writes are this cell's: another user's link could hide some.
-            followed(declared.controller_path)
+            resolve_links(declared.controller_path)
         checked = verify_history(declared, place, store) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:
@@ -268,9 +268,9 @@ def history_verb(
             if checked is not None:
                 checked.say(console)
             elif axis is not None:
-                show_axis(chosen[0], all_series, deeds, console)
+                show_axis(chosen[0], all_series, actions, console)
             else:
-                show(entries, all_series, deeds, console)
+                show(entries, all_series, actions, console)
             say_written(console, picture, csv)
         if checked is not None:
             checked.require()
@@ -295,9 +295,9 @@ def _add(store: HistoryStore, cell: Cell, place: HistoryPlace, file: Path, now: 
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
     new = store.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
-    told = "entered" if new else "it was in the history already"
+    outcome_text = "entered" if new else "it was in the history already"
     console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    console.print(f"{file.name}: {told}.")
+    console.print(f"{file.name}: {outcome_text}.")
     # Whoever wrote it may have been killed before the history knew.
     for write in catch_up(cell, place, store):
         console.print(f"Entered too: {printable(str(write))}.")

@@ -178,8 +178,8 @@ def salvage_verb(
 
     A fit takes a partial log that is valid and says so; what it finds is never written to a controller.
     """
-    with progress_bar("salvaging") as told:
-        saved = salvage(log, out, lambda samples: told(samples, 0, "samples"))
+    with progress_bar("salvaging") as report_progress:
+        saved = salvage(log, out, lambda samples: report_progress(samples, 0, "samples"))
     statistics = saved.statistics
     if json:
         print_json({"log": str(out), "partial": statistics.partial, "samples": statistics.samples,

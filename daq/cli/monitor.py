@@ -76,9 +76,9 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
     monitor = CellMonitor(network.link, network.axes)
     ampere: list[float | None] = [None] * len(network.axes)
     unknown = set(range(len(network.axes)))
-    told: deque[str] = deque(maxlen=SHOWN_EVENTS)
+    event_lines: deque[str] = deque(maxlen=SHOWN_EVENTS)
     # That a node is there is no news at the beginning; an error is.
-    told.extend(event.text for event in monitor.watch(QUIET_S).events if event.kind is not EventKind.NMT)
+    event_lines.extend(event.text for event in monitor.watch(QUIET_S).events if event.kind is not EventKind.NMT)
     while True:
         reading = monitor.watch(interval_s)
         answering = [axis for axis in unknown if reading.axes[axis].current_raw is not None]
@@ -89,8 +89,8 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
                 with suppress(DriverError):  # its current stays a raw number, and is shown as one
                     access = network.link.objects(network.node_ids[axis])
                     ampere[axis] = read_scale(access, network.axes[axis].profile).ampere_per_unit
-        told.extend(event.text for event in reading.events)
-        yield describe(cell, reading, ampere, list(told))
+        event_lines.extend(event.text for event in reading.events)
+        yield describe(cell, reading, ampere, list(event_lines))
 
 
 def describe(cell: Cell, reading: CellReading, ampere: list[float | None], events: list[str]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ def plan_verb(
     check_output(out, (cell,), "drivegain-plan")
     declared = load_cell(cell)
     experiment = experiment_of(declared, payload)
-    with progress_bar("planning") as told:
+    with progress_bar("planning") as report_progress:
         made = plan(
             declared,
             seed=seed,
@@ -53,7 +53,7 @@ def plan_verb(
             largest_condition=condition,
             largest_std_percent=sigma,
             experiment=experiment,
-            progress=lambda done, worst: told(done, exchanges, f"worst gain σ {worst:.2f} %"),
+            progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
         )
     try:
         save_plan(made, out)

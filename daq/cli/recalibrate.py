@@ -25,7 +25,7 @@ from daq.jobs.job import preview, recalibrate
 from daq.jobs.journal import Form, Journal, Level, form_of
 from daq.jobs.preflight import section_of, target_of
 from daq.jobs.tools import Tools
-from daq.jobs.units import MARK, Installation, Unit, cron_line, next_commands, told_cell, units_of
+from daq.jobs.units import MARK, Installation, Unit, cell_option, cron_line, next_commands, units_of
 from drivers.errors import WHILE, DriverError
 from ident.errors import IdentificationError
 
@@ -74,7 +74,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
     tools = Tools(save_report=save_report)
-    with interruptible() as undisturbed:
+    with interruptible() as block_signals:
         if dry_run:
             seen = preview(cell, declared, tools, journal, who=who)
             if json:
@@ -82,7 +82,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
             else:
                 typer.echo("\n".join((f"Dry run: {seen.remark}", *(f"  {step}" for step in seen.steps))))
             return
-        ended = recalibrate(cell, declared, tools, journal, who=who, undisturbed=undisturbed)
+        ended = recalibrate(cell, declared, tools, journal, who=who, block_signals=block_signals)
     if json:
         print_json(document(ended, cell))
     else:
@@ -129,7 +129,7 @@ def install_units(
     folder = to or (Path.home() / OF_USER if user else SYSTEM)
     units = units_of(declared, section, wanted)
     for unit in units:
-        require_ours(folder / unit.name, told_cell(wanted) if unit.name.endswith(".service") else "")
+        require_own_unit(folder / unit.name, cell_option(wanted) if unit.name.endswith(".service") else "")
     if yes:
         _write(folder, units)
     for unit in units:
@@ -187,7 +187,7 @@ def check_schedule(schedule: str) -> None:
         )
 
 
-def require_ours(path: Path, saying: str = "") -> None:
+def require_own_unit(path: Path, saying: str = "") -> None:
     """Refuse to replace a file that this verb has not made, or that it made for another cell.
 
     Args:

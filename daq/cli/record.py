@@ -67,7 +67,7 @@ def record_verb(
     if allowed_by is not None and not enable_motion:
         typer.echo(f"motion is allowed by {allowed_by} (its file says so): the axes move now", err=True)
     try:
-        with bus_lock(declared), interruptible() as undisturbed, progress_bar("recording") as told:
+        with bus_lock(declared), interruptible() as block_signals, progress_bar("recording") as report_progress:
             done = record(
                 cell,
                 declared,
@@ -79,8 +79,8 @@ def record_verb(
                 run_id=str(uuid.uuid4()),
                 speed=speed,
                 entered_kg=mass,
-                undisturbed=undisturbed,
-                progress=lambda count, total: told(count, total, "moves"),
+                block_signals=block_signals,
+                progress=lambda count, total: report_progress(count, total, "moves"),
             )
     except KeyboardInterrupt as interrupt:
         made = next((path for path in (out, part) if path.exists()), None)
@@ -88,7 +88,9 @@ def record_verb(
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except DriverError as error:
         if part.exists():
-            error.add_note(f"kept: what was recorded until then is in {part}, which no fit reads; {_way_on(part)}")
+            error.add_note(
+                f"kept: what was recorded until then is in {part}, which no fit reads; {_next_command(part)}"
+            )
         lost = isinstance(error, SampleLost | CellSilent)
         if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
@@ -135,12 +137,12 @@ def _free(out: Path) -> Path:
             str(part),
             found="the rest of a recording of that name that failed, was interrupted, or still runs",
             expected="none",
-            remedy=f"no fit reads it; {_way_on(part)}",
+            remedy=f"no fit reads it; {_next_command(part)}",
         )
     return part
 
 
-def _way_on(part: Path) -> str:
+def _next_command(part: Path) -> str:
     aside = part.with_name(part.name + ".kept")
     one, other = shlex.quote(str(part)), shlex.quote(str(aside))
     saved = shlex.quote(str(part.with_name(part.name.replace(".mcap.part", "") + "-partial.mcap")))
@@ -157,15 +159,15 @@ def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> 
     first = interrupt.__context__
     while first is not None and not isinstance(first, DriverError | OutputFailed | DiskSpaceShort | KeyboardInterrupt):
         first = first.__context__
-    told = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
-    told += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
-    problems = "; ".join(told)
+    notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
+    notes += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
+    problems = "; ".join(notes)
     axes = f"NOT ALL AXES ARE KNOWN TO STAND, press the emergency stop ({problems})" if problems else "axes stopped"
     if made is None:
         return f"interrupted: {axes}; nothing was recorded"
     if made == out:
         return f"interrupted: {axes}; all moves had been made, and {out} is complete"
-    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit; {_way_on(made)}"
+    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit; {_next_command(made)}"
 
 
 def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:

@@ -34,7 +34,7 @@ from daq.log.reader import LossyLogs
 from daq.report.effect_names import placed_name
 from daq.report.fit import start_of
 from daq.report.gains import gain_table, partial_note, with_deviation
-from daq.report.residual_document import FORMAT, VERSION, error_rows, residual_document, spelt, summary
+from daq.report.residual_document import FORMAT, VERSION, error_rows, percent_text, residual_document, summary
 from daq.report.residual_page import GENERATOR, residual_page
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from ident.calibration import Calibration
@@ -136,7 +136,7 @@ def residual_verb(
     """Find the effect that the residual asks for, add it to the model, refit everything, and look again."""
     check_output(out, (*logs, *(holdout or ()), *(() if cell is None else (cell,))), CALIBRATION)
     check_report(report)
-    with status("identifying") as told:
+    with status("identifying") as report_step:
         fitted = fit(
             logs,
             holdout=holdout or (),
@@ -145,10 +145,10 @@ def residual_verb(
             cell=None if cell is None else load_cell(cell),
             lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
         )
-        closed = close_loop(fitted, seed, told)
+        closed = close_loop(fitted, seed, report_step)
         calibration = calibration_of(closed, datetime.now(UTC))
-        told("counting the errors before and after")
-        changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=told)
+        report_step("counting the errors before and after")
+        changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
     if out is not None:
         save_calibration(calibration, out)
     if report is not None:
@@ -227,7 +227,7 @@ def error_table(changed: Account, axes: tuple[str, ...]) -> Table:
     for heading in (*axes, "total"):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, error in error_rows(changed):
-        table.add_row(name, *map(spelt, (*error.axes, error.total)))
+        table.add_row(name, *map(percent_text, (*error.axes, error.total)))
     return table
 
 

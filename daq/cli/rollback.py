@@ -21,12 +21,12 @@ from daq.cli.writing import (
     SaveUnknownOption,
     applier,
     audit_of,
-    kept,
     on_the_bus,
     outcome,
-    own_file,
+    record_in_history,
+    require_separate_audit,
     saving_of,
-    tell_history,
+    saving_text,
 )
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
@@ -35,7 +35,7 @@ from daq.files import sha256
 from daq.ledger.store import HistoryStore
 from daq.writeback.drive_proposal import drives_of
 from daq.writeback.drive_record import record_folder
-from daq.writeback.drive_target import DrivesWritten, DriveWayBack, roll_back_drives, way_back_of_drives
+from daq.writeback.drive_target import DriveRollback, DrivesWritten, plan_drive_rollback, roll_back_drives
 from daq.writeback.file_target import Restored, roll_back
 from drivers.canopen.parameters import Saving
 
@@ -43,7 +43,7 @@ from drivers.canopen.parameters import Saving
 
 
 def rollback_drives(
-    declared: Cell, *, now: datetime, doer: Applier, saving: Saving, audit: Path | None, yes: bool, json: bool
+    declared: Cell, *, now: datetime, actor: Applier, saving: Saving, audit: Path | None, yes: bool, json: bool
 ) -> None:
     """Show what stood in the drives before the last write, and put it back with `yes`; a second time undoes it.
 
@@ -56,38 +56,40 @@ def rollback_drives(
     """
     done: DrivesWritten | None = None
     with on_the_bus(declared) as network:
-        way = way_back_of_drives(declared, network)
+        planned = plan_drive_rollback(declared, network)
         if not json:
-            _show_way(way)
+            _show_rollback(planned)
         if yes:
             try:
-                done = roll_back_drives(way, network, now, saving=saving, audit=audit, who=str(doer))
+                done = roll_back_drives(planned, network, now, saving=saving, audit=audit, who=str(actor))
             except OSError as error:
                 raise OutputFailed.of(record_folder(declared), error) from error
     if done is not None:
-        tell_history(declared, partial(_tell_back, done, now, doer))
+        record_in_history(declared, partial(_record_rollback, done, now, actor))
     if json:
-        print_json(_described_way(way, done))
+        print_json(_rollback_document(planned, done))
         return
     console = Console(soft_wrap=True, highlight=False, markup=False)
     if done is None:
         console.print("Dry run, nothing was written. To put it back, repeat the command with --yes.")
         return
-    console.print(f"Restored what {done.source} says; what stood there is now in {done.record.name}. {kept(saving)}")
+    console.print(
+        f"Restored the values of {done.source}; those before are now in {done.record.name}. {saving_text(saving)}"
+    )
 
 
-def _show_way(way: DriveWayBack) -> None:
+def _show_rollback(rollback: DriveRollback) -> None:
     console = Console(soft_wrap=True, highlight=False, markup=False)
-    for value, write in zip(way.base, way.writes, strict=True):
+    for value, write in zip(rollback.base, rollback.writes, strict=True):
         new = value.parameter.value(write.word)
         console.print(f"{value.axis.name}, {value.parameter}: {value.value:.9g} -> {new:.9g}")
-    console.print(f"These stood there before the write of {way.record.at} by {printable(way.record.who)}.")
+    console.print(f"These stood there before the write of {rollback.record.at} by {printable(rollback.record.who)}.")
 
 
-def _described_way(way: DriveWayBack, done: DrivesWritten | None) -> dict[str, Any]:
+def _rollback_document(rollback: DriveRollback, done: DrivesWritten | None) -> dict[str, Any]:
     return {
-        "drives": drives_of(way.cell),
-        "source": str(way.record.path),
+        "drives": drives_of(rollback.cell),
+        "source": str(rollback.record.path),
         "restored": done is not None,
         "changes": [
             {
@@ -96,15 +98,15 @@ def _described_way(way: DriveWayBack, done: DrivesWritten | None) -> dict[str, A
                 "old": value.value,
                 "new": value.parameter.value(write.word),
             }
-            for value, write in zip(way.base, way.writes, strict=True)
+            for value, write in zip(rollback.base, rollback.writes, strict=True)
         ],
         **({} if done is None else outcome(done)),
     }
 
 
-def _tell_back(done: DrivesWritten, now: datetime, doer: Applier, store: HistoryStore) -> None:
+def _record_rollback(done: DrivesWritten, now: datetime, actor: Applier, store: HistoryStore) -> None:
     store.rolled_back(
-        at=now, who=str(doer), target=done.target, sha256_after=done.sha256_after, audit=done.audit_sha256
+        at=now, who=str(actor), target=done.target, sha256_after=done.sha256_after, audit=done.audit_sha256
     )
 
 
@@ -141,9 +143,9 @@ def rollback(
             expected="one of the two: what is done to a cell's controller is in the cell's audit",
             remedy="leave --audit out; `history: {audit: ...}` of the cell file says where its audit is",
         )
-    now, doer, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
+    now, actor, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if audit is not None:
-        own_file(audit, (to,))
+        require_separate_audit(audit, (to,))
     if drives:
         if declared is None or to is not None:
             raise UsageError(
@@ -153,7 +155,7 @@ def rollback(
                 remedy="name the cell, and no file",
             )
         saving = saving_of(ram_only, save_unknown)
-        rollback_drives(declared, now=now, doer=doer, saving=saving, audit=book, yes=yes, json=json)
+        rollback_drives(declared, now=now, actor=actor, saving=saving, audit=book, yes=yes, json=json)
         return
     file = _file(declared, cell, to)
     try:
@@ -161,17 +163,17 @@ def rollback(
             file,
             now,
             audit=book,
-            who=str(doer),
+            who=str(actor),
             format=None if declared is None or declared.controller is None else declared.controller.format,
         )
     except OSError as error:
         raise OutputFailed.of(file, error) from error
     if declared is not None:
-        tell_history(
+        record_in_history(
             declared,
             lambda store: store.rolled_back(
                 at=now,
-                who=str(doer),
+                who=str(actor),
                 target=str(done.file),
                 sha256_after=sha256(done.after),
                 audit=done.audit_sha256,
@@ -191,8 +193,8 @@ def rollback(
         return
     console = Console(soft_wrap=True, highlight=False)
     console.print(Syntax(diff, "diff", background_color="default", word_wrap=True))
-    stood = "the file was gone" if done.backup is None else f"what stood there is now {done.backup.name}"
-    console.print(f"Restored {done.source.name} to {done.file}; {stood}.", markup=False)
+    replaced_text = "the file was gone" if done.backup is None else f"what stood there is now {done.backup.name}"
+    console.print(f"Restored {done.source.name} to {done.file}; {replaced_text}.", markup=False)
     if book is None:
         console.print("Not written down: no --cell and no --audit was given.", markup=False)
 

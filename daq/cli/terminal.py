@@ -16,7 +16,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from daq.cli.verb import printable
 from daq.errors import OutputExists
-from drivers.canopen.network import Undisturbed
+from drivers.canopen.network import SignalBlocker
 
 _LOOK_BYTES = 4096
 
@@ -68,7 +68,7 @@ def _head(path: Path) -> bytes:
 # Progress of long work, on stderr: stdout is for results.
 
 
-Told = Callable[[int, int, str], None]
+ProgressCallback = Callable[[int, int, str], None]
 """Done, total, and a remark."""
 
 
@@ -114,7 +114,7 @@ class Stepper:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Told]:
+def progress_bar(title: str) -> Iterator[ProgressCallback]:
     """One bar."""
     with Stepper() as stepper:
         stepper.step(title)
@@ -127,10 +127,10 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True, highlight=False)
     with console.status(title):
 
-        def told(step: str) -> None:
+        def show_step(step: str) -> None:
             console.print(f"  {step}", style="dim")
 
-        yield told
+        yield show_step
 
 
 # Being told to stop while a robot moves: by Ctrl-C, by a service manager (SIGTERM), by a terminal that has gone.
@@ -144,7 +144,7 @@ GRACE_S = 10.0
 @contextmanager
 def interruptible(
     clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
-) -> Iterator[Undisturbed]:
+) -> Iterator[SignalBlocker]:
     """Turn some signals within the block into KeyboardInterrupt; pass over those that follow too soon.
 
     By default SIGTERM and SIGHUP end a process at once, and the axes would go on; a shell script starts what it puts
@@ -162,26 +162,26 @@ def interruptible(
         yield nullcontext
         return
 
-    deaf_until_s = float("-inf")
+    blocked_until_s = float("-inf")
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
-        nonlocal deaf_until_s
-        if clock() >= deaf_until_s:
-            deaf_until_s = clock() + GRACE_S
+        nonlocal blocked_until_s
+        if clock() >= blocked_until_s:
+            blocked_until_s = clock() + GRACE_S
             raise KeyboardInterrupt
 
     @contextmanager
-    def undisturbed() -> Iterator[None]:
-        nonlocal deaf_until_s
-        earlier_s, deaf_until_s = deaf_until_s, max(deaf_until_s, clock() + GRACE_S)
+    def block_signals() -> Iterator[None]:
+        nonlocal blocked_until_s
+        earlier_s, blocked_until_s = blocked_until_s, max(blocked_until_s, clock() + GRACE_S)
         try:
             yield
         finally:
-            deaf_until_s = earlier_s
+            blocked_until_s = earlier_s
 
     before = [(number, signal.signal(number, interrupt)) for number in signals]
     try:
-        yield undisturbed
+        yield block_signals
     finally:
         for number, handler in before:
             signal.signal(number, handler)

@@ -25,7 +25,7 @@ from daq.report.paper_tables import error_table as paper_error_table
 from daq.workflow.calibration_file import load
 from daq.workflow.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun, cross_validate
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import Acquaintance, Validation, conditioning_of, together
+from daq.workflow.validate import DataUse, Validation, conditioning_of, together
 from ident.calibration import Calibration
 from ident.estimators.estimate import RelativeError
 
@@ -131,7 +131,7 @@ def draw(calibration: Calibration, validations: tuple[Validation, ...], folder: 
             np.where(validation.use, torque_nm, np.nan).T
             for torque_nm in (validation.measured_nm, validation.predicted_nm)
         )
-        title = f"{validation.run}, {validation.acquaintance.value}: torque of {calibration.cell}"
+        title = f"{validation.run}, {validation.data_use.value}: torque of {calibration.cell}"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             plot_torques(path, validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
@@ -152,9 +152,9 @@ def report(calibration: Calibration, validations: tuple[Validation, ...], drawn:
             {
                 "log": str(validation.log),
                 "sha256": validation.digest,
-                "seen_by_fit": validation.acquaintance is Acquaintance.FIT,
+                "seen_by_fit": validation.data_use is DataUse.FIT,
                 "partial": validation.partial,
-                "held_out": validation.acquaintance is Acquaintance.HOLDOUT,
+                "held_out": validation.data_use is DataUse.HOLDOUT,
                 "same_configuration": validation.same_configuration,
                 "rows": validation.rows,
                 "relative_error_percent": _error(validation.error),
@@ -260,7 +260,7 @@ def error_table(calibration: Calibration, validations: tuple[Validation, ...]) -
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("", no_wrap=True)
     for validation in validations:
-        table.add_row(Text(printable(validation.run)), *_cells(validation.error), validation.acquaintance.value)
+        table.add_row(Text(printable(validation.run)), *_cells(validation.error), validation.data_use.value)
     if len(validations) > 1:
         table.add_row("together", *_cells(together(validations)))
     table.add_row("fit", *_cells(calibration.relative_error_percent))

@@ -55,7 +55,7 @@ class Listed:
 
 def json_text(document: Any) -> str:
     """One JSON document; numbers that JSON cannot say become null, bytes of names that are no UTF-8 are spelt out."""
-    text = json.dumps(_sayable(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return text.encode(errors="backslashreplace").decode()
 
 
@@ -69,13 +69,13 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
 
 
-def _sayable(value: Any) -> Any:
+def _json_safe(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):
-        return {str(key): _sayable(item) for key, item in value.items()}
+        return {str(key): _json_safe(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_sayable(item) for item in value]
+        return [_json_safe(item) for item in value]
     return value
 
 

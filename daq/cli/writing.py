@@ -79,11 +79,11 @@ def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
     """
     if cell.history is None:
         return None
-    own_file(cell.history.audit, (cell.history.store, cell.controller_path, *others))
+    require_separate_audit(cell.history.audit, (cell.history.store, cell.controller_path, *others))
     return cell.history.audit
 
 
-def own_file(audit: Path, others: Iterable[Path | None]) -> None:
+def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
     """Refuse an audit that is another file which takes part, by whatever name, there already or not.
 
     Raises:
@@ -106,7 +106,7 @@ def _is_same(audit: Path, other: Path) -> bool:
         return False
 
 
-def ask_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
+def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
     """What the cell's history knows that a change is judged by; one that cannot be read knows nothing."""
     if cell.history is None:
         return NOTHING
@@ -118,13 +118,13 @@ def ask_history(cell: Cell, target: str, request: Request, changes: Sequence[Gai
         return NOTHING
 
 
-def tell_history(cell: Cell, tell: Callable[[HistoryStore], object]) -> None:
+def record_in_history(cell: Cell, record: Callable[[HistoryStore], object]) -> None:
     """Let the cell's history know of what is done already; where it cannot take it, that is told and no more."""
     if cell.history is None:
         return
     try:
         with HistoryStore(cell.history.store) as store:
-            tell(store)
+            record(store)
     except Exception as error:  # noqa: BLE001 - whatever it is, the controller has its gains: not to be called undone
         _LOG.warning("the history does not know of this: %s", error)
 
@@ -166,8 +166,8 @@ def on_the_bus(declared: Cell) -> Iterator[CanopenNetwork]:
     try:
         with (
             bus_lock(declared),
-            interruptible() as undisturbed,
-            CanopenNetwork(address, axes, undisturbed=undisturbed) as network,
+            interruptible() as block_signals,
+            CanopenNetwork(address, axes, block_signals=block_signals) as network,
         ):
             yield network
     except KeyboardInterrupt as interrupt:
@@ -185,7 +185,7 @@ def outcome(written: DrivesWritten) -> dict[str, Any]:
     }
 
 
-def kept(saving: Saving) -> str:
+def saving_text(saving: Saving) -> str:
     """Whether it stays, for a person."""
     if saving is Saving.RAM:
         return "The drives have NOT saved: the gains are gone with their power."

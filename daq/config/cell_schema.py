@@ -187,7 +187,7 @@ class PayloadModel(StrictModel):
     known: KnownModel | None = None
 
     @model_validator(mode="after")
-    def _one_spelling(self) -> PayloadModel:
+    def _one_form(self) -> PayloadModel:
         if self.inertia_kg_m2 is not None and self.centre_m is None:
             raise ValueError("centre_m beside inertia_kg_m2: the inertia is about the centre of mass")
         if self.centre_m is not None and self.known is not None:

@@ -72,12 +72,12 @@ class GainObjectModel(StrictModel):
 _KEY, _KEY_AND_FACTOR = not_in_file("key"), not_in_file("key and factor")
 
 
-def _how_told(value: object) -> str:
+def _entry_kind(value: object) -> str:
     return _KEY_AND_FACTOR if isinstance(value, dict | GainKeyModel) else _KEY
 
 
 _Gain = Annotated[
-    Annotated[_FileName, Tag(_KEY)] | Annotated[GainKeyModel, Tag(_KEY_AND_FACTOR)], Discriminator(_how_told)
+    Annotated[_FileName, Tag(_KEY)] | Annotated[GainKeyModel, Tag(_KEY_AND_FACTOR)], Discriminator(_entry_kind)
 ]
 """A key alone, or {key: ..., factor: ...}."""
 
@@ -101,14 +101,15 @@ class ControllerModel(StrictModel):
     @property
     def controller(self) -> Controller:
         """As the write-back takes it."""
-        told = tuple(gain if isinstance(gain, GainKeyModel) else GainKeyModel(key=gain) for gain in self.gains)
+        gain_entry = tuple(gain if isinstance(gain, GainKeyModel) else GainKeyModel(key=gain) for gain in self.gains)
         return Controller(
             file=self.file,
-            gains=tuple(gain.key for gain in told),
-            factors=tuple(gain.factor for gain in told),
+            gains=tuple(gain.key for gain in gain_entry),
+            factors=tuple(gain.factor for gain in gain_entry),
             format=self.format,
             objects=tuple(
-                GainObject(Parameter(told.index, told.subindex, told.type), told.factor) for told in self.objects
+                GainObject(Parameter(gain_entry.index, gain_entry.subindex, gain_entry.type), gain_entry.factor)
+                for gain_entry in self.objects
             ),
         )
 
@@ -131,8 +132,8 @@ def controller_faults(model: ControllerModel, axes: int, *, on_a_bus: bool) -> I
             "objects of drives that no bus leads to",
             "bus, and node_id and drive of each axis",
         )
-    factors = [(("gains", i), told.factor) for i, told in enumerate(model.gains) if isinstance(told, GainKeyModel)]
-    factors += [(("objects", i), told.factor) for i, told in enumerate(model.objects)]
+    factors = [(("gains", i), entry.factor) for i, entry in enumerate(model.gains) if isinstance(entry, GainKeyModel)]
+    factors += [(("objects", i), entry.factor) for i, entry in enumerate(model.objects)]
     for (kind, index), factor in factors:
         if factor == 0.0 or not math.isfinite(factor):
             yield Fault(("controller", kind, index, "factor"), f"{factor:g}", "a factor that is not zero")

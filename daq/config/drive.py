@@ -58,7 +58,7 @@ SCALE_KEYS: dict[ScaleForm, frozenset[str]] = {
     ScaleForm.PER_MILLE: frozenset({"rated_current"}),
     ScaleForm.FIXED_STEP: frozenset({"ampere_per_unit"}),
     ScaleForm.DIGITS_OF_PEAK: frozenset({"digits", "peak_current_a"}),
-    ScaleForm.DIGITS_OF_TOLD_PEAK: frozenset({"digits", "peak_current"}),
+    ScaleForm.DIGITS_OF_REPORTED_PEAK: frozenset({"digits", "peak_current"}),
     ScaleForm.SWITCHED_PER_MILLE: frozenset({"rated_current", "switch"}),
 }
 """What each form is told by; nothing else, and nothing less."""
@@ -82,9 +82,9 @@ class ScaleModel(StrictModel):
 
     @model_validator(mode="after")
     def _form_and_keys(self) -> ScaleModel:
-        told, wanted = self.model_fields_set - {"form"}, SCALE_KEYS[self.form]
-        empty = {key for key in told if getattr(self, key) is None and key != "peak_current_a"}
-        if empty or told - wanted or wanted - told - {"objects"}:
+        given, wanted = self.model_fields_set - {"form"}, SCALE_KEYS[self.form]
+        empty = {key for key in given if getattr(self, key) is None and key != "peak_current_a"}
+        if empty or given - wanted or wanted - given - {"objects"}:
             raise ValueError(f"{' and '.join(sorted(wanted))} of a scale of form {self.form.value}, and nothing else")
         return self
 
@@ -157,8 +157,8 @@ class FactsModel(StrictModel):
 
     def facts(self) -> tuple[Fact, ...]:
         """As drivers takes them."""
-        told: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
-        return tuple(Fact(name, fact.basis, fact.where) for name, fact in told.items() if fact is not None)
+        stated: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
+        return tuple(Fact(name, fact.basis, fact.where) for name, fact in stated.items() if fact is not None)
 
 
 class DriveModel(StrictModel):

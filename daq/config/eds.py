@@ -105,9 +105,9 @@ def _entry_faults(entry: ObjectEntry, eds: Eds, *, mapped: bool) -> Iterator[str
         yield f"{entry}: no such object in {eds.name}"
         return
     if (found.bits, found.signed) != (entry.bits, entry.signed):
-        told = f"{'i' if found.signed else 'u'}{found.bits}" if found.bits else "no integer"
+        found_type = f"{'i' if found.signed else 'u'}{found.bits}" if found.bits else "no integer"
         wanted = f"{'i' if entry.signed else 'u'}{entry.bits}"
-        yield f"{entry} ({found.name}): {told} in {eds.name}, {wanted} in the profile"
+        yield f"{entry} ({found.name}): {found_type} in {eds.name}, {wanted} in the profile"
     if not found.readable:
         yield f"{entry} ({found.name}): cannot be read by {eds.name}"
     if mapped and not found.mappable:

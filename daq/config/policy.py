@@ -91,7 +91,7 @@ class ApplyPolicyModel(StrictModel):
         return self
 
     @model_validator(mode="after")
-    def _put_to_the_test(self) -> ApplyPolicyModel:
+    def _check_holdout_and_changes(self) -> ApplyPolicyModel:
         if self.by is AppliedBy.JOB and self.holdout is HoldOut.OPTIONAL:
             raise ValueError("`holdout: required` where the job applies by itself")
         return self

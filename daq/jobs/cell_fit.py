@@ -183,7 +183,7 @@ FORMAT = "drivegain-fleet-state"
 
 
 @dataclass(frozen=True, slots=True)
-class Shelf:
+class CalibrationCache:
     """A calibration file a cell, and beside each a small JSON file that says what it was made of.
 
     Attributes:
@@ -199,7 +199,7 @@ class Shelf:
         name = re.sub(r"[^\w.-]", "_", cell.cell)[:40]
         return self.folder / f"{name}-{cell.configuration_sha256[:12]}.yaml"
 
-    def standing(self, cell: CellLogs) -> tuple[Summary, float] | None:
+    def cached(self, cell: CellLogs) -> tuple[Summary, float] | None:
         """What is told of the calibration of these logs, and the seconds that it took; None where it is not there.
 
         The file itself is not parsed: it is the one that was written, by its digest.
@@ -224,7 +224,7 @@ class Shelf:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None  # whatever it is, it is made anew
 
-    def keep(self, cell: CellLogs, fitted: Fitted) -> Path:
+    def store(self, cell: CellLogs, fitted: Fitted) -> Path:
         """Put a calibration there; a kill at any point leaves what stands whole, or what is made anew.
 
         Raises:
@@ -256,7 +256,7 @@ class Shelf:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
 
 
-def open_shelf(folder: Path, loop: Loop) -> Shelf:
+def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
     """Make the folder, and see that files can be put there.
 
     Raises:
@@ -271,7 +271,7 @@ def open_shelf(folder: Path, loop: Loop) -> Shelf:
             pass
     except OSError as error:
         raise OutputFailed.of(folder, error) from error
-    return Shelf(folder, loop)
+    return CalibrationCache(folder, loop)
 
 
 def _check_replaceable(path: Path) -> None:

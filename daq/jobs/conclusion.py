@@ -48,10 +48,10 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
     """For a person."""
     session = conclusion.session
     # The words of the decision stand above its table.
-    told = session is not None and session.state.decision is not None and not session.state.problem
+    decided = session is not None and session.state.decision is not None and not session.state.problem
     lines = [
         f"Outcome: {conclusion.outcome.value} (exit code {conclusion.exit_code})",
-        *(() if told or not conclusion.remark else (conclusion.remark,)),
+        *(() if decided or not conclusion.remark else (conclusion.remark,)),
     ]
     if session is not None:
         state = session.state

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from daq.errors import UsageError
-from daq.jobs.cell_fit import Failure, Fitted, Loop, Shelf, Unfitted, failure_of, fit_cell
+from daq.jobs.cell_fit import CalibrationCache, Failure, Fitted, Loop, Unfitted, failure_of, fit_cell
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, Summary, UnknownLog, by_cell, survey
-from daq.jobs.workers import Crew
+from daq.jobs.workers import WorkerPool
 
 # One line of a fleet's table: a cell with what came of it, or with what stood in the way.
 
@@ -56,7 +56,7 @@ SURVEYED = 16
 LOOK_S = 30.0
 """After so long without a result somebody looks whether the workers are still there; a cell may well take longer."""
 
-Told = Callable[[int, int, str], None]
+ProgressCallback = Callable[[int, int, str], None]
 """Done, total, and a remark."""
 Work = TypeVar("Work")
 Made = TypeVar("Made")
@@ -64,11 +64,11 @@ Made = TypeVar("Made")
 
 def fit_fleet(
     logs: tuple[StoredLog, ...],
-    crew: Crew,
+    pool: WorkerPool,
     loop: Loop,
-    shelf: Shelf | None,
+    cache: CalibrationCache | None,
     now: Callable[[], datetime],
-    told: Told = lambda _done, _total, _remark: None,
+    report_progress: ProgressCallback = lambda _done, _total, _remark: None,
 ) -> tuple[FleetRow, ...]:
     """Fit every cell of which there are logs; what is wrong with one is told in its row.
 
@@ -78,7 +78,7 @@ def fit_fleet(
         loop: whether to look for effects.
         shelf: where calibrations are kept, None for nowhere.
         now: time of day, for the calibrations.
-        told: of progress, by cells; while heads are read, by logs.
+        report_progress: of progress, by cells; while heads are read, by logs.
 
     Returns:
         the rows, by cell and configuration; logs that do not tell whose they are come last.
@@ -88,31 +88,31 @@ def fit_fleet(
         OutputExists: something on the shelf is in the way of a calibration; no cell was fitted.
         OutputFailed: a calibration could not be kept.
     """
-    cells, unknown = _surveyed(logs, crew, told)
+    cells, unknown = _surveyed(logs, pool, report_progress)
     configurations = Counter(cell.cell for cell in cells)
     rows: list[FleetRow] = []
     missing = []
     for cell in cells:
-        standing = None if shelf is None else shelf.standing(cell)
-        if shelf is None or standing is None:
+        cached = None if cache is None else cache.cached(cell)
+        if cache is None or cached is None:
             missing.append(cell)
         else:
-            row = _row_of(cell, *standing, configurations[cell.cell])
-            rows.append(replace(row, file=shelf.file(cell), kept=True))
-    told(len(rows), len(cells), "")
+            row = _row_of(cell, *cached, configurations[cell.cell])
+            rows.append(replace(row, file=cache.file(cell), kept=True))
+    report_progress(len(rows), len(cells), "")
 
     def submit(cell: CellLogs) -> Future[Fitted | Unfitted]:
-        return crew.executor.submit(fit_cell, cell, loop, now())
+        return pool.executor.submit(fit_cell, cell, loop, now())
 
-    for cell, found in each(submit, missing, crew):
-        rows.append(_row(cell, found, configurations[cell.cell], shelf))
-        told(len(rows), len(cells), cell.cell)
+    for cell, found in each(submit, missing, pool):
+        rows.append(_row(cell, found, configurations[cell.cell], cache))
+        report_progress(len(rows), len(cells), cell.cell)
     rows.sort(key=lambda row: (row.cell, row.configuration_sha256))
     return (*rows, *(FleetRow(log.log.name, "", (log.log.name,), (), failure_of(log.error), 0.0) for log in unknown))
 
 
 def each(
-    submit: Callable[[Work], Future[Made]], work: Iterable[Work], crew: Crew
+    submit: Callable[[Work], Future[Made]], work: Iterable[Work], pool: WorkerPool
 ) -> Iterator[tuple[Work, Made | BaseException]]:
     """Have some work done, in the order in which it is finished.
 
@@ -130,12 +130,12 @@ def each(
         UsageError: the workers have gone.
     """
     waiting = iter(work)
-    running = {submit(piece): piece for piece in islice(waiting, crew.workers)}
+    running = {submit(piece): piece for piece in islice(waiting, pool.workers)}
     absent = 0
     while running:
         done, _ = wait(running, LOOK_S, return_when=FIRST_COMPLETED)
         # A worker that died may be on its way back: only who is missed twice has gone.
-        absent = absent + 1 if not done and not crew.present() else 0
+        absent = absent + 1 if not done and not pool.present() else 0
         if absent > 1:
             raise _gone("no workers any more")
         for future in done:
@@ -164,28 +164,30 @@ def _gone(found: str) -> UsageError:
     )
 
 
-def _surveyed(logs: tuple[StoredLog, ...], crew: Crew, told: Told) -> tuple[tuple[CellLogs, ...], list[UnknownLog]]:
+def _surveyed(
+    logs: tuple[StoredLog, ...], pool: WorkerPool, report_progress: ProgressCallback
+) -> tuple[tuple[CellLogs, ...], list[UnknownLog]]:
     portions = [logs[first : first + SURVEYED] for first in range(0, len(logs), SURVEYED)]
     seen: list[SeenLog] = []
     unknown: list[UnknownLog] = []
     looked_at = 0
 
     def submit(portion: tuple[StoredLog, ...]) -> Future[tuple[SeenLog | UnknownLog, ...]]:
-        return crew.executor.submit(survey, portion)
+        return pool.executor.submit(survey, portion)
 
-    for portion, found in each(submit, portions, crew):
+    for portion, found in each(submit, portions, pool):
         if isinstance(found, BaseException):  # a worker that was killed, or an error of ours
             unknown += [UnknownLog(log, found) for log in portion]
         else:
             seen += [log for log in found if isinstance(log, SeenLog)]
             unknown += [log for log in found if isinstance(log, UnknownLog)]
         looked_at += len(portion)
-        told(looked_at, len(logs), "heads of logs")
+        report_progress(looked_at, len(logs), "heads of logs")
     return by_cell(seen), sorted(unknown, key=lambda log: log.log.name)
 
 
 def _row(
-    cell: CellLogs, found: Fitted | Unfitted | BaseException, configurations: int, shelf: Shelf | None
+    cell: CellLogs, found: Fitted | Unfitted | BaseException, configurations: int, cache: CalibrationCache | None
 ) -> FleetRow:
     if isinstance(found, BaseException):
         # A worker that was killed, or an error of ours: the other cells have nothing to do with it.
@@ -193,7 +195,7 @@ def _row(
     if isinstance(found, Unfitted):
         return _row_of(cell, found.failure, found.seconds, configurations)
     row = _row_of(cell, found.summary, found.seconds, configurations)
-    return row if shelf is None else replace(row, file=shelf.keep(cell, found))
+    return row if cache is None else replace(row, file=cache.store(cell, found))
 
 
 def _row_of(cell: CellLogs, result: Summary | Failure, seconds: float, configurations: int) -> FleetRow:

@@ -75,10 +75,10 @@ def at_hand(log: StoredLog, folder: Path) -> Path:
         LogMissing: it cannot be read, or is no regular file.
     """
     if not log.remote:
-        with _told(log.address):
+        with _name_errors(log.address):
             return _regular(Path(log.address))
     copy = _copy(log, folder)
-    with _told(log.address):
+    with _name_errors(log.address):
         store, path = _store(log.address)
         with store.open(path, "rb") as source, copy.open("wb") as target:
             shutil.copyfileobj(source, target, PIECE_BYTES)
@@ -92,7 +92,7 @@ def beginning(log: StoredLog, size: int, folder: Path) -> Path:
         LogMissing: it cannot be read.
     """
     copy = _copy(log, folder)
-    with _told(log.address):
+    with _name_errors(log.address):
         store, path = _store(log.address)
         copy.write_bytes(store.cat_file(path, start=0, end=size))
     return copy
@@ -104,7 +104,7 @@ def fingerprint(log: StoredLog) -> str:
     Raises:
         LogMissing: it cannot be read, or is no regular file.
     """
-    with _told(log.address):
+    with _name_errors(log.address):
         if log.remote:
             store, path = _store(log.address)
             return str(store.ukey(path))
@@ -122,7 +122,7 @@ def _listed_local(folder: Path) -> list[StoredLog]:
 
 
 def _listed_remote(place: str) -> list[StoredLog]:
-    with _told(place):
+    with _name_errors(place):
         store, root = _store(place)
         if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
             return _listed_local(Path(root))  # file://: with links, pipes and devices, of which fsspec does not tell
@@ -169,7 +169,7 @@ def _store(address: str) -> tuple[Any, str]:
 
 
 @contextmanager
-def _told(address: str) -> Iterator[None]:
+def _name_errors(address: str) -> Iterator[None]:
     try:
         yield
     except DaqError:

@@ -20,16 +20,16 @@ from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock, InterlockFile, PlannedRun, Recalibration
 from daq.errors import MountFailed, NotReleased, TimeBoundReached
 from daq.workflow.record import network_of
-from drivers.canopen.network import Undisturbed
+from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
 from drivers.profiles.cia402 import POWERLESS, State, decode
 
 # Programs of the cell's own: the interlock's and the mount's.
 
 
-TOLD = 400
+MAX_OUTPUT_CHARACTERS = 400
 """Characters of what a program said that are shown."""
-_KEPT_BYTES = 4 * TOLD
+_KEPT_BYTES = 4 * MAX_OUTPUT_CHARACTERS
 """As many as those characters may take in UTF-8."""
 _READ_BYTES = 1 << 16
 
@@ -86,7 +86,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
         except BaseException:
             _end(process)
             raise
-    return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-TOLD:])
+    return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:])
 
 
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
@@ -206,7 +206,7 @@ LEFT_BEHIND = (
 )
 
 
-def check_drives(cell: Cell, undisturbed: Undisturbed) -> None:
+def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
     """Read identity and state of every drive; nothing is changed and nothing moves.
 
     Args:
@@ -218,7 +218,7 @@ def check_drives(cell: Cell, undisturbed: Undisturbed) -> None:
         StateRefused: one has power already: another controller drives this robot.
         DriverError: a drive does not answer, is another one than declared, or the bus has gone.
     """
-    with network_of(cell, undisturbed) as network:
+    with network_of(cell, block_signals) as network:
         network.check_identities()
         for axis, statusword in zip(network.axes, network.statuswords(), strict=True):
             state = decode(statusword)
@@ -238,7 +238,7 @@ AGAIN_S = 1.0
 
 
 @contextmanager
-def time_bound(minutes: float) -> Iterator[Undisturbed]:
+def time_bound(minutes: float) -> Iterator[SignalBlocker]:
     """Raise where the block is, once the time is up; what is yielded keeps the alarm from disturbing a stop.
 
     In another thread than the main one there is no alarm: Python handles no signals there.
@@ -267,7 +267,7 @@ def time_bound(minutes: float) -> Iterator[Undisturbed]:
         )
 
     @contextmanager
-    def undisturbed() -> Iterator[None]:
+    def block_signals() -> Iterator[None]:
         nonlocal stopping
         stopping += 1
         try:
@@ -278,7 +278,7 @@ def time_bound(minutes: float) -> Iterator[Undisturbed]:
     before = signal.signal(signal.SIGALRM, up)
     signal.setitimer(signal.ITIMER_REAL, 60.0 * minutes)
     try:
-        yield undisturbed
+        yield block_signals
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)

@@ -19,22 +19,22 @@ from daq.jobs.interlock import time_bound
 from daq.jobs.journal import Figures, Journal, Level, write_metrics
 from daq.jobs.preflight import before_motion, due_in, require_clock, section_of, target_of
 from daq.jobs.recording import (
-    Cellside,
     GainTarget,
+    JobContext,
     basis_of,
     calibration_of_session,
     fit_session,
     record_runs,
-    standing_runs,
+    verified_runs,
 )
 from daq.jobs.session import Outcome, Session, SessionState
 from daq.jobs.tools import Tools
-from daq.jobs.verdict import Past, settle
+from daq.jobs.verdict import GainHistory, decide_outcome
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.judgement import digests_in_force
 from daq.ledger.store import HistoryStore
 from daq.workflow.safeguards import bus_lock
-from drivers.canopen.network import Undisturbed
+from drivers.canopen.network import SignalBlocker
 from drivers.errors import WHILE
 
 # The end of a job, told wherever somebody may look: audit, state, summary, metrics, journal.
@@ -45,7 +45,7 @@ CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}
 
 
 @dataclass(frozen=True, slots=True)
-class Ending:
+class JobReporter:
     """Says how a job has ended, wherever somebody may look.
 
     Attributes:
@@ -71,7 +71,7 @@ class Ending:
         """
         outcome = session.state.outcome or Outcome.STOPPED
         remark = "" if session.state.decision is None else session.state.decision.remark
-        return self._tell(session, outcome, CODES.get(outcome, ExitCode.OK), remark, "")
+        return self._report(session, outcome, CODES.get(outcome, ExitCode.OK), remark, "")
 
     def failed(self, folder: Path, error: BaseException) -> None:
         """What fails while this is told is noted on the error, which goes on its way."""
@@ -82,7 +82,7 @@ class Ending:
             code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
             problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(WHILE)]
-            self._tell(session, outcome, code, "; ".join((problem, *notes)), problem)
+            self._report(session, outcome, code, "; ".join((problem, *notes)), problem)
         except (DaqError, OSError, StopIteration) as second:
             error.add_note(f"kept: the session's end could not be written down: {second}")
 
@@ -104,7 +104,7 @@ class Ending:
         except OSError as error:
             raise OutputFailed.of(self.target.history.audit, error) from error
 
-    def _tell(self, session: Session, outcome: Outcome, code: int, remark: str, problem: str) -> Conclusion:
+    def _report(self, session: Session, outcome: Outcome, code: int, remark: str, problem: str) -> Conclusion:
         now = self.tools.now()
         state = session.state.with_(
             outcome=outcome, exit_code=int(code), problem=problem, ended=now.isoformat(timespec="seconds")
@@ -196,7 +196,7 @@ def recalibrate(
     journal: Journal,
     *,
     who: str,
-    undisturbed: Undisturbed = nullcontext,
+    block_signals: SignalBlocker = nullcontext,
     lock_folder: Path | None = None,
 ) -> Conclusion:
     """Do the cell's scheduled recalibration, or what an earlier job has left of it.
@@ -224,18 +224,18 @@ def recalibrate(
         if (early := _not_due(section, cell, tools.now())) is not None:
             return early
         began_s = tools.monotonic_s()
-        session = _taken_up_or_new(section, cell, tools.now(), journal)
+        session = _resumed_or_new(section, cell, tools.now(), journal)
         journal = journal.within(session=session.state.session)
-        ending = Ending(cell_file, cell, section, target, tools, journal, who, began_s)
+        reporter = JobReporter(cell_file, cell, section, target, tools, journal, who, began_s)
         try:
-            ending.audit(AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
+            reporter.audit(AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
             with time_bound(section.max_duration_min) as in_time:
-                side = Cellside(cell_file, cell, section, target, tools, who, _both(undisturbed, in_time))
-                session = _go(side, session, journal)
+                context = JobContext(cell_file, cell, section, target, tools, who, _both(block_signals, in_time))
+                session = _go(context, session, journal)
         except BaseException as error:
-            ending.failed(session.folder, error)
+            reporter.failed(session.folder, error)
             raise
-        return ending.succeeded(session)
+        return reporter.succeeded(session)
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,13 +265,13 @@ def preview(
         return Preview((), early.remark)
     with bus_lock(cell, lock_folder):
         found = sessions.sessions(section.folder, cell.name)
-        session = sessions.to_take_up(found, basis_of(cell, section), now, section.resume_within_h)
-        made = () if session is None else tuple(run.name for run in standing_runs(session).state.runs)
+        session = sessions.resumable_session(found, basis_of(cell, section), now, section.resume_within_h)
+        made = () if session is None else tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
             folder = _nearest(section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
-            before_motion(Cellside(cell_file, cell, section, target, there, who, nullcontext), journal)
+            before_motion(JobContext(cell_file, cell, section, target, there, who, nullcontext), journal)
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
     steps += [f"mount {run.payload or 'none'}, record {run.name}" for run in left]
     if session is None or calibration_of_session(session) is None:
@@ -281,19 +281,21 @@ def preview(
     return Preview(tuple(steps), taken)
 
 
-def _go(side: Cellside, session: Session, journal: Journal) -> Session:
-    if len(standing_runs(session).state.runs) < len(side.section.runs):
-        before_motion(side, journal.within(step="preflight"))
-        session = record_runs(side, session, journal)
-    session, calibration = fit_session(side, session, journal.within(step="fit"))
-    with Past(side.cell, side.target.history, side.target.file, side.tools.now, side.who) as past:
-        past.keep(calibration, session.folder / sessions.CALIBRATION)
-        session = sessions.save(replace(session, state=session.state.with_(watched=past.watched())))
+def _go(context: JobContext, session: Session, journal: Journal) -> Session:
+    if len(verified_runs(session).state.runs) < len(context.section.runs):
+        before_motion(context, journal.within(step="preflight"))
+        session = record_runs(context, session, journal)
+    session, calibration = fit_session(context, session, journal.within(step="fit"))
+    with GainHistory(
+        context.cell, context.target.history, context.target.file, context.tools.now, context.who
+    ) as gain_history:
+        gain_history.enter(calibration, session.folder / sessions.CALIBRATION)
+        session = sessions.save(replace(session, state=session.state.with_(watched=gain_history.watched())))
         for gain in session.state.watched:
             if gain.alarm:
                 # Slices of a slow drift may each be small enough to be written without anybody.
                 journal.within(step="watch").say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
-        return settle(side, session, calibration, past, journal.within(step="decide"))
+        return decide_outcome(context, session, calibration, gain_history, journal.within(step="decide"))
 
 
 def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
@@ -309,9 +311,9 @@ def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | 
     return Conclusion(Outcome.NOT_DUE, ExitCode.OK, None, remark)
 
 
-def _taken_up_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
+def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: Journal) -> Session:
     found, basis = sessions.sessions(section.folder, cell.name), basis_of(cell, section)
-    session = sessions.to_take_up(found, basis, now, section.resume_within_h)
+    session = sessions.resumable_session(found, basis, now, section.resume_within_h)
     if session is None:
         session = sessions.begin(section.folder, basis, now)
         journal.within(session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
@@ -328,7 +330,7 @@ def _taken_up_or_new(section: Recalibration, cell: Cell, now: datetime, journal:
     return sessions.save(replace(session, state=state))
 
 
-def _both(one: Undisturbed, other: Undisturbed) -> Undisturbed:
+def _both(one: SignalBlocker, other: SignalBlocker) -> SignalBlocker:
     @contextmanager
     def both() -> Iterator[None]:
         with ExitStack() as stack:

@@ -83,8 +83,8 @@ class Journal:
         """
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
-            told = ", ".join(f"{name} {_text(value)}" for name, value in fields.items())
-            line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + told if told else ''}"
+            details = ", ".join(f"{name} {_text(value)}" for name, value in fields.items())
+            line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
         else:
             known = {"session": self.session, "step": self.step}
             named = {key: value for key, value in known.items() if value}
@@ -179,9 +179,9 @@ def registry_of(figures: Figures) -> CollectorRegistry:
         last = gauge("last_success_timestamp_seconds", "When the last good calibration was begun.")
         last.labels(cell).set(figures.last_good.timestamp())
     if figures.state is not None:
-        _tell_session(gauge, figures.state, cell)
+        _set_session_gauges(gauge, figures.state, cell)
     if figures.calibration is not None:
-        _tell_calibration(gauge, figures.calibration, cell)
+        _set_calibration_gauges(gauge, figures.calibration, cell)
     return registry
 
 
@@ -207,7 +207,7 @@ def file_stem(cell: str) -> str:
     return plain if plain == cell else f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
 
 
-def _tell_session(gauge: _Gauges, state: SessionState, cell: str) -> None:
+def _set_session_gauges(gauge: _Gauges, state: SessionState, cell: str) -> None:
     lost = gauge("lost_cycles", "Cycles that are not in any recording of a run.", "run")
     missing = gauge("missing_answers", "Answers of drives that never came, of all recordings of a run.", "run")
     attempts = gauge("recordings", "Of a run, until its recorder stood for it.", "run")
@@ -228,7 +228,7 @@ def _tell_session(gauge: _Gauges, state: SessionState, cell: str) -> None:
                 drift.labels(cell, gain.axis).set(gain.drift_sigma)
 
 
-def _tell_calibration(gauge: _Gauges, calibration: Calibration, cell: str) -> None:
+def _set_calibration_gauges(gauge: _Gauges, calibration: Calibration, cell: str) -> None:
     value = gauge("gain", "Identified drive gain, in Nm or N per A.", "axis", "unit")
     std = gauge("gain_std", "Its standard deviation, in the same unit.", "axis", "unit")
     for gain in calibration.gains:

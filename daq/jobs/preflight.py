@@ -9,11 +9,11 @@ from daq.config.recalibration import Recalibration
 from daq.errors import ClockWentBack, ConfigurationInconsistent, DiskSpaceShort, OutputFailed
 from daq.jobs.interlock import require_release
 from daq.jobs.journal import Journal, Level
-from daq.jobs.recording import Cellside, GainTarget
+from daq.jobs.recording import GainTarget, JobContext
 from daq.jobs.session import Session, last_good
 from daq.ledger.store import HistoryStore
 from daq.workflow.safeguards import agree
-from daq.writeback.file_access import followed
+from daq.writeback.file_access import resolve_links
 from drivers.errors import MotionRefused
 
 CLOCK_SLACK = timedelta(minutes=1)
@@ -35,7 +35,7 @@ def target_of(cell: Cell) -> GainTarget:
             expected="a controller's file: a job compares its gains with those in it",
             remedy="name it in the cell file; what is kept in drives alone is recorded and applied by hand",
         )
-    followed(file)  # refused now, not after an hour of recordings
+    resolve_links(file)  # refused now, not after an hour of recordings
     return GainTarget(cell.controller, file, cell.history)
 
 
@@ -103,7 +103,7 @@ def due_in(found: tuple[Session, ...], every_h: float, now: datetime) -> timedel
     return timedelta(0) if good is None else good.began + timedelta(hours=every_h) - now
 
 
-def before_motion(side: Cellside, journal: Journal) -> None:
+def before_motion(context: JobContext, journal: Journal) -> None:
     """Room on the disk, the history, the interlock, and the drives.
 
     Raises:
@@ -111,9 +111,9 @@ def before_motion(side: Cellside, journal: Journal) -> None:
         DiskSpaceShort, NotReleased, DriverError: nothing has moved.
         OutputFailed: the session's folder has gone.
     """
-    section = side.section
+    section = context.section
     try:
-        free_mb = side.tools.free(section.folder) / 1e6
+        free_mb = context.tools.free(section.folder) / 1e6
     except OSError as error:
         raise OutputFailed.of(section.folder, error) from error
     if free_mb < section.min_free_mb:
@@ -123,9 +123,9 @@ def before_motion(side: Cellside, journal: Journal) -> None:
             expected=f"{section.min_free_mb:g} MB (min_free_mb)",
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
         )
-    with HistoryStore(side.target.history.store) as store:
+    with HistoryStore(context.target.history.store) as store:
         store.entries()
-    require_release(section.interlock, side.tools.run, side.tools.now, section.working_folder)
+    require_release(section.interlock, context.tools.run, context.tools.now, section.working_folder)
     journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
-    side.tools.drives(side.cell, side.undisturbed)
+    context.tools.drives(context.cell, context.block_signals)
     journal.say(Level.INFO, "drives are as declared, without fault and without power")

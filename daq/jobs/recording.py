@@ -40,7 +40,7 @@ from daq.workflow.calibration_file import save as save_calibration
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
-from drivers.canopen.network import Undisturbed
+from drivers.canopen.network import SignalBlocker
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 from ident.model.bodies import Payload
@@ -64,7 +64,7 @@ class GainTarget:
 
 
 @dataclass(frozen=True, slots=True)
-class Cellside:
+class JobContext:
     """What every step of a job needs.
 
     Attributes:
@@ -81,7 +81,7 @@ class Cellside:
     target: GainTarget
     tools: Tools
     who: str
-    undisturbed: Undisturbed
+    block_signals: SignalBlocker
 
 
 def log_of(session: Session, name: str) -> Path:
@@ -95,13 +95,13 @@ def basis_of(cell: Cell, section: Recalibration) -> Basis:
     return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
 
 
-def standing_runs(session: Session) -> Session:
+def verified_runs(session: Session) -> Session:
     """The session without the runs whose logs are not what its state says."""
     runs = tuple(run for run in session.state.runs if sha256_of(log_of(session, run.name)) == run.sha256)
     return replace(session, state=session.state.with_(runs=runs))
 
 
-def record_runs(side: Cellside, session: Session, journal: Journal) -> Session:
+def record_runs(context: JobContext, session: Session, journal: Journal) -> Session:
     """Make all recordings that the session does not have yet; its state is written after each of them.
 
     Raises:
@@ -109,61 +109,63 @@ def record_runs(side: Cellside, session: Session, journal: Journal) -> Session:
         RunInvalid: its recorder does not stand for a run, however often it was made.
         DriverError, OutputFailed, ConfigurationError: see `daq.workflow.record`.
     """
-    session = standing_runs(session)
+    session = verified_runs(session)
     made = {run.name for run in session.state.runs}
-    left = [planned for planned in side.section.runs if planned.name not in made]
-    plans = {planned.name: _plan(side, session, planned, journal.within(step="plan")) for planned in left}
+    left = [planned for planned in context.section.runs if planned.name not in made]
+    plans = {planned.name: _plan(context, session, planned, journal.within(step="plan")) for planned in left}
     warm = not left
     for planned in left:
-        told = journal.within(step=f"record {planned.name}")
-        mount(side.section, planned, side.tools.run)
-        told.say(Level.INFO, "mounted", payload=planned.payload or "none")
+        run_journal = journal.within(step=f"record {planned.name}")
+        mount(context.section, planned, context.tools.run)
+        run_journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
-            _warm_up(side, session, planned, plans[planned.name], journal.within(step=WARM_UP))
+            _warm_up(context, session, planned, plans[planned.name], journal.within(step=WARM_UP))
             warm = True
-        run = _record_valid(side, session, planned, plans[planned.name], told)
+        run = _record_valid(context, session, planned, plans[planned.name], run_journal)
         session = save(replace(session, state=session.state.with_(runs=(*session.state.runs, run))))
     return session
 
 
-def _plan(side: Cellside, session: Session, planned: PlannedRun, journal: Journal) -> Plan:
+def _plan(context: JobContext, session: Session, planned: PlannedRun, journal: Journal) -> Plan:
     """Approved moves, or those of the seed; a plan of this session is made once."""
     if planned.plan_file is not None:
-        return load_plan(planned.plan_file, side.cell)
+        return load_plan(planned.plan_file, context.cell)
     path = session.folder / f"plan-{planned.seed}-{planned.duration_s:g}s.yaml"
     if path.exists():
         with suppress(ConfigurationError):  # what was damaged is made again
-            return load_plan(path, side.cell)
+            return load_plan(path, context.cell)
     journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
     try:
-        save_plan(side.tools.plan(side.cell, seed=planned.seed, duration_s=planned.duration_s), path)
+        save_plan(context.tools.plan(context.cell, seed=planned.seed, duration_s=planned.duration_s), path)
     except OSError as error:
         raise OutputFailed.of(path, error) from error
-    return load_plan(path, side.cell)  # as a person can read it
+    return load_plan(path, context.cell)  # as a person can read it
 
 
-def _warm_up(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> None:
+def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> None:
     """Make a run's moves without keeping its log until the joints are as warm as the later runs will find them.
 
     It is recorded all the same: in the same way, with the same supervision.
     """
-    passes = math.ceil(60.0 * side.section.warm_up_min / plan.duration_s)
+    passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
     for number in range(1, passes + 1):
         journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
         out = log_of(session, WARM_UP)
         out.unlink(missing_ok=True)
         out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
-        _record(side, planned, plan, out)
+        _record(context, planned, plan, out)
         out.unlink()
 
 
-def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> RecordedRun:
+def _record_valid(
+    context: JobContext, session: Session, planned: PlannedRun, plan: Plan, journal: Journal
+) -> RecordedRun:
     out = log_of(session, planned.name)
-    lost, missing = 0, (0,) * len(side.cell.axes)
-    for attempt in range(1, side.section.retries + 2):
+    lost, missing = 0, (0,) * len(context.cell.axes)
+    for attempt in range(1, context.section.retries + 2):
         _set_aside(out, journal)
         journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
-        log = (recorded := _record(side, planned, plan, out)).log
+        log = (recorded := _record(context, planned, plan, out)).log
         for warning in recorded.warnings:
             journal.say(Level.WARNING, "warning of the recorder", text=warning)
         lost += log.lost_cycles
@@ -181,31 +183,31 @@ def _record_valid(side: Cellside, session: Session, planned: PlannedRun, plan: P
         journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
     raise RunInvalid(
         str(out),
-        found=f"{side.section.retries + 1} recordings, none without losses (the last: {log.reason})",
+        found=f"{context.section.retries + 1} recordings, none without losses (the last: {log.reason})",
         expected="one that its recorder stands for",
         remedy="see to the bus and to the load of this computer; the next job records this run again",
     )
 
 
-def _record(side: Cellside, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
+def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
     """One recording. The interlock is asked before the drives are, and again right before they get power."""
 
     def released() -> None:
-        require_release(side.section.interlock, side.tools.run, side.tools.now, side.section.working_folder)
+        require_release(context.section.interlock, context.tools.run, context.tools.now, context.section.working_folder)
 
     released()
-    return side.tools.record(
-        side.file,
-        side.cell,
+    return context.tools.record(
+        context.file,
+        context.cell,
         plan,
         out,
-        payload=payload_of(side.cell, planned),
+        payload=payload_of(context.cell, planned),
         entered_kg=planned.mass_kg,
-        operator=side.who,
-        granted_by=f"the policy of cell {side.cell.name} and its interlock, for {side.who}",
+        operator=context.who,
+        granted_by=f"the policy of cell {context.cell.name} and its interlock, for {context.who}",
         run_id=str(uuid.uuid4()),
-        free=side.tools.free,
-        undisturbed=side.undisturbed,
+        free=context.tools.free,
+        block_signals=context.block_signals,
         # Waiting for the drives and mapping their PDOs takes seconds, in which somebody may open the cell.
         before_motion=released,
     )
@@ -254,7 +256,7 @@ def _free_names(out: Path, kind: str) -> Iterator[Path]:
 # From a session's logs to its calibration and its report.
 
 
-def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Session, Calibration]:
+def fit_session(context: JobContext, session: Session, journal: Journal) -> tuple[Session, Calibration]:
     """Fit the logs, close the loop, and write calibration and report; nothing where that was done before.
 
     Raises:
@@ -264,25 +266,25 @@ def fit_session(side: Cellside, session: Session, journal: Journal) -> tuple[Ses
     done = calibration_of_session(session)
     if done is not None:
         return session, done
-    logs = [log_of(session, run.name) for run in side.section.runs if not run.holdout]
-    unseen = [log_of(session, run.name) for run in side.section.runs if run.holdout]
+    logs = [log_of(session, run.name) for run in context.section.runs if not run.holdout]
+    unseen = [log_of(session, run.name) for run in context.section.runs if run.holdout]
     journal.say(Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen])
     try:
-        fitted = side.tools.fit(logs, holdout=unseen)
-        closed = side.tools.close_loop(fitted, side.section.seed, lambda step: journal.say(Level.INFO, step))
-        changed = side.tools.account(start_of(closed), closed.steps)
+        fitted = context.tools.fit(logs, holdout=unseen)
+        closed = context.tools.close_loop(fitted, context.section.seed, lambda step: journal.say(Level.INFO, step))
+        changed = context.tools.account(start_of(closed), closed.steps)
     except (DataError, IdentificationError):
         # The same logs would end in the same way: the next job records others.
         sessions.save(replace(session, state=session.state.with_(outcome=Outcome.UNFIT)))
         raise
-    calibration = side.tools.calibration(closed, side.tools.now())
+    calibration = context.tools.calibration(closed, context.tools.now())
     path, report = session.folder / CALIBRATION, session.folder / REPORT
     try:
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputFailed.of(path, error) from error
-    side.tools.save_report(closed, changed, calibration, report)
+    context.tools.save_report(closed, changed, calibration, report)
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
     for sentence in fit.sentences:
         journal.say(Level.INFO, "found", text=sentence)

@@ -248,7 +248,7 @@ def save(session: Session) -> Session:
     return session
 
 
-def to_take_up(found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float) -> Session | None:
+def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float) -> Session | None:
     """The newest session, if it waits for its end: of this configuration, with these plans, and young enough."""
     if not found or found[-1].finished:
         return None
@@ -300,5 +300,5 @@ def _read(path: Path) -> SessionState | None:
 
 
 def _times(state: SessionState) -> list[datetime]:
-    told = (state.began, state.attempt_began, state.ended)
-    return [datetime.fromisoformat(time) for time in told if time is not None]
+    times = (state.began, state.attempt_began, state.ended)
+    return [datetime.fromisoformat(time) for time in times if time is not None]

@@ -16,7 +16,7 @@ from daq.workflow.record import Recorded, record
 from daq.workflow.safeguards import FreeBytes, free_bytes
 from daq.writeback.file_proposal import Proposal, apply, propose_for
 from daq.writeback.file_target import Written
-from drivers.canopen.network import Undisturbed
+from drivers.canopen.network import SignalBlocker
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
 
@@ -39,7 +39,7 @@ class Tools:
     """
 
     save_report: SaveReport
-    drives: Callable[[Cell, Undisturbed], None] = check_drives
+    drives: Callable[[Cell, SignalBlocker], None] = check_drives
     plan: Callable[..., Plan] = plan
     record: Callable[..., Recorded] = record
     fit: Callable[..., Fit] = fit

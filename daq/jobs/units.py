@@ -107,7 +107,7 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
     )
 
 
-def told_cell(wanted: Installation) -> str:
+def cell_option(wanted: Installation) -> str:
     """How a service of ours tells for which cell it is."""
     return f"--cell {_quoted(str(wanted.cell_file))}"
 

@@ -17,17 +17,17 @@ from daq.errors import DaqError, OutputFailed
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs import session as sessions
 from daq.jobs.journal import Journal, Level
-from daq.jobs.recording import Cellside
+from daq.jobs.recording import JobContext
 from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, WatchedGain
-from daq.ledger.audit import AuditAction, append, told_of
+from daq.ledger.audit import AuditAction, append, find_write_entry
 from daq.ledger.audit import read as read_audit
-from daq.ledger.entry import Deed, Event
+from daq.ledger.entry import Event, WriteAction
 from daq.ledger.judgement import Known, judge, known_of
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import enter_applied
-from daq.ledger.watch import alarm_words, watch
+from daq.ledger.watch import alarm_text, watch
 from daq.workflow.calibration_file import read
-from daq.writeback.file_access import followed
+from daq.writeback.file_access import resolve_links
 from daq.writeback.file_proposal import Proposal
 from daq.writeback.file_target import Written
 from daq.writeback.gates.table import Gate
@@ -39,7 +39,7 @@ from ident.drift.change import FALSE_ALARM
 # What the cell's history says of the gains in force, and what a job adds to it.
 
 
-class Past:
+class GainHistory:
     """The history of a cell, open; a context manager.
 
     Args:
@@ -53,7 +53,7 @@ class Past:
     def __init__(
         self, cell: Cell, place: HistoryPlace, controller: Path, now: Callable[[], datetime], who: str
     ) -> None:
-        self._target = str(followed(controller))
+        self._target = str(resolve_links(controller))
         self._now = now
         self._who = who
         self._store = HistoryStore(place.store)
@@ -74,7 +74,7 @@ class Past:
     ) -> None:
         self._store.__exit__(kind, error, trace)
 
-    def keep(self, calibration: Calibration, path: Path) -> None:
+    def enter(self, calibration: Calibration, path: Path) -> None:
         """Enter this session's calibration; once, however often a session is taken up.
 
         Raises:
@@ -91,25 +91,29 @@ class Past:
             sha256_after: of the controller's file with these gains, by which a later way back to it is known.
         """
         if self._store.in_force(self._target) != self._digest:
-            told = told_of(audit, self._target, sha256_after)
-            event = Event(self._digest, Deed.APPLIED, self._now(), self._who, self._target, told, sha256_after)
+            audit_digest = find_write_entry(audit, self._target, sha256_after)
+            event = Event(
+                self._digest, WriteAction.APPLIED, self._now(), self._who, self._target, audit_digest, sha256_after
+            )
             enter_applied(self._cell, self._store, event)
 
     def watched(self) -> tuple[WatchedGain, ...]:
         """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
         series = watch(self._store.entries(), self._store.acknowledgements())
-        return tuple(WatchedGain(axis=one.axis, alarm=alarm_words(one) or "") for one in series)
+        return tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
 
     def known(self, changes: Sequence[GainChange]) -> Known:
         """What the changes by this session's calibration are judged by. Raises as `keep`."""
         return known_of(self._store, self._target, self._digest, changes)
 
 
-TOUCHED = "The controller's file was written or rolled back since the session began: a person decides."
+CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: a person decides."
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
 
 
-def settle(side: Cellside, session: Session, calibration: Calibration, past: Past, journal: Journal) -> Session:
+def decide_outcome(
+    context: JobContext, session: Session, calibration: Calibration, gain_history: GainHistory, journal: Journal
+) -> Session:
     """Compare a calibration with the gains in the controller, and do what follows from it; the state has the outcome.
 
     Raises:
@@ -117,16 +121,16 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         ControllerChanged, ControllerBusy, ControllerUnfit, AuditUnusable, OutputFailed: see
         `daq.writeback.file_proposal`.
     """
-    session = _written_before(side, session, past, journal)
+    session = _written_before(context, session, gain_history, journal)
     if session.state.outcome is not None:
         return session
-    path, now = session.folder / CALIBRATION, side.tools.now()
+    path, now = session.folder / CALIBRATION, context.tools.now()
     request = Request(calibration, now, file=path, content=read(path))
-    proposal = side.tools.propose(side.cell, request)
-    decision = decision_of(proposal, past)
-    differs, touched = any(gain.differs for gain in decision.gains), _written_since(side, session)
+    proposal = context.tools.propose(context.cell, request)
+    decision = decision_of(proposal, gain_history)
+    differs, touched = any(gain.differs for gain in decision.gains), _written_since(context, session)
     if differs and touched:
-        decision = decision.model_copy(update={"remark": f"{decision.remark} {TOUCHED}"})
+        decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
     journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(proposal.after_content)
     target = Target(
@@ -144,47 +148,47 @@ def settle(side: Cellside, session: Session, calibration: Calibration, past: Pas
         for refusal in closed:
             journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
         sessions.save(_with_outcome(session, Outcome.REFUSED))
-        _apply(side, proposal, now)  # which refuses it, and writes that down
+        _apply(context, proposal, now)  # which refuses it, and writes that down
     if proposal.after_content == proposal.before_content or not differs:
         return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
-    if proposal.refusals or by_a_person(side) or touched:
-        _propose(side, session, target, journal)
+    if proposal.refusals or needs_person(context) or touched:
+        _propose(context, session, target, journal)
         return sessions.save(_with_outcome(session, Outcome.PROPOSED))
-    written = _apply(side, proposal, now)
+    written = _apply(context, proposal, now)
     if written is not None:
         journal.say(
             Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
         )
-    _note(side, past, after, journal)
+    _note(context, gain_history, after, journal)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 
-def _apply(side: Cellside, proposal: Proposal, now: datetime) -> Written | None:
+def _apply(context: JobContext, proposal: Proposal, now: datetime) -> Written | None:
     try:
-        return side.tools.apply(proposal, now, audit=side.target.history.audit, who=side.who)
+        return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
     except OSError as error:
         raise OutputFailed.of(proposal.file, error) from error
 
 
-def _note(side: Cellside, past: Past, after_sha256: str, journal: Journal) -> None:
+def _note(context: JobContext, gain_history: GainHistory, after_sha256: str, journal: Journal) -> None:
     """The history's turn. The controller has its gains, and no trouble of the history's may call that undone."""
     try:
-        past.note_applied(side.target.history.audit, after_sha256)
+        gain_history.note_applied(context.target.history.audit, after_sha256)
     except DaqError as error:
         journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
 
 
-def by_a_person(side: Cellside) -> bool:
+def needs_person(context: JobContext) -> bool:
     """Whether a person applies: by the cell's policy, and wherever drives are written to."""
-    return side.cell.apply.by is AppliedBy.PERSON or bool(side.target.controller.objects)
+    return context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
 
 
-def decision_of(proposal: Proposal, past: Past) -> Decision:
+def decision_of(proposal: Proposal, gain_history: GainHistory) -> Decision:
     """Whether any gain differs from the controller's by more than chance (`daq.ledger.judgement`).
 
     An axis differs by itself where its probability among all of them says so.
     """
-    known = past.known(proposal.changes)
+    known = gain_history.known(proposal.changes)
     found = judge(proposal.changes, known)
     changes = {change.axis: change for change in proposal.changes}
     gains = tuple(
@@ -195,16 +199,16 @@ def decision_of(proposal: Proposal, past: Past) -> Decision:
             old_std=known.stds[axis],
             new=changes[axis].new,
             new_std=changes[axis].std,
-            change_percent=_finite(told.percent),
-            drift_sigma=_finite(told.sigmas),
+            change_percent=_finite(drift.percent),
+            drift_sigma=_finite(drift.sigmas),
             differs=probability <= FALSE_ALARM,
         )
-        for axis, told, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
+        for axis, drift, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
     )
     return Decision(gains=gains, remark=found.words)
 
 
-def _written_before(side: Cellside, session: Session, past: Past, journal: Journal) -> Session:
+def _written_before(context: JobContext, session: Session, gain_history: GainHistory, journal: Journal) -> Session:
     """A job that was killed behind its write has written all the same: it is noted, and never done twice."""
     target = session.state.target
     if target is None or target.base_sha256 == target.after_sha256:
@@ -212,35 +216,35 @@ def _written_before(side: Cellside, session: Session, past: Past, journal: Journ
     if sha256_of(Path(target.file)) != target.after_sha256:
         return session
     journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
-    _note(side, past, target.after_sha256, journal)
+    _note(context, gain_history, target.after_sha256, journal)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 
-def _written_since(side: Cellside, session: Session) -> bool:
+def _written_since(context: JobContext, session: Session) -> bool:
     """Whether the audit tells of a write of the controller's file, or of a way back, since the session began.
 
     An earlier job of it may have been killed right behind its write, and a person may have rolled that back since: the
     file is then what it was before, and the job must not do again what the person has undone.
     """
-    entries = read_audit(side.target.history.audit)
+    entries = read_audit(context.target.history.audit)
     begun = [
         index
         for index, entry in enumerate(entries)
         if entry.action is AuditAction.RECALIBRATION_BEGUN and entry.subject == str(session.folder)
     ]
-    file = str(followed(side.target.file))
+    file = str(resolve_links(context.target.file))
     ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
     # Of an audit that does not know the begin, all of it is later: the part that knew it was moved away.
     return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
 
 
-def _propose(side: Cellside, session: Session, target: Target, journal: Journal) -> None:
+def _propose(context: JobContext, session: Session, target: Target, journal: Journal) -> None:
     append(
-        side.target.history.audit,
+        context.target.history.audit,
         AuditAction.PROPOSED,
-        at=side.tools.now(),
-        who=side.who,
-        subject=str(followed(side.target.file)),
+        at=context.tools.now(),
+        who=context.who,
+        subject=str(resolve_links(context.target.file)),
         details={
             "session": session.state.session,
             "calibration_sha256": sha256_of(session.folder / CALIBRATION) or "",

@@ -20,7 +20,7 @@ CONNECT_S = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Crew:
+class WorkerPool:
     """Somebody at work.
 
     Attributes:
@@ -41,11 +41,11 @@ class Threads:
     workers: int
 
     @contextmanager
-    def engaged(self) -> Iterator[Crew]:
+    def start_pool(self) -> Iterator[WorkerPool]:
         """Until the block ends; what runs then is waited for, what waits is given up."""
         executor = ThreadPoolExecutor(self.workers, thread_name_prefix="fleet")
         try:
-            yield Crew(executor, self.workers, lambda: True)
+            yield WorkerPool(executor, self.workers, lambda: True)
         finally:
             executor.shutdown(cancel_futures=True)
 
@@ -57,7 +57,7 @@ class Processes:
     workers: int
 
     @contextmanager
-    def engaged(self) -> Iterator[Crew]:
+    def start_pool(self) -> Iterator[WorkerPool]:
         """Until the block ends.
 
         Raises:
@@ -76,9 +76,9 @@ class Processes:
                 dashboard_address=None,
                 scheduler_kwargs={"dashboard": False, "dashboard_address": f"{HERE}:0"},
             ) as cluster,
-            _client(distributed, cluster.scheduler_address, self.workers) as crew,
+            _client(distributed, cluster.scheduler_address, self.workers) as pool,
         ):
-            yield crew
+            yield pool
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +94,18 @@ class Scheduler:
     workers: int | None
 
     @contextmanager
-    def engaged(self) -> Iterator[Crew]:
+    def start_pool(self) -> Iterator[WorkerPool]:
         """Until the block ends; the scheduler and its workers go on.
 
         Raises:
             ConfigurationMissing: dask.distributed is not installed.
             UsageError: nobody answers at the address, or it has no workers.
         """
-        with _client(dask_distributed(), self.address, self.workers) as crew:
-            yield crew
+        with _client(dask_distributed(), self.address, self.workers) as pool:
+            yield pool
 
 
-def crew_of(scheduler: str, workers: int | None) -> Threads | Processes | Scheduler:
+def worker_pool(scheduler: str, workers: int | None) -> Threads | Processes | Scheduler:
     """Who is meant by --scheduler and --workers.
 
     Args:
@@ -148,7 +148,7 @@ def dask_distributed() -> Any:
 
 
 @contextmanager
-def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Crew]:
+def _client(distributed: Any, address: str, workers: int | None) -> Iterator[WorkerPool]:
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -169,6 +169,6 @@ def _client(distributed: Any, address: str, workers: int | None) -> Iterator[Cre
             )
         executor = client.get_executor(pure=False)
         try:
-            yield Crew(executor, workers or threads, lambda: bool(client.nthreads()))
+            yield WorkerPool(executor, workers or threads, lambda: bool(client.nthreads()))
         finally:
             executor.shutdown(wait=False)

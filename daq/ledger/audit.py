@@ -51,8 +51,8 @@ __all__ = [
     "OpenWrite",
     "append",
     "digest_now",
+    "find_write_entry",
     "read",
-    "told_of",
     "verify",
 ]
 
@@ -122,7 +122,7 @@ def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
     return judge(_content(path), digest_now, heads)
 
 
-def told_of(path: Path, subject: str, sha256_after: str) -> str | None:
+def find_write_entry(path: Path, subject: str, sha256_after: str) -> str | None:
     """SHA-256 of the newest entry about a write of that content, None where none tells of it.
 
     Args:
@@ -133,10 +133,10 @@ def told_of(path: Path, subject: str, sha256_after: str) -> str | None:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    told = [
+    digests = [
         one.sha256 for one in read(path) if (one.subject, one.details.get("sha256_after")) == (subject, sha256_after)
     ]
-    return told[-1] if told else None
+    return digests[-1] if digests else None
 
 
 def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
@@ -244,7 +244,7 @@ _Done = TypeVar("_Done")
 
 
 @dataclass(frozen=True, slots=True)
-class Chronicle:
+class AuditRecorder:
     """Where writes are written down, and in whose name.
 
     Attributes:
@@ -257,7 +257,7 @@ class Chronicle:
     who: str
     at: datetime
 
-    def of_write(
+    def record_write(
         self,
         begun: AuditAction,
         ended: AuditAction,
@@ -295,27 +295,27 @@ class Chronicle:
             found = {"begun": entry.number, "error": _said(error), "sha256_found": digest_now(str(target))}
             self._end(self.audit, AuditAction.FAILED, target, found)
             raise
-        told = self._end(self.audit, ended, target, {"begun": entry.number})
-        return done, (told or entry).sha256
+        end_entry = self._end(self.audit, ended, target, {"begun": entry.number})
+        return done, (end_entry or entry).sha256
 
-    def refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
+    def record_refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
         """Somebody asked for a write, and gates were closed."""
-        told = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
-        self._refused(target, {"refusals": told, **details})
+        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
+        self._refused(target, {"refusals": listed, **details})
 
-    def nothing_to_do(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
+    def record_no_change(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
         """Somebody asked for a write of what stands there already."""
         if self.audit is not None:
             self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": sha256(content), **details})
 
     @contextlib.contextmanager
-    def of_question(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
+    def record_refusal_of(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
         """Around what is asked of a file before it is written; a no is written down."""
         try:
             yield
         except CalibrationRefused as error:
-            told = {"gate": "file", "subject": error.subject, "found": error.found}
-            self._refused(target, {"refusals": [told], **details})
+            documented = {"gate": "file", "subject": error.subject, "found": error.found}
+            self._refused(target, {"refusals": [documented], **details})
             raise
 
     def _refused(self, target: Path, details: Mapping[str, object]) -> None:

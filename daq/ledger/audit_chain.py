@@ -286,19 +286,19 @@ class _Chain:
         self._settle(one)
         place = index + 1
         if not one.holds:
-            self._tell(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
+            self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
             self.number, self.previous, self.place = self.number + 1, None, place
             return
         if one.number < self.number:
             twice = self.numbers[one.number] > 1
             says = f"entry {one.number} {'is there more than once' if twice else 'stands after a later one'}"
-            self._tell(place, Flaw.ADDED if twice else Flaw.MOVED, says)
+            self._add_flaw(place, Flaw.ADDED if twice else Flaw.MOVED, says)
             return
         if one.number > self.number:
             self._jumped(place, one.number)
         elif self.previous is not None and one.previous != self.previous:
             says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
-            self._tell(self.place, Flaw.EDITED, says)
+            self._add_flaw(self.place, Flaw.EDITED, says)
         self.number, self.previous, self.place = one.number + 1, one.sha256, place
 
     def end(self) -> None:
@@ -308,15 +308,15 @@ class _Chain:
     def _settle(self, follower: AuditEntry | None) -> None:
         """Lines that are no entries: left by a killed writer, or made so by somebody."""
         fragments = [self.lines[index] for index in self.unfinished]
-        told = follower is not None and follower.action is AuditAction.TORN_LINE
-        if follower is not None and told and follower.details != torn_details(fragments):
+        is_torn = follower is not None and follower.action is AuditAction.TORN_LINE
+        if follower is not None and is_torn and follower.details != torn_details(fragments):
             says = f"entry {follower.number} tells of an unfinished line that is not there as it was"
-            self._tell(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
-        elif told or (follower is None and all(map(is_fragment, fragments))):
+            self._add_flaw(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
+        elif is_torn or (follower is None and all(map(is_fragment, fragments))):
             self.torn += [index + 1 for index in self.unfinished]
         else:
             for index in self.unfinished:
-                self._tell(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
+                self._add_flaw(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
             if fragments:
                 self.number, self.previous = self.number + len(fragments), None
         self.unfinished = []
@@ -326,11 +326,11 @@ class _Chain:
         gone = [each for each in missing if each not in self.numbers]
         if gone:
             which = f"entry {gone[0]} is" if len(gone) == 1 else f"entries {gone[0]} to {gone[-1]} are"
-            self._tell(place, Flaw.REMOVED, f"{which} missing before entry {number}")
+            self._add_flaw(place, Flaw.REMOVED, f"{which} missing before entry {number}")
         else:
-            self._tell(place, Flaw.MOVED, f"entry {number} stands before entry {missing[0]}")
+            self._add_flaw(place, Flaw.MOVED, f"entry {number} stands before entry {missing[0]}")
 
-    def _tell(self, line: int, flaw: Flaw, says: str) -> None:
+    def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
         self.flaws.append(AuditFlaw(line, flaw, says))
 
 
@@ -357,5 +357,5 @@ def _content_after(begun: AuditEntry, later: Sequence[AuditEntry], digest_now: C
 
 def _digest_before(begun: AuditEntry) -> str | None:
     """Of the file when the write began, or that there was none; None where the entry does not tell."""
-    told = begun.details.get("sha256_before", 0)
-    return GONE if told is None else told if isinstance(told, str) else None
+    recorded = begun.details.get("sha256_before", 0)
+    return GONE if recorded is None else recorded if isinstance(recorded, str) else None

@@ -16,7 +16,7 @@ from daq.workflow.calibration_file import decode
 from ident.calibration import Calibration, Gain, Source
 
 
-class Deed(Enum):
+class WriteAction(Enum):
     """What was done to a controller."""
 
     APPLIED = "applied"
@@ -39,7 +39,7 @@ class Event:
     """
 
     digest: str | None
-    deed: Deed
+    action: WriteAction
     at: datetime
     who: str
     target: str
@@ -111,9 +111,9 @@ class Acknowledgement:
 
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
     """When the newest log of a fit was recorded, UTC; `otherwise` where none tells."""
-    told = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
+    times_s = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
     try:
-        return datetime.fromtimestamp(max(seconds for seconds in told if seconds is not None), UTC)
+        return datetime.fromtimestamp(max(seconds for seconds in times_s if seconds is not None), UTC)
     except (ValueError, OverflowError, OSError):
         return otherwise.astimezone(UTC)
 
@@ -182,7 +182,7 @@ GAIN_COLUMNS = ("axis", "value", "std", "unit", "nameplate")
 def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
     """What the row of a calibration says, besides digest and document."""
     holdout, created = calibration.holdout_error_percent, utc(calibration.created, entered)
-    told = (
+    values = (
         iso(created),
         iso(recorded_at(calibration, created)),
         logs_of(calibration, digest),
@@ -195,7 +195,7 @@ def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict
         None if holdout is None else holdout.total,
         calibration.rows,
     )
-    return dict(zip(COLUMNS, told, strict=True))
+    return dict(zip(COLUMNS, values, strict=True))
 
 
 def gain_columns_of(calibration: Calibration) -> list[dict[str, object]]:
@@ -218,22 +218,22 @@ def calibration_flaws(calibrations: Sequence[tuple[Any, ...]], gains: Sequence[t
         rows_of.setdefault(digest, []).append(tuple(gain))
     for digest, document, *columns in calibrations:
         name = f"calibration {digest[:12]}…"
-        stands = dict(zip(COLUMNS, columns, strict=True))
-        entered = zoned(stands["entered"])
+        found_row = dict(zip(COLUMNS, columns, strict=True))
+        entered = zoned(found_row["entered"])
         try:
             calibration = decode(document.encode(), f"document of {name}")
         except DaqError as error:
             yield f"{name}: its document is {error.found}, expected {error.expected}"
             continue
-        yield from _differences(f"row of {name}", stands, columns_of(calibration, digest, entered))
+        yield from _differences(f"row of {name}", found_row, columns_of(calibration, digest, entered))
         expected = gain_columns_of(calibration)
         rows = [dict(zip(GAIN_COLUMNS, row, strict=True)) for row in rows_of.get(digest, [])]
         axes, wanted = ([row["axis"] for row in some] for some in (rows, expected))
         if axes != wanted:
             yield f"gains of {name}: found {_listed(axes)}, expected {_listed(wanted)} as its document says"
             continue
-        for row, told in zip(rows, expected, strict=True):
-            yield from _differences(f"gain of {row['axis']} in {name}", row, told)
+        for row, expected_row in zip(rows, expected, strict=True):
+            yield from _differences(f"gain of {row['axis']} in {name}", row, expected_row)
 
 
 def gap_flaws(table: str, there: set[int], last: int) -> Iterator[str]:
@@ -259,12 +259,12 @@ def early_flaws(acknowledgements: Iterable[Acknowledgement]) -> Iterator[str]:
             )
 
 
-def _differences(name: str, stands: dict[str, Any], expected: dict[str, Any]) -> Iterator[str]:
-    for column, told in expected.items():
+def _differences(name: str, found_row: dict[str, Any], expected: dict[str, Any]) -> Iterator[str]:
+    for column, expected_value in expected.items():
         # SQLite has no NaN: it keeps NULL.
-        wanted = None if isinstance(told, float) and math.isnan(told) else told
-        if stands[column] != wanted:
-            yield f"{name}: found {column} {stands[column]!r}, expected {wanted!r} as its document says"
+        wanted = None if isinstance(expected_value, float) and math.isnan(expected_value) else expected_value
+        if found_row[column] != wanted:
+            yield f"{name}: found {column} {found_row[column]!r}, expected {wanted!r} as its document says"
 
 
 def _listed(names: Iterable[object]) -> str:

@@ -24,9 +24,9 @@ from daq.ledger.entry import (
     COLUMNS,
     GAIN_COLUMNS,
     Acknowledgement,
-    Deed,
     Entry,
     Event,
+    WriteAction,
     calibration_flaws,
     columns_of,
     early_flaws,
@@ -63,7 +63,7 @@ def connect(path: Path, access: Access) -> sqlite3.Connection:
         HistoryUnreadable: it is none, of another version, broken, or locked for long.
         OutputFailed: there is none, and none can be made.
     """
-    with telling(path, access):
+    with translate_sqlite_errors(path, access):
         address = f"file:{quote(os.fsencode(path.absolute()))}?mode={access.value}"
         connection = sqlite3.connect(address, uri=True, timeout=BUSY_S, isolation_level=None)
         try:
@@ -86,7 +86,7 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
     Raises:
         HistoryUnreadable, OutputFailed: see `connect`.
     """
-    with telling(path, Access.WRITE):
+    with translate_sqlite_errors(path, Access.WRITE):
         connection.execute("BEGIN IMMEDIATE")
         try:
             if schema.is_empty(connection):
@@ -100,7 +100,7 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def telling(path: Path, access: Access) -> Iterator[None]:
+def translate_sqlite_errors(path: Path, access: Access) -> Iterator[None]:
     """What SQLite raises, in our words.
 
     Raises:
@@ -226,7 +226,7 @@ class HistoryStore:
         with self._writing() as connection:
             if not connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
                 raise ValueError(f"calibration {digest[:12]}… is not in the history")
-            self._note(connection, Event(digest, Deed.APPLIED, at, who, target, audit, sha256_after))
+            self._note(connection, Event(digest, WriteAction.APPLIED, at, who, target, audit, sha256_after))
 
     def rolled_back(
         self, *, at: datetime, who: str, target: str, sha256_after: str, audit: str | None = None
@@ -244,7 +244,7 @@ class HistoryStore:
         with self._writing() as connection:
             same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
             digest = same[-1].digest if same else None
-            self._note(connection, Event(digest, Deed.ROLLED_BACK, at, who, target, audit, sha256_after))
+            self._note(connection, Event(digest, WriteAction.ROLLED_BACK, at, who, target, audit, sha256_after))
         return digest
 
     def acknowledge(self, noted: Acknowledgement) -> None:
@@ -265,19 +265,19 @@ class HistoryStore:
         gains: dict[str, list[Gain]] = {}
         for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
             gains.setdefault(digest, []).append(Gain(*gain))
-        with telling(self.path, Access.READ):
+        with translate_sqlite_errors(self.path, Access.READ):
             return tuple(_entry(row, gains.get(row[0], []), events) for row in rows)
 
     def events(self) -> tuple[Event, ...]:
         """All writes to controllers, oldest first."""
         rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
-        with telling(self.path, Access.READ):
-            return tuple(Event(row[0], Deed(row[1]), zoned(row[2]), *row[3:]) for row in rows)
+        with translate_sqlite_errors(self.path, Access.READ):
+            return tuple(Event(row[0], WriteAction(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """All of them, oldest first."""
         rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
-        with telling(self.path, Access.READ):
+        with translate_sqlite_errors(self.path, Access.READ):
             return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def audited(self) -> frozenset[str]:
@@ -316,7 +316,7 @@ class HistoryStore:
             f"SELECT digest, document, {', '.join(COLUMNS)} FROM calibration ORDER BY created, digest"
         )
         gains = self._rows(f"SELECT digest, {', '.join(GAIN_COLUMNS)} FROM gain ORDER BY digest, place")
-        with telling(self.path, Access.READ):
+        with translate_sqlite_errors(self.path, Access.READ):
             return (
                 *calibration_flaws(calibrations, gains),
                 *(flaw for table in ("event", "acknowledgement") for flaw in gap_flaws(table, *self._numbers(table))),
@@ -361,7 +361,7 @@ class HistoryStore:
             "INSERT INTO event (digest, deed, at, who, target, audit, sha256_after) VALUES (?, ?, ?, ?, ?, ?, ?)",
             (
                 event.digest,
-                event.deed.value,
+                event.action.value,
                 iso(event.at),
                 event.who,
                 event.target,
@@ -373,7 +373,7 @@ class HistoryStore:
     def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         if self._connection is None:
             return []
-        with telling(self.path, Access.READ):
+        with translate_sqlite_errors(self.path, Access.READ):
             if schema.is_empty(self._connection):
                 return []
             return self._connection.execute(query, values).fetchall()

@@ -10,11 +10,11 @@ from datetime import UTC, datetime
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.ledger.audit import AuditAction, AuditEntry, verify
-from daq.ledger.entry import Acknowledgement, Deed, Event, iso, utc
+from daq.ledger.entry import Acknowledgement, Event, WriteAction, iso, utc
 from daq.ledger.store import HistoryStore
 from daq.writeback.drive_proposal import drives_of
 
-_ENDS = {AuditAction.APPLIED: Deed.APPLIED, AuditAction.ROLLED_BACK: Deed.ROLLED_BACK}
+_ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
 _BEGINS = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
 _NEVER = datetime.min.replace(tzinfo=UTC)
 
@@ -32,7 +32,7 @@ class AuditedWrite:
     ended: AuditEntry
 
     @property
-    def deed(self) -> Deed:
+    def action(self) -> WriteAction:
         """What was done."""
         return _ENDS[self.ended.action]
 
@@ -44,8 +44,8 @@ class AuditedWrite:
     @property
     def cell(self) -> str | None:
         """Name of the cell whose calibration was written, None where the audit does not tell."""
-        told = None if self.begun is None else self.begun.details.get("calibration")
-        found = told.get("cell") if isinstance(told, dict) else None
+        recorded = None if self.begun is None else self.begun.details.get("calibration")
+        found = recorded.get("cell") if isinstance(recorded, dict) else None
         return found if isinstance(found, str) else None
 
     @property
@@ -84,7 +84,7 @@ def writes_to(cell: Cell, entries: Sequence[AuditEntry]) -> list[AuditedWrite]:
         if one.action not in _ENDS or one.subject not in targets:
             continue
         write = AuditedWrite(begun.get(_number(one)), one)
-        if write.deed is Deed.APPLIED:
+        if write.action is WriteAction.APPLIED:
             owners[one.subject] = write.cell or cell.name
         if owners.get(one.subject, cell.name) == cell.name:
             found.append(write)
@@ -134,11 +134,14 @@ def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[Audi
     known, stopped, entered = {entry.digest for entry in store.entries()}, set[str](), []
     for write in new:
         one, after = write.ended, write.sha256_after
-        at, can = at_of(one), after is not None and (write.deed is Deed.ROLLED_BACK or write.calibration in known)
+        at, can = (
+            at_of(one),
+            after is not None and (write.action is WriteAction.ROLLED_BACK or write.calibration in known),
+        )
         if one.subject in stopped or at is None or after is None or not can:
             stopped.add(one.subject)
             continue
-        if write.deed is Deed.ROLLED_BACK:
+        if write.action is WriteAction.ROLLED_BACK:
             store.rolled_back(at=at, who=one.who, target=one.subject, sha256_after=after, audit=one.sha256)
         else:
             digest = write.calibration or ""
@@ -178,8 +181,8 @@ def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) 
     named = f"as entry {entry.number} of the audit, which it names"
     begun = next((one for one in entries if one.number == _number(entry)), entry) if entry.action in _ENDS else entry
     after = _text(begun, "sha256_after")
-    if entry.action in _ENDS and _ENDS[entry.action] is not event.deed:
-        yield f"found {event.deed.value}, expected {entry.action.value} {named}"
+    if entry.action in _ENDS and _ENDS[entry.action] is not event.action:
+        yield f"found {event.action.value}, expected {entry.action.value} {named}"
     if event.target != entry.subject:
         yield f"found target {event.target}, expected {entry.subject} {named}"
     if after is not None and event.sha256_after is not None and event.sha256_after != after:
@@ -199,7 +202,7 @@ def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) ->
     Such an event names the entry of the begin, and another entry of the audit tells of whoever entered it: `nothing to
     do` of the same time, or the job around it.
     """
-    if entry.action in _ENDS or event.deed is not Deed.APPLIED:
+    if entry.action in _ENDS or event.action is not WriteAction.APPLIED:
         return False
     begun_at: datetime | None = None
     for one in entries:
@@ -252,6 +255,6 @@ def _number(entry: AuditEntry) -> int:
 
 
 def _calibration(begun: AuditEntry) -> str | None:
-    told = begun.details.get("calibration")
-    found = told.get("sha256") if isinstance(told, dict) else None
+    recorded = begun.details.get("calibration")
+    found = recorded.get("sha256") if isinstance(recorded, dict) else None
     return found if isinstance(found, str) else None

@@ -240,7 +240,7 @@ _SEVERAL = (
 )
 
 
-def alarm_words(series: Series) -> str | None:
+def alarm_text(series: Series) -> str | None:
     """`gain of J4 fell 6.0 % since 2026-03-02, 5.1 σ`; None where the newest calibration raises no alarm."""
     drift, onset = series.drift, series.onset
     if drift is None or drift.alarm is None or onset is None:
@@ -250,12 +250,12 @@ def alarm_words(series: Series) -> str | None:
     moved = "rose" if rose else "fell"
     match drift.alarm.kind:
         case AlarmKind.DRIFT:
-            told = f"{moved} {percent} {since}"
+            sentence = f"{moved} {percent} {since}"
         case AlarmKind.JUMP:
-            told = f"{moved} {percent} at once, {since}"
+            sentence = f"{moved} {percent} at once, {since}"
         case AlarmKind.TREND:
-            told = f"{'rises' if rose else 'falls'} steadily {since}, {percent} until now"
-    return f"gain of {series.axis} {told}, {sigmas}"
+            sentence = f"{'rises' if rose else 'falls'} steadily {since}, {percent} until now"
+    return f"gain of {series.axis} {sentence}, {sigmas}"
 
 
 def pattern_of(all_series: Sequence[Series]) -> Pattern:

@@ -14,7 +14,7 @@ from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.message import Readback
-from daq.log.reader import Log, LossyLogs, SampleBlock, read_log, tells_losses_alone
+from daq.log.reader import Log, LossyLogs, SampleBlock, read_log, reports_only_losses
 from drivers.stream.sample import CellEvent, EventKind
 from ident.data.run import Recording, Run
 from ident.model.bodies import Payload
@@ -142,8 +142,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         LogIncomplete: cell and log do not belong together.
     """
     name, samples, rate_hz = log.path.stem, log.samples, log.head.run.rate_hz
-    told = tells_losses_alone(log.statistics.reason)
-    accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and told
+    only_losses = reports_only_losses(log.statistics.reason)
+    accepted = lossy is LossyLogs.ACCEPTED and not log.statistics.valid and only_losses
     if accepted:
         _LOG.warning(
             "%s has lost %s: its samples are left out, and nothing of it is written back",
@@ -155,7 +155,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             str(log.path),
             found=f"a run that its recorder marked invalid ({log.statistics.reason or 'no reason given'})",
             expected="a valid run",
-            remedy="record it again" + ("; or, to look at it all the same, --accept-losses" if told else ""),
+            remedy="record it again" + ("; or, to look at it all the same, --accept-losses" if only_losses else ""),
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)

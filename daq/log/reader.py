@@ -313,7 +313,7 @@ class LossyLogs(Enum):
     ACCEPTED = "accepted"
 
 
-def tells_losses_alone(reason: str) -> bool:
+def reports_only_losses(reason: str) -> bool:
     """Whether the reason of an invalid run speaks of MASKED losses and of nothing else.
 
     Doubles, frames that nobody asked for and periods without SYNC are not among them: they say that the recorder did

@@ -97,16 +97,16 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
 def _copy(
     reader: LogReader, blocks: Iterable[SampleBlock], log: LogWriter, axes: int, progress: Callable[[int], None]
 ) -> None:
-    told = 0
+    known_events = 0
     for block in blocks:
         _check_width(reader.path, block, axes)
-        for event in reader.events[told:]:
+        for event in reader.events[known_events:]:
             log.event(event)
-        told = len(reader.events)
+        known_events = len(reader.events)
         for sample in _samples(block):
             log.write(sample)
         progress(log.statistics.samples)
-    for event in reader.events[told:]:
+    for event in reader.events[known_events:]:
         log.event(event)
     log.conclude(*_verdict(reader, log.statistics), partial=True)
 
@@ -123,11 +123,11 @@ def _verdict(reader: LogReader, counted: RunStatistics) -> tuple[bool, str]:
         return reader.statistics.valid, reader.statistics.reason
     found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
     found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
-    found += [_told(event) for event in reader.events if event.kind not in _HARMLESS][:3]
+    found += [_event_text(event) for event in reader.events if event.kind not in _HARMLESS][:3]
     return not found, ", ".join(found)
 
 
-def _told(event: CellEvent) -> str:
+def _event_text(event: CellEvent) -> str:
     return f"{event.kind.value} ({event.text})"
 
 

@@ -199,15 +199,15 @@ class LogWriter:
     @property
     def statistics(self) -> RunStatistics:
         """So far."""
-        told = self._verdict
+        verdict = self._verdict
         return RunStatistics(
             samples=self._samples,
             lost_cycles=self._lost,
             missing=tuple(self._missing),
-            valid=told.valid,
-            reason=told.reason,
-            partial=told.partial,
-            wall_minus_monotonic_ns=told.wall_minus_monotonic_ns,
+            valid=verdict.valid,
+            reason=verdict.reason,
+            partial=verdict.partial,
+            wall_minus_monotonic_ns=verdict.wall_minus_monotonic_ns,
         )
 
     def flush(self) -> None:

@@ -42,16 +42,16 @@ def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
     return f"{placed.effect.name} on {axes[placed.axis]}{pair}"
 
 
-def in_words(effect: Effect, axes: tuple[str, ...]) -> str:
+def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """What an axis has, to follow "J3 has": `friction that grows with the load`."""
     if is_unnamed(effect):
-        return f"a torque that depends on {variable_words(effect, axes)} and that no named effect explains"
+        return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
     words = WORDS.get(effect.name, f"the effect {effect.name!r}")
     other = other_axis(effect)
     return words if other is None else words.replace("another joint", axes[other])
 
 
-def variable_words(effect: Effect, axes: tuple[str, ...]) -> str:
+def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """The variable that shows an effect, without its unit: `the joint position`."""
     other = other_axis(effect)
     if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:

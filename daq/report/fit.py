@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 
 from daq.config.cell import MILLIMETRE, Cell, JointUnit
-from daq.report.effect_names import in_words, other_axis, variable_words
+from daq.report.effect_names import effect_text, other_axis, variable_text
 from daq.report.gains import plot_gains
 from daq.report.picture import BLACK, QUANTITY, SKY, FloatArray, legend_below, panels, save_png, thinned, unformatted
 from daq.report.residual_plots import plot_residual
@@ -159,7 +159,7 @@ def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: Pl
         variable=variable,
         variable_label=_label(placed, cell.axis_names, unit),
         velocity_rad_s=velocity,
-        title=f"{name}: {in_words(placed.effect, cell.axis_names)}, run {data.name}",
+        title=f"{name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
         force=unit.force,
     )
 
@@ -168,7 +168,7 @@ def _label(placed: PlacedEffect, axes: tuple[str, ...], unit: JointUnit) -> str:
     """The variable with its unit at this joint: what acts on a prismatic one is a force, and its position is in m."""
     abscissa = placed.effect.abscissa
     words, _, measure = abscissa.value.partition(" [")
-    label = f"{variable_words(placed.effect, axes) if other_axis(placed.effect) is not None else words} [{measure}"
+    label = f"{variable_text(placed.effect, axes) if other_axis(placed.effect) is not None else words} [{measure}"
     if unit is not MILLIMETRE or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
         return label
     return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
@@ -220,7 +220,7 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
 # What the data of a fit cannot tell, and by what they tell each gain, in words.
 
 
-def cannot_tell(fitted: Fit) -> tuple[str, ...]:
+def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
     """What no residual of these data could show, in words."""
     if fitted.final.estimate.gains_fixed:
         return ()
@@ -314,15 +314,15 @@ def comparison_document(comparison: Comparison, axes: tuple[str, ...]) -> list[d
 
 
 def _trial(trial: Trial, axes: tuple[str, ...]) -> dict[str, Any]:
-    told: dict[str, Any] = {
+    document: dict[str, Any] = {
         "estimator": trial.estimator,
         "position_cutoff_hz": trial.position_cutoff_hz,
         "decimation_cutoff_hz": trial.decimation_cutoff_hz,
     }
     if trial.gains is None or trial.std is None:
-        return {**told, "gains": None, "reason": trial.reason}
+        return {**document, "gains": None, "reason": trial.reason}
     gains = [
         {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
         for axis, value, std in zip(axes, trial.gains, trial.std, strict=True)
     ]
-    return {**told, "gains": gains, "relative_error_percent": trial.relative_error_percent}
+    return {**document, "gains": gains, "relative_error_percent": trial.relative_error_percent}

@@ -13,39 +13,39 @@ from rich.table import Table
 from daq.cli.verb import printable
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
-from daq.ledger.entry import Deed, Entry, Event
+from daq.ledger.entry import Entry, Event, WriteAction
 from daq.ledger.store import HistoryStore
-from daq.ledger.watch import Point, Series, alarm_words, pattern_of, questions
+from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.history import rows
 from daq.writeback.drive_proposal import drives_of
-from daq.writeback.file_access import followed
+from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
-from daq.writeback.formats.scalar import Scalar, respell
+from daq.writeback.formats.scalar import Scalar, rewrite_gain
 from ident.drift.chart import CHART
 
 
-def show(entries: Sequence[Entry], all_series: Sequence[Series], deeds: Mapping[str, str], console: Console) -> None:
+def show(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
     """The calibrations, a line each, with what was done with each by its digest; then each gain as it is now."""
     if not entries:
         console.print("The history is empty: no calibration was applied or entered yet.")
         console.print("To enter one: drivegain history CELL --add CALIBRATION")
         return
-    console.print(calibration_table(entries, all_series, deeds))
+    console.print(calibration_table(entries, all_series, actions))
     console.print()
     console.print(gain_table(all_series))
     say_alarms(all_series, console)
 
 
-def show_axis(series: Series, all_series: Sequence[Series], deeds: Mapping[str, str], console: Console) -> None:
+def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
     """Every calibration of one gain."""
-    console.print(axis_table(series, deeds))
+    console.print(axis_table(series, actions))
     for noted in series.acknowledged:
         console.print(
             f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
             f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
         )
-    words = alarm_words(series)
+    words = alarm_text(series)
     if words is not None:
         say_alarms(all_series, console)
     elif series.drift is not None:
@@ -54,7 +54,7 @@ def show_axis(series: Series, all_series: Sequence[Series], deeds: Mapping[str, 
 
 def say_alarms(all_series: Sequence[Series], console: Console) -> None:
     """What changed, and what it may come from."""
-    alarms = [words for series in all_series if (words := alarm_words(series)) is not None]
+    alarms = [words for series in all_series if (words := alarm_text(series)) is not None]
     console.print("No alarm." if not alarms else "")
     for words in alarms:
         console.print(f"ALARM: {words}", style="bold")
@@ -64,7 +64,7 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
         console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
 
 
-def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], deeds: Mapping[str, str]) -> Table:
+def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]) -> Table:
     """One row a calibration."""
     table = _table("recorded (UTC)", "calibration")
     table.add_column("error %", justify="right", no_wrap=True)
@@ -86,7 +86,7 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], de
             f"{error:.2f}",
             _largest([point for _, _, point in points]),
             ", ".join(alarms) or "-",
-            printable(deeds[entry.digest]),
+            printable(actions[entry.digest]),
         )
     return table
 
@@ -119,7 +119,7 @@ def gain_table(all_series: Sequence[Series]) -> Table:
     return table
 
 
-def axis_table(series: Series, deeds: Mapping[str, str]) -> Table:
+def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
     """Every calibration of one gain, with the two sums and the slope that are watched."""
     table = _table("recorded (UTC)")
     headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
@@ -140,7 +140,7 @@ def axis_table(series: Series, deeds: Mapping[str, str]) -> Table:
             f"{stretch.drift.lower[place]:.1f}",
             f"{stretch.drift.trend[place]:+.1f}",
             "-" if alarm is None else alarm.kind.value,
-            printable(deeds[point.entry.digest]),
+            printable(actions[point.entry.digest]),
         )
     return table
 
@@ -172,7 +172,7 @@ def describe(
                 "unit": series.unit,
                 "dispersion": series.dispersion,
                 "alarmed": series.alarmed,
-                "alarm": alarm_words(series),
+                "alarm": alarm_text(series),
                 "since": None if series.onset is None else series.onset.isoformat(),
                 "change_percent": None if series.drift is None else series.drift.change_percent,
                 "change_sigmas": None if series.drift is None else series.drift.change_sigmas,
@@ -197,10 +197,10 @@ def _table(*first: str) -> Table:
 
 
 def _largest(points: Sequence[Point]) -> str:
-    told = [(abs(point.change.sigmas), point) for point in points if point.change is not None]
-    if not told:
+    changes = [(abs(point.change.sigmas), point) for point in points if point.change is not None]
+    if not changes:
         return "-"
-    sigmas, point = max(told, key=lambda pair: pair[0])
+    sigmas, point = max(changes, key=lambda pair: pair[0])
     percent = 0.0 if point.change is None else point.change.percent
     return f"{printable(point.gain.axis)} {percent:+.1f} % {sigmas:.1f} σ"
 
@@ -208,7 +208,7 @@ def _largest(points: Sequence[Point]) -> str:
 # What was done with each calibration, in words, and which one's gains the controller has now.
 
 
-_WORDS = {Deed.APPLIED: "applied", Deed.ROLLED_BACK: "restored"}
+_WORDS = {WriteAction.APPLIED: "applied", WriteAction.ROLLED_BACK: "restored"}
 """Of an event after which a controller had the gains of a calibration."""
 
 
@@ -228,7 +228,7 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
     if file is None or not controller.gains:
         return store.in_force(drives_of(cell.name)) if controller.objects else None
     try:
-        target = str(followed(file))
+        target = str(resolve_links(file))
         scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.gains)
     except (ControllerUnfit, OSError):
         return None
@@ -241,7 +241,7 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
     return next((digest for digest in (*order, *having) if digest in having), None)
 
 
-def deed_words(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
+def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
     """What was done with each calibration, by its digest.
 
     Args:
@@ -254,16 +254,16 @@ def deed_words(entries: Sequence[Entry], events: Sequence[Event], digest_in_forc
 
 def _words(digest: str, events: Sequence[Event], digest_in_force: str | None) -> str:
     mine = [place for place, event in enumerate(events) if event.digest == digest]
-    told = []
+    parts = []
     if mine:
         last = events[mine[-1]]
-        told.append(f"{_WORDS[last.deed]} by {last.who}")
+        parts.append(f"{_WORDS[last.action]} by {last.who}")
         then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
-        if then is not None and then.deed is Deed.ROLLED_BACK:
-            told.append(f"taken back by {then.who}")
+        if then is not None and then.action is WriteAction.ROLLED_BACK:
+            parts.append(f"taken back by {then.who}")
     if digest == digest_in_force:
-        told.append("in force")
-    return ", ".join(told) or "-"
+        parts.append("in force")
+    return ", ".join(parts) or "-"
 
 
 def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
@@ -276,7 +276,7 @@ def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
         if not (math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value):
             return False
         try:
-            put = respell(scalar, gain.value, gain.std, factor)
+            put = rewrite_gain(scalar, gain.value, gain.std, factor)
         except ControllerUnfit:
             return False
         if put.new != put.old:

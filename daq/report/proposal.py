@@ -35,8 +35,8 @@ def show_changes(
     exact = [change.axis for change in changes if not known.stds.get(change.axis)]
     whose = "all axes" if len(exact) == len(changes) else ", ".join(exact)
     taken = f"the number {place} taken as exact ({whose})" if exact else "σ of both"
-    told = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
-    console.print(terminal_text(told), style="dim")
+    note = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
+    console.print(terminal_text(note), style="dim")
     console.print()
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from daq.report.effect_names import in_words, is_unnamed, placed_name
+from daq.report.effect_names import effect_text, is_unnamed, placed_name
 from daq.report.fit import coefficients
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
@@ -43,16 +43,16 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
         if placed in kept
     )
     if not found:
-        error, where = least_seen(account.total.after)
+        error, where = strictest_error(account.total.after)
         return (
             f"No structure found: the error {where} is {error.total:.1f} %{_of_all(account)}.",
             _silence(fitted),
             *_skew_sentence(fitted),
         )
-    (before, _), (after, where) = least_seen(account.total.before), least_seen(account.total.after)
+    (before, _), (after, where) = strictest_error(account.total.before), strictest_error(account.total.after)
     return (
         *found,
-        f"All axes together: the error {where} {fell(before.total, after.total)}{_of_all(account)}.",
+        f"All axes together: the error {where} {error_change_text(before.total, after.total)}{_of_all(account)}.",
         *(() if fitted.final.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
         _silence(fitted),
         *_skew_sentence(fitted),
@@ -96,12 +96,12 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     )
 
 
-def spelt(percent: float) -> str:
+def percent_text(percent: float) -> str:
     """Two decimals; a dash for what is not known."""
     return f"{percent:.2f}" if math.isfinite(percent) else "-"
 
 
-def least_seen(errors: Errors) -> tuple[RelativeError, str]:
+def strictest_error(errors: Errors) -> tuple[RelativeError, str]:
     """The error that has seen least of what it is measured on, and on what that was."""
     if errors.holdout is not None:
         return errors.holdout, "on runs that were not used"
@@ -110,7 +110,7 @@ def least_seen(errors: Errors) -> tuple[RelativeError, str]:
     return errors.cross_validated, "on moves left out in turn"
 
 
-def fell(before_percent: float, after_percent: float) -> str:
+def error_change_text(before_percent: float, after_percent: float) -> str:
     """`falls from 6.9 to 2.8 %`; what rises is said to."""
     before, after = f"{before_percent:.1f}", f"{after_percent:.1f}"
     if before == after:
@@ -123,23 +123,24 @@ def _effect_sentence(
 ) -> str:
     axes = fitted.cell.axis_names
     name = axes[placed.axis]
-    (before, _), (after, where) = least_seen(turn.before), least_seen(turn.after)
+    (before, _), (after, where) = strictest_error(turn.before), strictest_error(turn.after)
     floor = _floor(account).axes[placed.axis]
-    told = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
+    floor_text = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
         excess = f" ({100.0 * share_of_excess:.0f} % of what the model leaves beyond noise)"
     if placed.effect.side is Side.ALL_MOTORS:
-        before_all, after_all = (least_seen(errors)[0].total for errors in (turn.before, turn.after))
-        return f"The recording has {in_words(placed.effect, axes)}: the error {where} {fell(before_all, after_all)}."
+        before_all, after_all = (strictest_error(errors)[0].total for errors in (turn.before, turn.after))
+        change = error_change_text(before_all, after_all)
+        return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."
     return (
-        f"{name} has {in_words(placed.effect, axes)}{excess}: the error of {name} {where} "
-        f"{fell(before.axes[placed.axis], after.axes[placed.axis])} ({told})."
+        f"{name} has {effect_text(placed.effect, axes)}{excess}: the error of {name} {where} "
+        f"{error_change_text(before.axes[placed.axis], after.axes[placed.axis])} ({floor_text})."
     )
 
 
 def _floor(account: Account) -> RelativeError:
-    """Of the rows that `least_seen` speaks of."""
+    """Of the rows that `strictest_error` speaks of."""
     return account.floor if account.holdout_floor is None else account.holdout_floor
 
 
@@ -149,14 +150,14 @@ def _of_all(account: Account) -> str:
 
 
 def _gains_sentence(axes: Sequence[str], changes: Sequence[GainChange]) -> str:
-    told = [
+    parts = [
         f"{axis} by {change.change_percent:+.1f} %"
         for axis, change in zip(axes, changes, strict=True)
         if change.significant
     ]
-    if not told:
+    if not parts:
         return "No drive gain changes by more than noise."
-    return f"Drive gains that change by more than noise: {', '.join(told)}."
+    return f"Drive gains that change by more than noise: {', '.join(parts)}."
 
 
 def _silence(fitted: Fit) -> str:

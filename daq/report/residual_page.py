@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from unicodedata import category
 
-from daq.report.effect_names import in_words, placed_name, variable_words
-from daq.report.fit import cannot_tell, coefficients, draw_effect, draw_torques, start_of
+from daq.report.effect_names import effect_text, placed_name, variable_text
+from daq.report.fit import coefficients, draw_effect, draw_torques, identifiability_notes, start_of
 from daq.report.gains import partial_note, plot_gain_changes, with_deviation
-from daq.report.residual_document import WHEN, ErrorRow, error_rows, spelt, summary
+from daq.report.residual_document import WHEN, ErrorRow, error_rows, percent_text, summary
 from daq.report.residual_plots import Bar, plot_ranking
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
@@ -171,7 +171,7 @@ def error_table(axes: tuple[str, ...], rows: tuple[ErrorRow, ...]) -> str:
     return table(
         "Relative error ‖e‖/‖v‖ [%]",
         ("", *axes, "total"),
-        [(name, *map(spelt, (*error.axes, error.total))) for name, error in rows],
+        [(name, *map(percent_text, (*error.axes, error.total))) for name, error in rows],
     )
 
 
@@ -199,7 +199,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         ("unused", turn.before.holdout, turn.after.holdout),
     )
     return section(
-        f"{axes[placed.axis]}: {in_words(placed.effect, axes)}",
+        f"{axes[placed.axis]}: {effect_text(placed.effect, axes)}",
         paragraph(
             f"Effect {placed_name(placed, axes)}"
             + (f" ({settings})." if settings else ".")
@@ -219,14 +219,14 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
             f"Relative error of {axes[placed.axis]} [%]",
             ("", *WHEN),
             [
-                (name, spelt(first.axes[placed.axis]), spelt(second.axes[placed.axis]))
+                (name, percent_text(first.axes[placed.axis]), percent_text(second.axes[placed.axis]))
                 for name, first, second in pairs
                 if first is not None and second is not None
             ],
         ),
         picture(
             draw_effect(None, before, step.after, placed, fitted.cell),
-            f"Residual of {axes[placed.axis]} over time and against {variable_words(placed.effect, axes)}, "
+            f"Residual of {axes[placed.axis]} over time and against {variable_text(placed.effect, axes)}, "
             "without and with the effect. A mean that still leaves zero is torque that the model still lacks.",
         ),
     )
@@ -295,7 +295,7 @@ def _finding_name(finding: Finding, axes: tuple[str, ...]) -> str:
 def _limits(fitted: Fit) -> tuple[str, ...]:
     held = fitted.final.estimate.gains_fixed
     return (
-        *cannot_tell(fitted),
+        *identifiability_notes(fitted),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
         *(("The gains were given: an error in them is hidden in the parameters.",) if held else ()),

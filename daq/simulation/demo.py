@@ -68,7 +68,7 @@ class Settings:
 
 
 @dataclass(frozen=True, slots=True)
-class Telling:
+class ProgressReporter:
     """Whom to tell what is being done.
 
     Attributes:
@@ -106,13 +106,13 @@ class Outcome:
     written: Written | None
 
 
-def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Telling) -> Outcome:
+def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> Outcome:
     """Scan, plan, record, identify, close the loop, and write a copy of the controller file.
 
     Args:
         settings: what may be chosen.
         now: wall clock with time zone.
-        telling: whom to tell.
+        reporter: whom to tell.
 
     Raises:
         DaqError, DriverError, IdentificationError: whatever a real cell could raise.
@@ -123,20 +123,20 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], telling: Tellin
     out = settings.out
     logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
     _make_room(out, logs)
-    telling.step("scan the bus")
+    reporter.step("scan the bus")
     nodes = _scan(settings, cell)
-    telling.step("plan exciting moves")
-    plans = tuple(_plan(settings, cell, index, telling) for index in range(len(PLANS)))
-    recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, telling) for index in range(len(RUNS)))
-    telling.step("identify all gains and parameters")
+    reporter.step("plan exciting moves")
+    plans = tuple(_plan(settings, cell, index, reporter) for index in range(len(PLANS)))
+    recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, reporter) for index in range(len(RUNS)))
+    reporter.step("identify all gains and parameters")
     fitted = fit(logs[:-1], holdout=logs[-1:])
-    telling.step("look for what the model lacks")
-    fitted = close_loop(fitted, settings.seed, lambda step: telling.progress(0, 0, step))
+    reporter.step("look for what the model lacks")
+    fitted = close_loop(fitted, settings.seed, lambda step: reporter.progress(0, 0, step))
     calibration = calibration_of(fitted, now())
     save(calibration, out / "calibration.yaml")
-    telling.step("write the calibration to a copy of the controller file")
+    reporter.step("write the calibration to a copy of the controller file")
     proposal, written = _write_back(cell, calibration, out, now())
-    telling.step("draw the pictures")
+    reporter.step("draw the pictures")
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
     draw(fitted, calibration, truth, out)
@@ -228,36 +228,38 @@ def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
         return nodes
 
 
-def _plan(settings: Settings, cell: Cell, index: int, telling: Telling) -> Plan:
+def _plan(settings: Settings, cell: Cell, index: int, reporter: ProgressReporter) -> Plan:
     exchanges = 800
     made = plan(
         cell,
         seed=10 * settings.seed + index,
         duration_s=settings.duration_s,
         exchanges=exchanges,
-        progress=lambda done, std: telling.progress(done, exchanges, f"plan {PLANS[index]}, worst gain σ {std:.2f} %"),
+        progress=lambda done, std: reporter.progress(done, exchanges, f"plan {PLANS[index]}, worst gain σ {std:.2f} %"),
     )
     save_plan(made, settings.out / f"plan-{PLANS[index]}.yaml")
     return made
 
 
 def _record_valid(
-    settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, telling: Telling
+    settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, reporter: ProgressReporter
 ) -> Recorded:
     """One run, made again where its recorder does not stand for it; the last attempt is kept as it is, for the fit."""
     name, payload, plan_name = RUNS[index]
-    telling.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
+    reporter.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
     for attempt in range(1, RETRIES + 1):
-        recorded = _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+        recorded = _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, reporter)
         if recorded.log.valid:
             return recorded
         # A busy computer lets the simulated cell answer late, or twice in a period.
-        telling.step(f"record {name} again ({attempt} of at most {RETRIES} times): {recorded.log.reason}")
+        reporter.step(f"record {name} again ({attempt} of at most {RETRIES} times): {recorded.log.reason}")
         recorded.path.unlink()
-    return _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, telling)
+    return _record(settings, cell_file, cell, plans[PLANS.index(plan_name)], index, reporter)
 
 
-def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, telling: Telling) -> Recorded:
+def _record(
+    settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index: int, reporter: ProgressReporter
+) -> Recorded:
     name, payload, _ = RUNS[index]
     spec = load_simulation(settings.simulation, payload)
     declared = {candidate.name: candidate for candidate in cell.payloads}
@@ -274,7 +276,7 @@ def _record(settings: Settings, cell_file: Path, cell: Cell, moves: Plan, index:
             operator="demo",
             granted_by="the demonstration: a simulated cell",
             run_id=f"demo-{settings.seed}-{name}",
-            progress=lambda done, total: telling.progress(done, total, "moves"),
+            progress=lambda done, total: reporter.progress(done, total, "moves"),
         )
 
 

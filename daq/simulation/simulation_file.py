@@ -42,7 +42,7 @@ class FaultModel(StrictModel):
     emcy_code: Annotated[int, Field(ge=0x1000, le=0xFFFF)] | None = None
 
     @model_validator(mode="after")
-    def _one_spelling(self) -> FaultModel:
+    def _one_form(self) -> FaultModel:
         if self.at_s is not None and self.at_cycle is not None:
             raise ValueError("at_s or at_cycle, not both")
         if self.for_s is not None and self.cycles is not None:

@@ -131,8 +131,8 @@ def _perhaps(entry: RelativeErrorEntry | None) -> RelativeError | None:
 
 
 def _source(entry: SourceEntry) -> Source:
-    told = entry.recording
-    recording = None if told is None else Recording(**told.model_dump())
+    entry_recording = entry.recording
+    recording = None if entry_recording is None else Recording(**entry_recording.model_dump())
     return Source(entry.name, entry.sha256, entry.role, entry.partial, entry.payload, entry.mass_kg, recording)
 
 

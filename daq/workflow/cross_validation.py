@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell, model_of
 from daq.errors import LogsDiffer
 from daq.log.conversion import load_run
-from daq.workflow.validate import Acquaintance, Validation, check_cell, conditioning_of, predicted, unpredictable
+from daq.workflow.validate import DataUse, Validation, check_cell, conditioning_of, predicted, unpredictable
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
@@ -156,7 +156,7 @@ def cross_validate(
                     reason if len(labels) == len(calibrations) else f"{reason} ({', '.join(labels)})"
                     for reason, labels in reasons.items()
                 ),
-                seen_by=tuple(label for label, v in found.items() if v.acquaintance is Acquaintance.FIT),
+                seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
             )
         )
     together = joined(bare) if bare else None

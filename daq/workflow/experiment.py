@@ -220,11 +220,11 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     expected = nominal_payload(model.robot, mounted.drawn)
     velocity = np.array([axis.limits.velocity for axis in cell.axes])
     acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
-    lively = _lively(cell, velocity, acceleration)
+    fast_motion = _fast_motion(cell, velocity, acceleration)
     links, from_urdf = nominal_links(model.robot, cell.urdf)
     loaded = links.copy()
     loaded[-1] += expected.parameters
-    torque = nominal_torque_limits(model, cell.urdf, loaded, lively)
+    torque = nominal_torque_limits(model, cell.urdf, loaded, fast_motion)
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     noise = NOISE_SHARE * (np.abs(model.drive_train.to_motor) * torque).max(axis=1) / np.abs(gains)
     expectation = Expectation(
@@ -242,7 +242,7 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         *scene.remarks,
     )
     period, edge = _rows(cell)
-    return Experiment(cell, Design(expectation, visible(model, lively)), scene, mounted, period, edge, remarks)
+    return Experiment(cell, Design(expectation, visible(model, fast_motion)), scene, mounted, period, edge, remarks)
 
 
 def _payload(cell: Cell, name: str | None) -> WeighedPayload:
@@ -258,7 +258,7 @@ def _payload(cell: Cell, name: str | None) -> WeighedPayload:
     return found[0]
 
 
-def _lively(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> Motion:
+def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> Motion:
     """Random moves as fast as the limits allow: which parameters there are does not depend on a plan's seed."""
     rng = np.random.default_rng(0)
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T

@@ -148,7 +148,7 @@ def fit(
     try:
         return _fit(logs, holdout, method, gains_fixed, cell, lossy)
     except PayloadUnseen as error:
-        raise PayloadUnseen(error.std_percent, error.runs, _culprit(logs, cell, lossy)) from error
+        raise PayloadUnseen(error.std_percent, error.runs, _contradicting_run(logs, cell, lossy)) from error
 
 
 def _fit(
@@ -203,7 +203,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     )
 
 
-def _culprit(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
+def _contradicting_run(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
     """Which log contradicts the others about the payload: without it they agree."""
     for log in logs:
         try:
@@ -353,7 +353,7 @@ def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEf
 def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
     before, step, finding = _joined(fitted, placed)
     names = {column.name for column in placed.columns}
-    error_before, error_after = _unused_error(before, placed), _unused_error(step.after, placed)
+    error_before, error_after = _holdout_error(before, placed), _holdout_error(step.after, placed)
     if error_before is None or error_after is None:
         # Without a run that was held out, the moves that were left out in turn must do.
         error_before, error_after = finding.error_before_percent, finding.error_after_percent
@@ -383,7 +383,7 @@ def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[Identification | Evidenc
     raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
 
 
-def _unused_error(model: Identification | Evidence, placed: PlacedEffect) -> float | None:
+def _holdout_error(model: Identification | Evidence, placed: PlacedEffect) -> float | None:
     """On the runs held out [%]: of the axis, or in total for what acts on all motors; None where they say nothing."""
     error: RelativeError | None = model.holdout_error
     if error is None:

@@ -33,11 +33,11 @@ THINNING = 2
 """Every second row is enough to compare proposals by."""
 SHARPNESS = 8.0
 """The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
-FEWEST_MOVES = 5
-MOST_TRIES = 100
+MIN_MOVES = 5
+MAX_TRIES = 100
 """Random postures or ways that are tried from one place before it counts as shut in."""
-MOST_RETREATS = 30
-MOST_STARTS = 10
+MAX_RETREATS = 30
+MAX_STARTS = 10
 """Random plans that are begun before the run counts as too short."""
 PLACES = 3
 """Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says."""
@@ -105,9 +105,9 @@ class Search:
             PlanUnfit: it has no room for five moves, or no clear way is found.
         """
         most: list[PlannedMove] = []
-        for _ in range(MOST_STARTS):
+        for _ in range(MAX_STARTS):
             moves, paths = self._filled()
-            if len(moves) >= FEWEST_MOVES:
+            if len(moves) >= MIN_MOVES:
                 return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
             most = max(most, moves, key=len)
         raise self._unfit(f"room for {len(most)} moves", "at least 5, better 30", "allow a longer run")
@@ -127,7 +127,7 @@ class Search:
                 continue
             # A corner that the random targets before it led into.
             retreats += 1
-            if retreats > MOST_RETREATS:
+            if retreats > MAX_RETREATS:
                 raise self._blocked("way")
             if paths:
                 left += paths.pop().duration_s + moves.pop().dwell_s
@@ -221,22 +221,24 @@ class Search:
             if all(self._obstruction(path) is None for way, path in new.items() if way not in fresh):
                 kept.append((moves, ways))
                 fresh |= new
-        told = self._experiment.informations(list(fresh.values()), THINNING)
-        known |= {way: (path, information) for (way, path), information in zip(fresh.items(), told, strict=True)}
+        informations = self._experiment.informations(list(fresh.values()), THINNING)
+        known |= {
+            way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
+        }
         return [
             Draft(moves, tuple(known[way][0] for way in ways), tuple(known[way][1] for way in ways))
             for moves, ways in kept
         ]
 
     def _clear_start(self) -> PlannedMove:
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             move = self._random_move()
             if self._experiment.scene.checker.margins(np.array(move.target_rad)[:, None])[0] > 0.0:
                 return move
         raise self._blocked("posture")
 
     def _clear_move(self, start: FloatArray) -> PlannedMove | None:
-        for _ in range(MOST_TRIES):
+        for _ in range(MAX_TRIES):
             move = self._random_move()
             if self._experiment.scene.checker.obstruction(start, np.array(move.target_rad)) is None:
                 return move

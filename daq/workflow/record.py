@@ -29,12 +29,12 @@ from daq.workflow.safeguards import (
     FreeBytes,
     check_currents,
     check_entered_mass,
+    defer_full_gc,
     free_bytes,
     largest_log_bytes,
-    short_searches,
 )
 from daq.writeback.formats.document import read_bytes
-from drivers.canopen.network import CanopenNetwork, Undisturbed
+from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.errors import MotionRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
@@ -92,7 +92,7 @@ class Recorded:
     warnings: tuple[str, ...] = ()
 
 
-def network_of(cell: Cell, undisturbed: Undisturbed = nullcontext) -> CanopenNetwork:
+def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> CanopenNetwork:
     """The amplifiers of a cell; use it as a context manager.
 
     Args:
@@ -105,7 +105,7 @@ def network_of(cell: Cell, undisturbed: Undisturbed = nullcontext) -> CanopenNet
     pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
     # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
     guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
-    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, undisturbed=undisturbed)
+    return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, block_signals=block_signals)
 
 
 def record(
@@ -122,7 +122,7 @@ def record(
     entered_kg: float | None = None,
     clocks: Clocks | None = None,
     free: FreeBytes = free_bytes,
-    undisturbed: Undisturbed = nullcontext,
+    block_signals: SignalBlocker = nullcontext,
     progress: Callable[[int, int], None] = lambda _move, _moves: None,
     before_motion: Callable[[], None] = lambda: None,
 ) -> Recorded:
@@ -160,7 +160,7 @@ def record(
     if granted_by is None:
         raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
     check_entered_mass(cell, payload, entered_kg)
-    with short_searches(), network_of(cell, undisturbed) as network, _sync_producer(cell, network) as producer:
+    with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
         network.prepare()
         warnings = (*load_warnings(cell), *check_currents(cell, network.scales()), *network.unguarded())
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())

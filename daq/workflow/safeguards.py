@@ -266,7 +266,7 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
     Raises:
         ScaleImplausible: the two torque constants differ by a factor of five or more.
     """
-    told: dict[str, list[str]] = {}
+    axes_by_warning: dict[str, list[str]] = {}
     for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):
         found = reading.warnings
         if axis.profile is None or not axis.gain_unit.startswith(("Nm/A", "N/A")):
@@ -274,9 +274,9 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
         else:
             found += check_name_plate(reading, axis.profile.amplitude, axis.nameplate_gain / float(reduction))
         for warning in found:
-            told.setdefault(warning, []).append(axis.name)
+            axes_by_warning.setdefault(warning, []).append(axis.name)
     note = actual_current_note(cell)
-    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in told.items())
+    grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
     return grouped if note is None else (note, *grouped)
 
 
@@ -335,7 +335,7 @@ NEVER = 2**31 - 1
 
 
 @contextmanager
-def short_searches() -> Iterator[None]:
+def defer_full_gc() -> Iterator[None]:
     """What has lived for long is not searched until the block ends; what is made meanwhile is.
 
     A search through all that the program and its libraries have made takes tens of milliseconds, in which nothing else

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-class Acquaintance(Enum):
+class DataUse(Enum):
     """Whether a calibration has met a log, by the log's digest."""
 
     FIT = "seen by the fit"
@@ -56,7 +56,7 @@ class Validation:
     log: Path
     run: str
     digest: str
-    acquaintance: Acquaintance
+    data_use: DataUse
     same_configuration: bool
     partial: bool
     time_s: FloatArray
@@ -194,7 +194,7 @@ def predicted(
         log=log,
         run=run.name,
         digest=run.digest,
-        acquaintance=_acquaintance(calibration, run.digest),
+        data_use=_data_use(calibration, run.digest),
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
@@ -224,8 +224,8 @@ def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parame
     return {name: parameter for name, _, mounting, parameter in split if mounting == payload.mounting}
 
 
-def _acquaintance(calibration: Calibration, digest: str) -> Acquaintance:
+def _data_use(calibration: Calibration, digest: str) -> DataUse:
     roles = {source.role for source in calibration.sources if source.sha256 == digest}
     if "fit" in roles:
-        return Acquaintance.FIT
-    return Acquaintance.HOLDOUT if "holdout" in roles else Acquaintance.NEW
+        return DataUse.FIT
+    return DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW

@@ -16,9 +16,9 @@ from daq.writeback.drive_record import record_folder
 from daq.writeback.gates.fit import fit_refusals
 from daq.writeback.gates.logs import source_refusals
 from daq.writeback.gates.signature import signature_refusals
-from daq.writeback.gates.table import Refusal, circumstances, closed
+from daq.writeback.gates.table import Refusal, gate_context, refusal_error
 from daq.writeback.gates.target import GainChange, drive_base_refusals, gain_refusals
-from daq.writeback.request import Request, change_of, evidence_of, look, other_change
+from daq.writeback.request import Request, change_digest, changed_since_review, evidence_of, parse_base
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import ParameterValue, ParameterWrite, read_parameters
 from ident.calibration import Gain
@@ -59,7 +59,7 @@ class DriveProposal:
     @property
     def looked_at(self) -> str:
         """What --base takes from whoever has looked at this change: they want this one and no other."""
-        return change_of(*self.contents)
+        return change_digest(*self.contents)
 
     @property
     def unchanged(self) -> bool:
@@ -96,22 +96,22 @@ def propose_to_drives(declared: Cell, request: Request, network: CanopenNetwork)
             remedy="give the calibration and the configuration of the same cell",
         )
     policy = request.policy or declared.apply
-    pairs = [(axis, told.parameter) for axis, told in zip(network.axes, objects, strict=True)]
+    pairs = [(axis, gain_object.parameter) for axis, gain_object in zip(network.axes, objects, strict=True)]
     base = read_parameters(network, pairs)
     changes, writes = [], []
-    for value, told in zip(base, objects, strict=True):
-        change, word = _change(gains[value.axis.name], value, told)
+    for value, gain_object in zip(base, objects, strict=True):
+        change, word = _change(gains[value.axis.name], value, gain_object)
         changes.append(change)
-        writes.append(ParameterWrite(value.axis, told.parameter, word))
+        writes.append(ParameterWrite(value.axis, gain_object.parameter, word))
     configuration = None if request.configuration_changed else declared.digest
     subject, folder = drives_of(declared.name), record_folder(declared)
     before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
-    looked = look(request.looked_at, before)
+    reviewed = parse_base(request.looked_at, before)
     refusals = (
         *fit_refusals(calibration, declared.name, configuration, policy, declared.recording_digest),
-        *source_refusals(calibration, policy, circumstances(declared, request.now, request.entered_kg)),
-        *drive_base_refusals(subject, base, digest(base), folder, looked.base_sha256),
-        *other_change(looked, subject, before, after),
+        *source_refusals(calibration, policy, gate_context(declared, request.now, request.entered_kg)),
+        *drive_base_refusals(subject, base, digest(base), folder, reviewed.base_sha256),
+        *changed_since_review(reviewed, subject, before, after),
         *signature_refusals(request.file, request.signed, policy, request.appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
     )
@@ -121,7 +121,7 @@ def propose_to_drives(declared: Cell, request: Request, network: CanopenNetwork)
 
 def refused(proposal: DriveProposal) -> CalibrationRefused:
     """The error for a proposal with closed gates."""
-    return closed(drives_of(proposal.cell), proposal.refusals)
+    return refusal_error(drives_of(proposal.cell), proposal.refusals)
 
 
 def _objects(declared: Cell) -> tuple[GainObject, ...]:
@@ -137,30 +137,30 @@ def _objects(declared: Cell) -> tuple[GainObject, ...]:
     return objects
 
 
-def _change(gain: Gain, value: ParameterValue, told: GainObject) -> tuple[GainChange, int]:
+def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, int]:
     """The change, and the bits to write; those of now where there is no gain to write, which a gate refuses."""
-    key = f"node {value.axis.node_id}, {told.parameter}"
+    key = f"node {value.axis.node_id}, {gain_object.parameter}"
     writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    word = _word(key, gain, told) if writable else value.word
-    new = told.parameter.value(word) / told.factor
+    word = _word(key, gain, gain_object) if writable else value.word
+    new = gain_object.parameter.value(word) / gain_object.factor
     change = GainChange(
         axis=gain.axis,
         key=key,
         line=0,
-        old=value.value / told.factor,
+        old=value.value / gain_object.factor,
         new=new if writable else gain.value,
         std=gain.std,
         unit=gain.unit,
         nameplate=gain.nameplate,
-        spelling=f"{told.parameter.value(word):.9g}" if writable else "",
+        spelling=f"{gain_object.parameter.value(word):.9g}" if writable else "",
     )
     return change, word
 
 
-def _word(key: str, gain: Gain, told: GainObject) -> int:
-    wanted = told.factor * gain.value
+def _word(key: str, gain: Gain, gain_object: GainObject) -> int:
+    wanted = gain_object.factor * gain.value
     try:
-        word = told.parameter.word(wanted)
+        word = gain_object.parameter.word(wanted)
     except ValueError as error:
         raise ControllerUnfit(
             key,
@@ -168,11 +168,11 @@ def _word(key: str, gain: Gain, told: GainObject) -> int:
             expected="a gain that fits",
             remedy="check `type` and `factor` in `controller.objects` of the cell file; nothing was written",
         ) from error
-    held = told.parameter.value(word)
-    if held == 0 or 0 < abs(told.factor) * gain.std < abs(held - wanted):
+    held = gain_object.parameter.value(word)
+    if held == 0 or 0 < abs(gain_object.factor) * gain.std < abs(held - wanted):
         raise ControllerUnfit(
             key,
-            found=f"{wanted:.6g} ± {abs(told.factor) * gain.std:.2g}, which the number {held:.9g} does not tell",
+            found=f"{wanted:.6g} ± {abs(gain_object.factor) * gain.std:.2g}, which the number {held:.9g} does not tell",
             expected="a rounding below σ",
             remedy="this object is too coarse for the gain: use another one, or another factor in "
             "`controller.objects`; nothing was written",
@@ -182,11 +182,11 @@ def _word(key: str, gain: Gain, told: GainObject) -> int:
 
 def canonical(base: tuple[ParameterValue, ...], words: tuple[int, ...] | None = None) -> bytes:
     """Which drives they are and what stands in them, or the given bits in its place, as bytes."""
-    told = [
+    listed = [
         [value.axis.name, value.axis.node_id, value.identity.serial, str(value.parameter), word]
         for value, word in zip(base, words or [value.word for value in base], strict=True)
     ]
-    return json.dumps(told).encode()
+    return json.dumps(listed).encode()
 
 
 def digest(base: tuple[ParameterValue, ...]) -> str:

@@ -163,9 +163,9 @@ def read_record(path: Path) -> DriveRecord:
         body: dict[str, Any] = json.loads(content)
     except (OSError, ValueError, ValidationError) as error:
         raise _unfit(path, str(error).splitlines()[0][:200]) from error
-    told = body.pop("sha256")
-    if told != _digest(body):
-        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {told[:12]}… as it says")
+    recorded_digest = body.pop("sha256")
+    if recorded_digest != _digest(body):
+        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {recorded_digest[:12]}… as it says")
     notes = tuple(
         DriveNote(
             note.axis,

@@ -15,10 +15,10 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.errors import BackupMissing, ControllerChanged, ControllerUnfit
 from daq.files import sha256
-from daq.ledger.audit import AuditAction, Chronicle
+from daq.ledger.audit import AuditAction, AuditRecorder
 from daq.writeback.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
 from daq.writeback.drive_record import DriveNote, DriveRecord, read_record, read_records, record_folder, write_record
-from daq.writeback.file_access import only_writer
+from daq.writeback.file_access import exclusive_writer
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import (
     ParameterChange,
@@ -34,7 +34,7 @@ from drivers.profiles.profile import Axis, Parameter
 
 
 @dataclass(frozen=True, slots=True)
-class DriveWayBack:
+class DriveRollback:
     """A way back that has been worked out and not gone.
 
     Attributes:
@@ -52,7 +52,7 @@ class DriveWayBack:
     writes: tuple[ParameterWrite, ...]
 
 
-def way_back_of_drives(declared: Cell, network: CanopenNetwork) -> DriveWayBack:
+def plan_drive_rollback(declared: Cell, network: CanopenNetwork) -> DriveRollback:
     """What stood in the drives before the last write that changed them, whole or cut off by a kill; reads only.
 
     Args:
@@ -78,7 +78,7 @@ def way_back_of_drives(declared: Cell, network: CanopenNetwork) -> DriveWayBack:
             ParameterWrite(value.axis, note.parameter, note.old)
             for value, note in zip(base, record.drives, strict=True)
         )
-        return DriveWayBack(declared.name, folder, record, base, writes)
+        return DriveRollback(declared.name, folder, record, base, writes)
     raise BackupMissing(
         drives_of(declared.name),
         found=f"{len(paths)} records of what stands there now" if paths else f"no record in {folder}",
@@ -89,12 +89,12 @@ def way_back_of_drives(declared: Cell, network: CanopenNetwork) -> DriveWayBack:
 
 def _recorded(declared: Cell, network: CanopenNetwork, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
     axes = {(axis.name, axis.node_id): axis for axis in network.axes}
-    strangers = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
-    if record.cell != declared.name or strangers:
+    unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
+    if record.cell != declared.name or unknown_axes:
         raise ControllerUnfit(
             str(record.path),
             found=f"a write to cell {record.cell!r}"
-            + (f", with {', '.join(strangers)} that this cell has not" if strangers else ""),
+            + (f", with {', '.join(unknown_axes)} that this cell has not" if unknown_axes else ""),
             expected=f"one to the drives of cell {declared.name!r}",
             remedy="nothing was written; has the cell file been changed since?",
         )
@@ -104,8 +104,8 @@ def _recorded(declared: Cell, network: CanopenNetwork, record: DriveRecord) -> l
 def _check_untouched(record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
     """Refuse where going back would lose what somebody else did."""
     for value, note in zip(base, record.drives, strict=True):
-        told = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
-        if told != (note.vendor_id, note.product_code, note.serial):
+        identity = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
+        if identity != (note.vendor_id, note.product_code, note.serial):
             raise ControllerChanged(
                 f"{note.axis} (node {note.node_id})",
                 found=f"another drive, with serial number {value.identity.serial}",
@@ -178,10 +178,12 @@ def apply_to_drives(
         OSError: the record could not be written; nothing was written to the drives.
     """
     if proposal.refusals:
-        Chronicle(audit, who, now).refusal(Path(drives_of(proposal.cell)), proposal.refusals, proposal.evidence)
+        AuditRecorder(audit, who, now).record_refusal(
+            Path(drives_of(proposal.cell)), proposal.refusals, proposal.evidence
+        )
         raise refused(proposal)
     details = {"drives": _documented(proposal.base, proposal.writes), **proposal.evidence}
-    with only_writer(_made(proposal.folder)):
+    with exclusive_writer(_made(proposal.folder)):
         return _write(
             network, proposal.cell, proposal.folder, proposal.base, proposal.writes, saving, now,
             begun=AuditAction.APPLY_BEGUN, audit=audit, who=who, details=details,
@@ -189,7 +191,7 @@ def apply_to_drives(
 
 
 def roll_back_drives(
-    way: DriveWayBack,
+    rollback: DriveRollback,
     network: CanopenNetwork,
     now: datetime,
     *,
@@ -202,20 +204,20 @@ def roll_back_drives(
     What it replaces is recorded too, so that a second way back undoes the first.
 
     Args:
-        way: as it was worked out.
+        rollback: as it was worked out.
         network, now, saving, audit, who: as in `apply_to_drives`.
 
     Raises:
         ControllerChanged: something else stands in the drives than when the way was worked out.
         ControllerBusy, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
     """
-    details = {"drives": _documented(way.base, way.writes), "restored": str(way.record.path)}
-    with only_writer(_made(way.folder)):
+    details = {"drives": _documented(rollback.base, rollback.writes), "restored": str(rollback.record.path)}
+    with exclusive_writer(_made(rollback.folder)):
         written = _write(
-            network, way.cell, way.folder, way.base, way.writes, saving, now,
+            network, rollback.cell, rollback.folder, rollback.base, rollback.writes, saving, now,
             begun=AuditAction.ROLLBACK_BEGUN, audit=audit, who=who, details=details,
         )  # fmt: skip
-    return replace(written, source=way.record.path)
+    return replace(written, source=rollback.record.path)
 
 
 def _write(
@@ -247,11 +249,11 @@ def _write(
     target = Path(drives_of(cell))
     before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
     ended = _BEGINS_AND_ENDS[begun]
-    changes, told = Chronicle(audit, who, now).of_write(
+    changes, audit_digest = AuditRecorder(audit, who, now).record_write(
         begun, ended, target, before, after, {"saving": saving.value, **details},
         partial(write_parameters, network, writes, saving, begin),
     )  # fmt: skip
-    return DrivesWritten(str(target), records[0], changes, sha256(after), audit_sha256=told)
+    return DrivesWritten(str(target), records[0], changes, sha256(after), audit_sha256=audit_digest)
 
 
 def _notes(found: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> tuple[DriveNote, ...]:

@@ -20,7 +20,7 @@ from daq.files import fsync_folder, replace_file
 from daq.writeback.formats.document import read_bytes
 
 
-def followed(file: Path) -> Path:
+def resolve_links(file: Path) -> Path:
     """Resolve the symbolic links of a file's name, those of its folders included.
 
     A file that is gone resolves to where its links still lead.
@@ -84,16 +84,16 @@ def _status(file: Path) -> os.stat_result | None:
         return None
 
 
-def require_there(file: Path) -> None:
+def require_existing(file: Path) -> None:
     """Refuse a symbolic link that leads nowhere, by that name: "no such file" would be hard to believe.
 
     A file of several names (hard links) is refused too: a new file takes the place of one name, and whoever reads the
     others goes on with the old gains.
 
     Raises:
-        ControllerUnfit: for either; and see `followed`.
+        ControllerUnfit: for either; and see `resolve_links`.
     """
-    target = followed(file)
+    target = resolve_links(file)
     if file.is_symlink() and not target.exists():
         raise ControllerUnfit(
             str(file),
@@ -129,7 +129,7 @@ _MODE = 0o644
 
 
 @contextlib.contextmanager
-def only_writer(target: Path) -> Iterator[None]:
+def exclusive_writer(target: Path) -> Iterator[None]:
     """Hold the file's lock; the system gives it back even after a kill.
 
     The lock file is removed at the end. A second writer may have opened it just before: its lock is then on a file
@@ -224,7 +224,7 @@ class Backup:
     stamp: str
     count: int
     was: str
-    became: str
+    after_digest: str
 
     def content(self) -> bytes:
         """What is in it.

@@ -15,17 +15,17 @@ from daq.config.controller import ControllerFormat
 from daq.config.policy import ApplyPolicy
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerUnfit
 from daq.files import sha256
-from daq.ledger.audit import Chronicle
-from daq.writeback.file_access import followed, require_there
+from daq.ledger.audit import AuditRecorder
+from daq.writeback.file_access import require_existing, resolve_links
 from daq.writeback.file_target import Written, write
 from daq.writeback.formats.document import decode, read_bytes
-from daq.writeback.formats.scalar import Scalar, respell
+from daq.writeback.formats.scalar import Scalar, rewrite_gain
 from daq.writeback.gates.fit import fit_refusals
 from daq.writeback.gates.logs import source_refusals
 from daq.writeback.gates.signature import signature_refusals
-from daq.writeback.gates.table import Circumstances, Refusal, circumstances, closed
+from daq.writeback.gates.table import GateContext, Refusal, gate_context, refusal_error
 from daq.writeback.gates.target import GainChange, base_refusals, gain_refusals
-from daq.writeback.request import Request, change_of, evidence_of, look, other_change
+from daq.writeback.request import Request, change_digest, changed_since_review, evidence_of, parse_base
 from ident.calibration import Calibration, Gain
 
 
@@ -58,7 +58,7 @@ class Proposal:
     @property
     def looked_at(self) -> str:
         """What --base takes from whoever has looked at this change: they want this one and no other."""
-        return change_of(self.before_content, self.after_content)
+        return change_digest(self.before_content, self.after_content)
 
     @property
     def diff(self) -> str:
@@ -101,7 +101,7 @@ def propose_for(declared: Cell, request: Request, file: Path | None = None) -> P
         cell=declared.name,
         configuration_sha256=declared.digest,
         recording_configuration_sha256=declared.recording_digest,
-        held=circumstances(declared, request.now, request.entered_kg),
+        held=gate_context(declared, request.now, request.entered_kg),
         format=controller.format,
         factors=dict(zip(names, controller.factors, strict=True)) if controller.factors else {},
     )
@@ -115,7 +115,7 @@ def propose(
     cell: str,
     configuration_sha256: str | None = None,
     recording_configuration_sha256: str | None = None,
-    held: Circumstances | None = None,
+    held: GateContext | None = None,
     format: ControllerFormat | None = None,  # noqa: A002 - as the cell file calls it
     factors: Mapping[str, float] | None = None,
 ) -> Proposal:
@@ -139,7 +139,7 @@ def propose(
     """
     calibration, policy, factors = request.calibration, request.policy or ApplyPolicy(), factors or {}
     _check_axes(calibration, keys)
-    require_there(file)
+    require_existing(file)
     content = read_bytes(file)
     now = decode(content, str(file), format)
     base_sha256 = sha256(content)
@@ -150,14 +150,14 @@ def propose(
     )
     _check_apart(str(file), scalars)
     after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
-    looked = look(request.looked_at, content)
+    reviewed = parse_base(request.looked_at, content)
     # Who has looked at the file matters where something is lost: not where these gains stand in it already.
     base = (
         ()
         if after.content == content and all(change.spelling for change in changes)
         else (
-            *base_refusals(calibration, str(file), base_sha256, looked.base_sha256),
-            *other_change(looked, str(file), content, after.content),
+            *base_refusals(calibration, str(file), base_sha256, reviewed.base_sha256),
+            *changed_since_review(reviewed, str(file), content, after.content),
         )
     )
     refusals = (
@@ -168,7 +168,7 @@ def propose(
             policy,
             recording_configuration_sha256,
         ),
-        *source_refusals(calibration, policy, held or Circumstances()),
+        *source_refusals(calibration, policy, held or GateContext()),
         *base,
         *signature_refusals(request.file, request.signed, policy, request.appliers),
         *(refusal for change in changes for refusal in gain_refusals(change, policy)),
@@ -207,10 +207,10 @@ def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: 
     """
     details = {"changes": [_documented(change) for change in proposal.changes], **proposal.evidence}
     if proposal.refusals:
-        Chronicle(audit, who, now).refusal(followed(proposal.file), proposal.refusals, details)
+        AuditRecorder(audit, who, now).record_refusal(resolve_links(proposal.file), proposal.refusals, details)
         raise refused(proposal)
     if proposal.after_content == proposal.before_content:
-        Chronicle(audit, who, now).nothing_to_do(followed(proposal.file), proposal.before_content, details)
+        AuditRecorder(audit, who, now).record_no_change(resolve_links(proposal.file), proposal.before_content, details)
         return None
     spelling = {change.key: change.spelling for change in proposal.changes}
     before = decode(proposal.before_content, str(proposal.file), proposal.format)
@@ -225,7 +225,7 @@ def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: 
 
 def refused(proposal: Proposal) -> CalibrationRefused:
     """The error for a proposal with closed gates."""
-    return closed(str(proposal.file), proposal.refusals)
+    return refusal_error(str(proposal.file), proposal.refusals)
 
 
 def _check_axes(calibration: Calibration, keys: Mapping[str, str]) -> None:
@@ -261,7 +261,7 @@ def _check_apart(file: str, scalars: Sequence[Scalar]) -> None:
 
 def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
     writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    put = respell(scalar, gain.value, gain.std, factor) if writable else None
+    put = rewrite_gain(scalar, gain.value, gain.std, factor) if writable else None
     return GainChange(
         axis=gain.axis,
         key=scalar.key,

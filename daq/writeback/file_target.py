@@ -13,8 +13,8 @@ from pathlib import Path
 from daq.config.controller import ControllerFormat
 from daq.errors import BackupMissing, ControllerChanged
 from daq.files import replace_file, sha256
-from daq.ledger.audit import AuditAction, Chronicle
-from daq.writeback.file_access import Backup, back_up, backups, followed, only_writer, put_back, short_digest
+from daq.ledger.audit import AuditAction, AuditRecorder
+from daq.writeback.file_access import Backup, back_up, backups, exclusive_writer, put_back, resolve_links, short_digest
 from daq.writeback.formats.document import decode, read_bytes
 
 
@@ -86,11 +86,11 @@ def write(
         AuditUnusable: it could not be written down; the old content stands.
         OSError: from the file system; the old content stands, and neither backup nor temporary file is left.
     """
-    target = followed(file)
-    chronicle, known = Chronicle(audit, who, now), details or {}
+    target = resolve_links(file)
+    recorder, known = AuditRecorder(audit, who, now), details or {}
     with contextlib.ExitStack() as lock:
-        with chronicle.of_question(target, known):
-            lock.enter_context(only_writer(target))
+        with recorder.record_refusal_of(target, known):
+            lock.enter_context(exclusive_writer(target))
             before = read_bytes(target)
             found = sha256(before)
             if found != base_sha256:
@@ -100,11 +100,11 @@ def write(
                     expected=f"{base_sha256[:12]}…, for which the change was shown",
                     remedy="somebody has changed the file: look at a new dry run",
                 )
-        written, told = chronicle.of_write(
+        written, audit_digest = recorder.record_write(
             AuditAction.APPLY_BEGUN, AuditAction.APPLIED, target, before, after, known,
             partial(_replace, target, before, after, check, now),
         )  # fmt: skip
-        return replace(written, audit_sha256=told)
+        return replace(written, audit_sha256=audit_digest)
 
 
 def roll_back(
@@ -134,26 +134,26 @@ def roll_back(
         AuditUnusable: it could not be written down; the file stands as it was.
         OSError: from the file system; the file stands as it was.
     """
-    target = followed(file)
-    chronicle = Chronicle(audit, who, now)
+    target = resolve_links(file)
+    recorder = AuditRecorder(audit, who, now)
     with contextlib.ExitStack() as lock:
-        with chronicle.of_question(target, {"asked": "rollback"}):
-            lock.enter_context(only_writer(target))
+        with recorder.record_refusal_of(target, {"asked": "rollback"}):
+            lock.enter_context(exclusive_writer(target))
             before = read_bytes(target) if target.exists() else None
-            backup = _way_back(file, target, before)
+            backup = _backup_to_restore(file, target, before)
             after = backup.content()
             if before is not None:
                 _check_unedited(file, before, backup)
         details = {"restored": backup.path.name}
         check = partial(_check_parses, name=str(backup.path), format=format)
-        restored, told = chronicle.of_write(
+        restored, audit_digest = recorder.record_write(
             AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK, target, before, after, details,
             partial(_restore, target, before, after, backup, check, now),
         )  # fmt: skip
-        return replace(restored, audit_sha256=told)
+        return replace(restored, audit_sha256=audit_digest)
 
 
-def _way_back(file: Path, target: Path, before: bytes | None) -> Backup:
+def _backup_to_restore(file: Path, target: Path, before: bytes | None) -> Backup:
     found = backups(target)
     for backup in reversed(found):
         # A writer that was killed before it replaced the file leaves a backup of what is still there.
@@ -168,12 +168,12 @@ def _way_back(file: Path, target: Path, before: bytes | None) -> Backup:
 
 
 def _check_unedited(file: Path, before: bytes, backup: Backup) -> None:
-    if short_digest(before) != backup.became:
+    if short_digest(before) != backup.after_digest:
         one, other = shlex.quote(str(backup.path)), shlex.quote(str(file))
         raise ControllerChanged(
             str(file),
             found=f"content {short_digest(before)}…",
-            expected=f"{backup.became}…, as drivegain wrote it when it made {backup.path.name}",
+            expected=f"{backup.after_digest}…, as drivegain wrote it when it made {backup.path.name}",
             remedy="somebody has edited the file since, and going back would lose that; look at the difference with "
             f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
         )

@@ -56,7 +56,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class LookedAt:
+class ReviewedChange:
     """What somebody says that they have looked at.
 
     Attributes:
@@ -65,41 +65,41 @@ class LookedAt:
     """
 
     base_sha256: str | None
-    became: str | None
+    after_digest: str | None
 
 
-def change_of(before: bytes, after: bytes) -> str:
+def change_digest(before: bytes, after: bytes) -> str:
     """By which a change is recognised, for --base."""
     return f"{short_digest(before)}-{short_digest(after)}"
 
 
-def look(told: str | None, before: bytes) -> LookedAt:
+def parse_base(base: str | None, before: bytes) -> ReviewedChange:
     """Read what --base says.
 
     Args:
-        told: `change_of` a change, or the whole SHA-256 of what stood there; None where nobody has looked.
+        base: `change_digest` a change, or the whole SHA-256 of what stood there; None where nobody has looked.
         before: what stands there now. Where its digest begins with the digits that were told, it is what was meant.
 
     Raises:
         UsageError: it is neither.
     """
-    if told is None:
-        return LookedAt(None, None)
-    was, joined, became = told.strip().lower().partition("-")
+    if base is None:
+        return ReviewedChange(None, None)
+    was, joined, after_digest = base.strip().lower().partition("-")
     digits = len(short_digest(before))
     if not joined and len(was) == len(sha256(before)) and _is_hex(was):
-        return LookedAt(was, None)
-    if not (len(was) == len(became) == digits and _is_hex(was + became)):
+        return ReviewedChange(was, None)
+    if not (len(was) == len(after_digest) == digits and _is_hex(was + after_digest)):
         raise UsageError(
-            f"--base {told}",
+            f"--base {base}",
             found="no digest",
             expected=f"what a dry run tells: {digits} digits, a hyphen, {digits} digits",
             remedy="copy it from the last line of the dry run",
         )
-    return LookedAt(sha256(before) if was == short_digest(before) else was, became)
+    return ReviewedChange(sha256(before) if was == short_digest(before) else was, after_digest)
 
 
-def other_change(looked: LookedAt, subject: str, before: bytes, after: bytes) -> tuple[Refusal, ...]:
+def changed_since_review(reviewed: ReviewedChange, subject: str, before: bytes, after: bytes) -> tuple[Refusal, ...]:
     """Closed where another content would be written than the one that was shown.
 
     Args:
@@ -108,14 +108,14 @@ def other_change(looked: LookedAt, subject: str, before: bytes, after: bytes) ->
         before, after: what stands there, and what would stand there. Where something else stands there than was shown,
             the gate of the base says so, and this one says nothing.
     """
-    if looked.became in {None, short_digest(after)} or looked.base_sha256 != sha256(before):
+    if reviewed.after_digest in {None, short_digest(after)} or reviewed.base_sha256 != sha256(before):
         return ()
     return (
         Refusal(
             Gate.BASE,
             subject,
             f"a change to {short_digest(after)}…",
-            f"to {looked.became}…, as --base says",
+            f"to {reviewed.after_digest}…, as --base says",
             "the calibration, the keys or the factors have changed since the dry run: look at a new one",
         ),
     )

@@ -14,7 +14,7 @@ import can
 
 from drivers.canopen.bus import bus_errors, send_burst
 from drivers.canopen.emcy import describe
-from drivers.canopen.sdo import Clock, ObjectAccess, PumpedSdoClient, SdoPolicy
+from drivers.canopen.sdo import Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
 from drivers.errors import BusError, NmtRefused
 from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
@@ -112,7 +112,7 @@ class Link:
         self._next_beat_ns = 0
         self._opener = opener
         self._bus: can.BusABC | None = None
-        self._clients: dict[int, list[PumpedSdoClient]] = {}
+        self._clients: dict[int, list[SynchronousSdoClient]] = {}
         self._access: dict[tuple[int, SdoPolicy], ObjectAccess] = {}
         self._events: deque[tuple[int, EventKind, int, str]] = deque()
 
@@ -249,8 +249,8 @@ class Link:
             self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
         elif bits:
             says = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
-            told = ", ".join(text for mask, text in says if bits & mask) or f"says {bits:02X}h"
-            self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {told}"))
+            description = ", ".join(text for mask, text in says if bits & mask) or f"says {bits:02X}h"
+            self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {description}"))
 
     def note_foreign(self, identifier: int) -> None:
         """Take note of a frame of a master's, or of our own heartbeat, that neither we nor our SYNC producer sent."""
@@ -290,7 +290,7 @@ class Link:
         """Access to the object dictionary of a node, with the link's policy or another."""
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
-            client = PumpedSdoClient(node_id, self.send, self.pump, self.clock, policy)
+            client = SynchronousSdoClient(node_id, self.send, self.pump, self.clock, policy)
             self._clients.setdefault(node_id, []).append(client)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy)
         return self._access[node_id, policy]

@@ -85,7 +85,7 @@ class Bounds:
     unused_s: float = 0.35
 
 
-Undisturbed = Callable[[], AbstractContextManager[None]]
+SignalBlocker = Callable[[], AbstractContextManager[None]]
 """Makes blocks that no signal interrupts for a while: in them the axes are stopped and given back."""
 DEFAULT_BOUNDS = Bounds()
 DEFAULT_POLICY = SdoPolicy()
@@ -126,10 +126,10 @@ class CanopenNetwork:
         policy: SdoPolicy = DEFAULT_POLICY,
         clock: Clock = time.monotonic_ns,
         opener: Callable[[CellAddress], can.BusABC] = open_cell_bus,
-        undisturbed: Undisturbed = nullcontext,
+        block_signals: SignalBlocker = nullcontext,
     ) -> None:
         self.axes = axes
-        self.undisturbed = undisturbed
+        self.block_signals = block_signals
         self.heartbeat_ms = heartbeat_ms
         self.guard_ms = guard_ms
         self.bounds = bounds
@@ -150,7 +150,7 @@ class CanopenNetwork:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         try:
-            with self.undisturbed():
+            with self.block_signals():
                 problems = self._give_back() if self._originals else []
         except BaseException as cut:
             cut.add_note(f"{WHILE}closing the network: it was cut short, and not every axis has its settings back")

@@ -32,7 +32,7 @@ from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Param
 # What a recording that was killed has left in a drive: its power takes it away, a save would keep it.
 
 
-def left_over(network: CanopenNetwork, axis: Axis) -> str:
+def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     """What a drive still has of a recording that was killed, for a person; empty where it has nothing.
 
     Raises:
@@ -217,7 +217,7 @@ def write_parameters(
             _require_powerless(network, axis)
         network.require_alone()
     except BaseException as error:  # an interrupt too: half of the gains are none
-        with network.undisturbed():
+        with network.block_signals():
             _undo(network, old, progress, save_timeout_s, error)
         raise
     return tuple(
@@ -280,7 +280,7 @@ def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> Non
             f"keeps nobody knows what ({axis.profile.name}: {axis.profile.save_semantics})",
             "write to its RAM alone (--ram-only), or let it save all the same (--save-unknown)",
         )
-    if save.mapping is not Mapping.SEPARATE and (left := left_over(network, axis)):
+    if save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
         raise SaveRefused(
             axis.node_id,
             f"would keep what a recording that was killed has left there ({left})",

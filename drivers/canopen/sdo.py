@@ -40,7 +40,7 @@ class SdoPolicy:
     attempts: int = 3
 
 
-class PumpedSdoClient(SdoClient):
+class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without the thread behind it: it reads the bus while it waits.
 
     canopen leaves reading to a Notifier thread, which dies silently of an exception and would be a second reader beside
@@ -114,7 +114,7 @@ class PumpedSdoClient(SdoClient):
 class ObjectAccess:
     """Reads and writes the object dictionary of one node; every failure is an ObjectAccessError."""
 
-    def __init__(self, node_id: int, client: PumpedSdoClient, policy: SdoPolicy) -> None:
+    def __init__(self, node_id: int, client: SynchronousSdoClient, policy: SdoPolicy) -> None:
         self.node_id = node_id
         self._client = client
         self._policy = policy

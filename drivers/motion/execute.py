@@ -106,7 +106,7 @@ def execute(
             network.unguard()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
-        with network.undisturbed():
+        with network.block_signals():
             walk.ended_by(error)
             problems = _drain(walk.stop())
             if not problems:
@@ -144,7 +144,7 @@ class _Walk:
         self._nodes = network.node_ids
         self._axes = range(len(network.axes))
         self._targets = list(first.position_counts)
-        self._told: list[tuple[int, int] | None] = [None] * len(network.axes)
+        self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
 
     def _cycles(self, seconds: float) -> int:
         return max(1, round(seconds * 1e9 / self._stream.pacing.period_ns))
@@ -156,11 +156,11 @@ class _Walk:
     def _state(self, axis: int) -> State:
         return decode(self._sample.statusword[axis])
 
-    def _tell(self, axis: int, controlword: int, repeat: bool = False) -> None:
+    def _send_command(self, axis: int, controlword: int, repeat: bool = False) -> None:
         """Controlword and target of one axis, with the next SYNC; said again only when asked."""
-        told = (controlword, self._targets[axis])
-        if repeat or self._told[axis] != told:
-            self._told[axis] = told
+        command = (controlword, self._targets[axis])
+        if repeat or self._sent[axis] != command:
+            self._sent[axis] = command
             self._stream.send((_frame(self._nodes[axis], 0, controlword, self._targets[axis]),))
 
     def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
@@ -179,7 +179,9 @@ class _Walk:
             for axis in waiting:
                 # A target that is not the position would be a jump on enabling.
                 self._targets[axis] = self._sample.position_counts[axis]
-                self._tell(axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0)
+                self._send_command(
+                    axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0
+                )
             yield self._next()
         for axis in self._axes:
             if self._state(axis) is not State.OPERATION_ENABLED:
@@ -200,7 +202,7 @@ class _Walk:
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
-            self._tell(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
+            self._send_command(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
         sample = self._checked()
         self._emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
@@ -238,7 +240,7 @@ class _Walk:
             for _ in range(bound):
                 for axis in waiting:
                     # Said every cycle until acknowledged: some drives act on the second controlword only.
-                    self._tell(axis, controlword, repeat=True)
+                    self._send_command(axis, controlword, repeat=True)
                 if not waiting:
                     break
                 yield self._checked()
@@ -305,7 +307,7 @@ class _Walk:
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm it."""
-        still, rest = [0] * len(self._told), list(self._sample.position_counts)
+        still, rest = [0] * len(self._sent), list(self._sample.position_counts)
         silent = 0
         powered = list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
@@ -313,7 +315,7 @@ class _Walk:
                 state = self._state(axis)
                 resting = state is State.QUICK_STOP_ACTIVE and still[axis] >= self._bounds.standstill_cycles
                 goal = Goal.SWITCH_ON_DISABLED if resting else Goal.QUICK_STOP
-                self._tell(axis, next_command(state, goal), repeat=cycle % 10 == 0)
+                self._send_command(axis, next_command(state, goal), repeat=cycle % 10 == 0)
             self._sample = self._stream.advance()
             yield self._sample
             for axis, position in enumerate(self._sample.position_counts):

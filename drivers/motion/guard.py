@@ -85,13 +85,13 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     return tuple(found)
 
 
-def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> Guard:
+def find_guard(access: ObjectAccess, consumers: Consumers | None, recording_leftover: Callable[[int], bool]) -> Guard:
     """Choose a free entry of 1016h; one that still watches a recorder that was killed is used again.
 
     Args:
         access: to the node.
         consumers: its 1016h.
-        left_over: `is_left_over`, of an entry's value.
+        recording_leftover: `is_left_over`, of an entry's value.
 
     Raises:
         ObjectAccessError: the node does not answer; an object that it lacks is reported in `Guard.lack`.
@@ -99,7 +99,7 @@ def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Cal
     if consumers is None:
         return Guard(None, 0, None, "no 1016h: it does NOT stop by itself when the recorder is killed")
     for entry, value in consumers:
-        if (ours := left_over(value)) or not value & 0xFFFF:
+        if (ours := recording_leftover(value)) or not value & 0xFFFF:
             return Guard(entry, 0 if ours else value, *_option(access))
     return Guard(None, 0, None, "no free 1016h: it does NOT stop by itself when the recorder is killed")
 

@@ -28,7 +28,9 @@ FROZEN_COUNTS = 64
 """Way that the set-point must have gone meanwhile: one that creeps or has just begun proves nothing."""
 
 
-def way_counts(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float, time_s: float) -> float:
+def travel_counts(
+    distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float, time_s: float
+) -> float:
     """Way of a symmetric trapezoid from rest after a time, or of the triangle that it is [counts]."""
     velocity = min(velocity_counts_s, math.sqrt(distance_counts * acceleration_counts_s2))
     ramp_s = velocity / acceleration_counts_s2
@@ -77,7 +79,7 @@ class FrozenData:
                 self._last[axis] = (*values, sample.cycle)
                 continue
             since_s, now_s = ((cycle - self._begin) * self._period_s for cycle in (last[2], sample.cycle))
-            if now_s - since_s >= FROZEN_S and way_counts(*profile, now_s) - way_counts(*profile, since_s) >= (
+            if now_s - since_s >= FROZEN_S and travel_counts(*profile, now_s) - travel_counts(*profile, since_s) >= (
                 FROZEN_COUNTS
             ):
                 found.append(axis)
@@ -120,13 +122,13 @@ class ToggleBits:
                 self._last.pop(axis, None)
                 continue
             value = statuswords[axis] >> bit & 1
-            before, since_ns, cycles, told = self._last.get(axis, (-1, 0, 0, False))
+            before, since_ns, cycles, reported = self._last.get(axis, (-1, 0, 0, False))
             if value != before:
                 self._last[axis] = (value, time_ns, 0, False)
                 continue
             stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
-            self._last[axis] = (value, since_ns, cycles + 1, told or stale)
-            if stale and not told:
+            self._last[axis] = (value, since_ns, cycles + 1, reported or stale)
+            if stale and not reported:
                 yield axis, DataStale(node_id, bit, (time_ns - since_ns) * 1e-9, cycles + 1)
 
 

@@ -63,15 +63,15 @@ class ScaleForm(Enum):
     """The known ways from a raw number to ampere; `CurrentScale` is what each amounts to.
 
     PRODUCT: factor × objects. PER_MILLE: of a rated current that the drive holds in mA. FIXED_STEP: so many ampere.
-    DIGITS_OF_PEAK: so many digits are the drive's peak current, which a person enters. DIGITS_OF_TOLD_PEAK: the same,
-    and the drive tells it in mA. SWITCHED_PER_MILLE: of the rated current, or of it over √2, as an object says.
+    DIGITS_OF_PEAK: so many digits are the drive's peak current, which a person enters. DIGITS_OF_REPORTED_PEAK: the
+    same, and the drive tells it in mA. SWITCHED_PER_MILLE: of the rated current, or of it over √2, as an object says.
     """
 
     PRODUCT = "product"
     PER_MILLE = "per-mille-of-rated-current"
     FIXED_STEP = "fixed-step"
     DIGITS_OF_PEAK = "digits-of-peak-current"
-    DIGITS_OF_TOLD_PEAK = "digits-of-told-peak-current"
+    DIGITS_OF_REPORTED_PEAK = "digits-of-told-peak-current"
     SWITCHED_PER_MILLE = "per-mille-of-rated-current-or-its-rms"
 
 

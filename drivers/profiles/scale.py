@@ -15,7 +15,7 @@ from drivers.profiles.profile import Amplitude, DriveProfile, ObjectEntry
 
 SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
 """Of servo motors; what is outside was entered in another unit than mA."""
-FEWEST_STEPS = 20.0
+MIN_STEPS = 20.0
 """Raw units in the rated current; with fewer, rounding alone would be 5 % of it."""
 GROSS = 5.0
 """Ratio of two name plates from which on one of them is in another unit; no two motors are so unlike on purpose."""
@@ -110,10 +110,10 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     """
     if reading.rated_current_a is None or reading.rated_torque_nm is None:
         return ()  # the reading itself has said so
-    told, declared = reading.rated_torque_nm / reading.rated_current_a, abs(motor_nm_per_a)
-    ratio = told / declared
+    reported, declared = reading.rated_torque_nm / reading.rated_current_a, abs(motor_nm_per_a)
+    ratio = reported / declared
     evidence = (
-        f"{told:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / {reading.rated_current_a:g} A), "
+        f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / {reading.rated_current_a:g} A), "
         f"{declared:.4g} Nm/A by the cell's nameplate gain, {ratio:.3g} times"
     )
     if not 1.0 / GROSS < ratio < GROSS:
@@ -169,11 +169,11 @@ def _check_rated(node_id: int, profile: DriveProfile, ampere: float, rated_a: fl
         )
     steps, entry = rated_a / ampere, profile.current
     most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
-    if not FEWEST_STEPS <= steps <= most:
+    if not MIN_STEPS <= steps <= most:
         raise ScaleImplausible(
             node_id,
             profile.name,
             f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
-            f"{FEWEST_STEPS:g} to {most} steps, what {entry} can say",
+            f"{MIN_STEPS:g} to {most} steps, what {entry} can say",
             "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
         )

@@ -137,7 +137,7 @@ class SimulatedCell:
         self._wires, there = _wires(bus, ids)
         self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
         self._gate = SyncGate(len(self._wires))
-        _refuse_unsayable(spec.faults, bus)
+        _refuse_error_frames(spec.faults, bus)
         self._disturbance = Disturbance(spec.faults)
         for index, node in enumerate(self.nodes):
             node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
@@ -368,18 +368,18 @@ def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], t
     return tuple(map(str, bus.address.parts)), there
 
 
-def _refuse_unsayable(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
+def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
     """An error frame that a bus cannot carry would end the cell in the middle of somebody's run."""
     hub = (
         any(part.address.interface == "socketcand" for part in bus.address.parts)
         if isinstance(bus, SplitBus)
         else isinstance(bus, SocketcandBus)
     )
-    unsayable = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
-    if hub and unsayable:
+    error_frame_faults = sorted({fault.kind.value for fault in faults if fault.kind in ERROR_FRAMES})
+    if hub and error_frame_faults:
         raise SpecInvalid(
-            f"the faults {', '.join(unsayable)} are error frames, which the socketcand protocol does not have: "
-            "leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
+            f"the faults {', '.join(error_frame_faults)} are error frames, which the socketcand protocol does not "
+            "have: leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
         )
 
 

@@ -92,28 +92,28 @@ def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:
         amplifiers: after a SYNC period.
         rated_current_a: shape (n,).
     """
-    told = np.empty((8, len(rated_current_a)), dtype=np.int64)
-    _tell(amplifiers.loops, amplifiers.reported_a, rated_current_a, told)
-    return Readings(*told.tolist())
+    readings = np.empty((8, len(rated_current_a)), dtype=np.int64)
+    _fill(amplifiers.loops, amplifiers.reported_a, rated_current_a, readings)
+    return Readings(*readings.tolist())
 
 
 @compiled
-def _tell(
-    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, told: NDArray[np.int64]
+def _fill(
+    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
 ) -> None:
     """Fill one row for each field of Readings, in their order, shape (8, n)."""
     for i in range(len(loops)):
         axis = loops[i]
         # int32 as the bus carries it: an endless axis wraps around.
-        told[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
-        told[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
-        told[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
+        readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
+        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
+        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
         per_mille = 1000.0 / rated_current_a[i]
-        told[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
-        told[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
-        told[5, i] = axis["reached"]
-        told[6, i] = axis["limited"]
-        told[7, i] = axis["following_error"]
+        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
+        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
+        readings[5, i] = axis["reached"]
+        readings[6, i] = axis["limited"]
+        readings[7, i] = axis["following_error"]
 
 
 class ErrorCode(IntEnum):

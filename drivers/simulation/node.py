@@ -81,7 +81,9 @@ class Node:
         self._readings = readings
         self._send = send
         self._dictionary = translated(amplifier_dictionary(axis), axis)
-        self._told = {told.key: told.source(amplifiers, index) for told in current_objects(axis)}
+        self._signals = {
+            current_object.key: current_object.source(amplifiers, index) for current_object in current_objects(axis)
+        }
         self._values: dict[tuple[int, int], Value] = {key: entry.default for key, entry in self._dictionary.items()}
         self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary)
         self._triggers = tuple(TransmitTrigger(pdo, self._source) for pdo in self._transmit)
@@ -338,7 +340,7 @@ class Node:
         index, subindex = key
         if index == 0x1003:
             return lambda: (self._history[0] if self._history else 0) if subindex else len(self._history[:1])
-        return self._told.get(key) or live.get(index, lambda: self._number(index, subindex))
+        return self._signals.get(key) or live.get(index, lambda: self._number(index, subindex))
 
     def _number(self, index: int, subindex: int = 0) -> int:
         value = self._values[index, subindex]

@@ -299,10 +299,10 @@ class CurrentObject:
     def source(self, amplifiers: AmplifierSet, index: int) -> Callable[[], int]:
         """Its value at any time, of the amplifier of that index."""
         lowest, highest = _LIMITS[self.kind]
-        told_a = amplifiers.reported_a if self.signal is Signal.REFERENCE else amplifiers.actual_a
+        signal_a = amplifiers.reported_a if self.signal is Signal.REFERENCE else amplifiers.actual_a
 
         def value() -> int:
-            return max(lowest, min(highest, round(float(told_a[index]) / self.step_a)))
+            return max(lowest, min(highest, round(float(signal_a[index]) / self.step_a)))
 
         return value
 
@@ -341,8 +341,8 @@ _ABSENT: dict[Dialect, frozenset[int]] = {
 def translated(dictionary: Dictionary, axis: AxisSpec) -> Dictionary:
     """A dictionary of the standard with the objects of a make in it, and without those that the make lacks."""
     objects = {key: entry for key, entry in dictionary.items() if key[0] not in _ABSENT[axis.dialect]}
-    for told in current_objects(axis):
-        objects[told.key] = Entry(told.kind, mappable=Mappable.TRANSMIT)
+    for current_object in current_objects(axis):
+        objects[current_object.key] = Entry(current_object.kind, mappable=Mappable.TRANSMIT)
     if axis.dialect is Dialect.EPOS4:
         objects[0x3001, 1] = Entry(Kind.U32, round(1000 * axis.rated_current_a), writable=True)
     if axis.dialect is Dialect.COPLEY:

@@ -165,7 +165,7 @@ class Capture:
         self._backlog_dropped = self._interface_dropped = 0
         self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
         self._interface_before = self._read_interface()
-        self._told = (0, 0, 0)
+        self._reported_drops = (0, 0, 0)
         self._frame = bytearray(_FRAME.size)
 
     def run(self, parent: int) -> None:
@@ -258,12 +258,12 @@ class Capture:
             self._backlog_dropped += 1
             return
         self._backlog += RECORD.pack(*record)
-        self._told = (record.kernel_dropped, record.interface_dropped, record.backlog_dropped)
+        self._reported_drops = (record.kernel_dropped, record.interface_dropped, record.backlog_dropped)
 
     def _note(self, kind: Kind, number: int = 0) -> None:
         """Into the backlog even when that is full: these are few."""
-        self._told = self._counts
-        self._backlog += RECORD.pack(0, 0, *self._told, number, kind, 0, False, False, bytes(8))
+        self._reported_drops = self._counts
+        self._backlog += RECORD.pack(0, 0, *self._reported_drops, number, kind, 0, False, False, bytes(8))
 
     @property
     def _counts(self) -> tuple[int, int, int]:
@@ -282,11 +282,11 @@ class Capture:
     def _read_drops(self) -> None:
         """Ask the socket itself: a drop is told with the next frame, and there may be none."""
         try:
-            told = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
+            counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
         except OSError:
             return  # before Linux 4.12: then the next frame tells it
-        if len(told) == _MEMINFO.size:
-            self._drops.see(_MEMINFO.unpack(told)[_DROPS])
+        if len(counters) == _MEMINFO.size:
+            self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
 
     def forward(self) -> bool:
         """Hand on what the parent takes without waiting; tells whether there is still a parent."""
@@ -295,7 +295,7 @@ class Capture:
                 with memoryview(self._backlog) as waiting:
                     sent = self._out.send(waiting[:_SEND_BYTES], socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
                 del self._backlog[:sent]
-            if self._told != self._counts:
+            if self._reported_drops != self._counts:
                 self._note(Kind.LOSSES)
         except BlockingIOError:
             pass

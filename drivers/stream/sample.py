@@ -86,5 +86,5 @@ EventSink = Callable[[CellEvent], None]
 """Receives events in the order in which they happen, before the sample of their cycle is handed out."""
 
 
-def discard(event: CellEvent) -> None:
+def ignore_event(event: CellEvent) -> None:
     """An EventSink for those who want samples alone."""

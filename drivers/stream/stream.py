@@ -19,7 +19,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
 from drivers.errors import BusError, CellSilent, NodeMisplaced, PdoLengthWrong, SampleLost
 from drivers.motion.watch import Watch
-from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample, discard
+from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample, ignore_event
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
@@ -121,7 +121,7 @@ class SyncStream:
         self,
         network: CanopenNetwork,
         pacing: Pacing,
-        on_event: EventSink = discard,
+        on_event: EventSink = ignore_event,
         max_missing_cycles: int = 3,
     ) -> None:
         self.network = network

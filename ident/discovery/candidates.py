@@ -23,7 +23,7 @@ from ident.model.model import Model
 # Candidate columns put to the test on a problem in folds: what they explain, in-sample and on moves left out.
 
 
-SAID_ALREADY = 1e-6
+REDUNDANT_SHARE = 1e-6
 """Share of a column that must be left when all declared directions are taken out of it."""
 UNSEEN = 1e-9
 """Share of a direction, squared, below which the folds that a fit may use do not show it."""
@@ -70,7 +70,7 @@ class Products:
     part_held: FloatArray
 
 
-def put_to_test(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
+def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
     """Project columns off all declared directions, gains included, and see what they explain.
 
     Everything is computed from products that are summed block by block, so that a candidate costs no pass over the
@@ -103,7 +103,7 @@ def put_to_test(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) 
             made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w, folds.move_hessian
         )
         gram = move_gram.sum(axis=0)
-        if np.any(np.diag(gram) <= SAID_ALREADY * squares[chosen]) or np.linalg.cond(gram / _size(gram)) > 1e10:
+        if np.any(np.diag(gram) <= REDUNDANT_SHARE * squares[chosen]) or np.linalg.cond(gram / _size(gram)) > 1e10:
             trials.append(None)
             continue
         score = move_score[:, chosen].sum(axis=0)
@@ -206,7 +206,7 @@ FAST = frozenset({Abscissa.MOTOR_ANGLE})
 
 
 @dataclass(frozen=True, slots=True)
-class Tested:
+class TestedFamily:
     """A family on one axis, tested with each of its settings that says something.
 
     Attributes:
@@ -224,7 +224,7 @@ class Tested:
 
 
 @dataclass(frozen=True, slots=True)
-class Inquiry:
+class SearchProblem:
     """What candidates are tested on.
 
     Attributes:
@@ -274,9 +274,11 @@ class Inquiry:
         candidates = [slice(int(end) - torque.shape[1], int(end)) for end, torque in zip(ends, torques, strict=True)]
         whole = np.concatenate(torques, axis=1)
         columns = self.folds.problem.whitened(whole, self.model.drive_train.to_motor)
-        return put_to_test(self.folds, columns, candidates)
+        return score_candidates(self.folds, columns, candidates)
 
-    def test(self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False) -> tuple[Tested, ...]:
+    def test(
+        self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False
+    ) -> tuple[TestedFamily, ...]:
         """Families on an axis; those of which the model lacks nothing are left out."""
         torque = self.slow_torque if at_rows else self.torque
         placed = [
@@ -292,16 +294,16 @@ class Inquiry:
         for (number, effect), trial in zip(placed, trials, strict=True):
             if trial is not None:
                 members.setdefault(number, []).append((effect, trial))
-        return tuple(Tested(axis, tuple(found)) for found in members.values())
+        return tuple(TestedFamily(axis, tuple(found)) for found in members.values())
 
 
-def inquire(
+def prepare_search(
     model: Model,
     datasets: Sequence[Dataset],
     observation: Observation,
     estimate: Estimate,
     cache: ColumnCache | None = None,
-) -> Inquiry:
+) -> SearchProblem:
     """Linearise around an estimate, cut into folds, and predict what effects are made of.
 
     Args:
@@ -326,7 +328,7 @@ def inquire(
     )
     rows = tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True))
     floors = noise_floors(datasets, observation.conditioning)
-    return Inquiry(
+    return SearchProblem(
         model=model,
         datasets=datasets,
         observation=observation,

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
-from ident.discovery.candidates import ColumnCache, inquire
+from ident.discovery.candidates import ColumnCache, prepare_search
 from ident.discovery.search import Finding, Gates, Place, choose, find, judge, place_of, refined
 from ident.discovery.signals import session_began_s, signals
-from ident.discovery.structure import FEWEST_MOVES, detection_limits_nm, find_structure, is_inadequate
+from ident.discovery.structure import MIN_MOVES, detection_limits_nm, find_structure, is_inadequate
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.placement import acts_on, effect_torque
@@ -166,25 +166,27 @@ def close_the_loop(
     for _ in range(MAX_EFFECTS):
         known = len(current.effects)
         progress("looking for an effect that the model lacks" + (f" beside the {known} found" if known else ""))
-        inquiry = inquire(current.model, start.trained, current.training, current.estimate, cache)
-        findings = find(inquiry, rng, gates, families)
+        search_problem = prepare_search(current.model, start.trained, current.training, current.estimate, cache)
+        findings = find(search_problem, rng, gates, families)
         taken = frozenset((*refused, *(place_of(placed.effect, placed.axis) for placed in current.effects)))
         accepted = choose(findings, taken)
-        axes = range(inquiry.axes) if accepted is None else (accepted.axis,)
+        axes = range(search_problem.axes) if accepted is None else (accepted.axis,)
         if accepted is None:
             progress("looking for structure that no named effect explains")
-        structures = find_structure(inquiry, axes, rng, gates)
+        structures = find_structure(search_problem, axes, rng, gates)
         best = choose(structures, taken)
         if accepted is None or (best is not None and is_inadequate(accepted, best)):
             accepted = best
-        limits_nm = detection_limits_nm(inquiry, gates)
+        limits_nm = detection_limits_nm(search_problem, gates)
         if accepted is None:
-            few = inquiry.folds.moves < FEWEST_MOVES
-            words = [f"{inquiry.folds.moves} moves are too few (of {FEWEST_MOVES}) to ask for what has no name"] * few
+            few = search_problem.folds.moves < MIN_MOVES
+            words = [
+                f"{search_problem.folds.moves} moves are too few (of {MIN_MOVES}) to ask for what has no name"
+            ] * few
             steps.append(Step(findings, structures, limits_nm, None, current, "; ".join((*refused.values(), *words))))
             break
         place = place_of(accepted.effect, accepted.axis)
-        accepted = replace(accepted, effect=refined(inquiry, accepted.effect, accepted.axis, families))
+        accepted = replace(accepted, effect=refined(search_problem, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         try:
             joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
@@ -212,8 +214,10 @@ def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> 
             rest = with_effects(current, tuple(other for other in current.effects if other != placed))
         except UNFITTED:
             continue  # what the data cannot be fitted without is not idle
-        inquiry = inquire(rest.model, rest.trained, rest.training, rest.estimate)
-        (finding, *_) = judge(inquiry, inquiry.test(((placed.effect,),), placed.axis), rng, gates) or (None,)
+        search_problem = prepare_search(rest.model, rest.trained, rest.training, rest.estimate)
+        (finding, *_) = judge(search_problem, search_problem.test(((placed.effect,),), placed.axis), rng, gates) or (
+            None,
+        )
         if finding is None or not finding.passed:
             current = rest
     return current

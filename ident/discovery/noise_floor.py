@@ -35,8 +35,8 @@ from ident.equations.rows import row_filter
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FEWEST_DWELLS = 8
-FEWEST_FREEDOM = 20.0
+MIN_DWELLS = 8
+MIN_FREEDOM = 20.0
 """σ is then known to 20 %."""
 _TREND = 3
 """Coefficients of the parabola: a straight line leaves the bend of a controller that settles."""
@@ -85,10 +85,10 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
         if row_filter(data, conditioning).rows(part.stop - part.start) > _TREND
         and np.ptp(data.current_a[motor, part]) > 0.0
     ]
-    if len(dwells) < FEWEST_DWELLS:
+    if len(dwells) < MIN_DWELLS:
         return None
     variance, freedom = np.array(dwells).T
-    if freedom.sum() < FEWEST_FREEDOM:
+    if freedom.sum() < MIN_FREEDOM:
         return None
     likely = variance * freedom / stats.chi2.median(freedom)
     order = np.argsort(likely)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ident.discovery.candidates import Inquiry, Tested, Trial
+from ident.discovery.candidates import SearchProblem, TestedFamily, Trial
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 
@@ -102,7 +102,7 @@ class Finding:
 
 
 def find(
-    inquiry: Inquiry,
+    search_problem: SearchProblem,
     rng: np.random.Generator,
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
@@ -115,8 +115,8 @@ def find(
         gates: what a candidate must show.
         families: the dictionary.
     """
-    tested = [found for axis in range(inquiry.axes) for found in inquiry.test(families, axis)]
-    return judge(inquiry, tested, rng, gates or Gates())
+    tested = [found for axis in range(search_problem.axes) for found in search_problem.test(families, axis)]
+    return judge(search_problem, tested, rng, gates or Gates())
 
 
 def choose(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
@@ -145,7 +145,9 @@ def place_of(effect: Effect, axis: int) -> Place:
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 
-def judge(inquiry: Inquiry, tested: Sequence[Tested], rng: np.random.Generator, gates: Gates) -> tuple[Finding, ...]:
+def judge(
+    search_problem: SearchProblem, tested: Sequence[TestedFamily], rng: np.random.Generator, gates: Gates
+) -> tuple[Finding, ...]:
     """What the data say of each family, ranked by left-out moves.
 
     Args:
@@ -158,8 +160,8 @@ def judge(inquiry: Inquiry, tested: Sequence[Tested], rng: np.random.Generator, 
         return ()
     trials = tuple(trial for family in tested for _, trial in family.members)
     probabilities = iter(_max_t(trials, rng, gates.draws))
-    before = inquiry.folds.square_sum(inquiry.folds.residual)
-    findings = [_judge(inquiry, before, family, probabilities, gates) for family in tested]
+    before = search_problem.folds.square_sum(search_problem.folds.residual)
+    findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
     ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
     return tuple(replace(finding, ambiguity=_alike(finding, ranked)) for finding in ranked)
 
@@ -176,9 +178,13 @@ def _parameters(effect: Effect) -> int:
 
 
 def _judge(
-    inquiry: Inquiry, before: FloatArray, family: Tested, probabilities: Iterator[float], gates: Gates
+    search_problem: SearchProblem,
+    before: FloatArray,
+    family: TestedFamily,
+    probabilities: Iterator[float],
+    gates: Gates,
 ) -> Finding:
-    problem, members = inquiry.folds.problem, family.members
+    problem, members = search_problem.folds.problem, family.members
     probability = [next(probabilities) for _ in members]
     best = int(np.argmax([float(trial.fallen.sum()) for _, trial in members]))
     effect, trial = members[best]
@@ -212,7 +218,7 @@ def _judge(
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
         passed=bool(passed),
-        share_of_excess=_share_of_excess(inquiry, motor, float(trial.fallen[motor]), own),
+        share_of_excess=_share_of_excess(search_problem, motor, float(trial.fallen[motor]), own),
         fold_errors=after.sum(axis=1),
     )
 
@@ -223,8 +229,8 @@ def _deviations(trial: Trial) -> FloatArray:
     return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
 
 
-def _share_of_excess(inquiry: Inquiry, motor: int, fallen: float, own: float) -> float | None:
-    floor_a, problem = inquiry.floors_a[motor], inquiry.folds.problem
+def _share_of_excess(search_problem: SearchProblem, motor: int, fallen: float, own: float) -> float | None:
+    floor_a, problem = search_problem.floors_a[motor], search_problem.folds.problem
     if floor_a is None:
         return None
     excess = own - float(np.sum(problem.motor == motor)) * (floor_a / problem.noise[motor]) ** 2
@@ -293,7 +299,7 @@ DECLARED = {"exponent": (0.8, 1.25)}
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
-def refined(inquiry: Inquiry, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]) -> Effect:
+def refined(search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]) -> Effect:
     """Golden section on the squared residual, over the logarithm of a setting, between its neighbours in the family.
 
     An effect without a positive real setting, or at the end of its family, is returned as it is.
@@ -318,7 +324,7 @@ def refined(inquiry: Inquiry, effect: Effect, axis: int, families: Iterable[Sequ
         place = grid.index(value)
         if grid[0] > 0 and 0 < place < len(grid) - 1:
             lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
-            return _golden(inquiry, effect, axis, name, lower, upper)
+            return _golden(search_problem, effect, axis, name, lower, upper)
     return effect
 
 
@@ -330,11 +336,11 @@ def _one_side(name: str, value: float, lower: float, upper: float) -> tuple[floa
     return (lower, min(upper, below)) if value < below else (max(lower, above), upper)
 
 
-def _golden(inquiry: Inquiry, effect: Effect, axis: int, name: str, lower: float, upper: float) -> Effect:
+def _golden(search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float) -> Effect:
     a, b = float(np.log(lower)), float(np.log(upper))
 
     def fall(x: float) -> float:
-        (trial,) = inquiry.trials([inquiry.torque(_with(effect, name, float(np.exp(x))), axis)])
+        (trial,) = search_problem.trials([search_problem.torque(_with(effect, name, float(np.exp(x))), axis)])
         return -np.inf if trial is None else float(trial.fallen.sum())
 
     inner, outer = b - GOLDEN * (b - a), a + GOLDEN * (b - a)

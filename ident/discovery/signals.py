@@ -119,8 +119,8 @@ def declared_signals(
 
 def session_began_s(datasets: Sequence[Dataset]) -> float | None:
     """When the first of some runs began, or None where one of them does not tell."""
-    told = [data.started_s for data in datasets if data.started_s is not None]
-    return min(told) if told and len(told) == len(datasets) else None
+    starts_s = [data.started_s for data in datasets if data.started_s is not None]
+    return min(starts_s) if starts_s and len(starts_s) == len(datasets) else None
 
 
 def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.discovery.candidates import Inquiry
+from ident.discovery.candidates import SearchProblem
 from ident.discovery.search import Finding, Gates, is_better, judge
 from ident.effects.effect import Abscissa, Effect, values
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
@@ -32,14 +32,14 @@ VARIABLES = (
 )
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
 MUCH_MORE = 0.15
-FEWEST_MOVES = 5 * (INTERVALS + 1)
+MIN_MOVES = 5 * (INTERVALS + 1)
 """Five for each coefficient of a term."""
 TAIL = 0.005
 """Of the samples at either end of a variable's range: there a spline would rest on a handful of them."""
 
 
 def find_structure(
-    inquiry: Inquiry, axes: Iterable[int], rng: np.random.Generator, gates: Gates
+    search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
     """What the residual of some axes depends on, the best on left-out moves first.
 
@@ -49,10 +49,12 @@ def find_structure(
         rng: of the bootstrap.
         gates: what a term must show.
     """
-    if inquiry.folds.moves < FEWEST_MOVES:
+    if search_problem.folds.moves < MIN_MOVES:
         return ()  # a term of many coefficients would fit the few moves that there are
-    tested = [found for axis in axes for found in inquiry.test(_families(inquiry, axis), axis, at_rows=True)]
-    return judge(inquiry, tested, rng, gates)
+    tested = [
+        found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
+    ]
+    return judge(search_problem, tested, rng, gates)
 
 
 def is_inadequate(named: Finding, structure: Finding) -> bool:
@@ -64,7 +66,7 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
     return structure.passed and more and is_better(structure, named)
 
 
-def detection_limits_nm(inquiry: Inquiry, gates: Gates) -> FloatArray:
+def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
     """Torque (root mean square over the moving rows) that an effect must have at each motor to be found, shape (n,).
 
     It is torque that the declared model cannot mimic: of an effect that looks much like gravity or viscous friction
@@ -73,40 +75,40 @@ def detection_limits_nm(inquiry: Inquiry, gates: Gates) -> FloatArray:
     It is what opens the gates on the size of an effect whose shape the dictionary or a spline can follow; on a short
     recording noise asks for more.
     """
-    problem = inquiry.folds.problem
+    problem = search_problem.folds.problem
     noise_a = np.array(
         [
             problem.noise[i] * float(np.sqrt(np.mean(problem.residual[problem.motor == i] ** 2)))
-            for i in range(inquiry.axes)
+            for i in range(search_problem.axes)
         ]
     )
     return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))
 
 
-def _families(inquiry: Inquiry, axis: int) -> tuple[tuple[Effect, ...], ...]:
+def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, ...], ...]:
     """A family a variable, with the range that it has in these runs."""
     families: list[tuple[Effect, ...]] = []
     for variable, signs in VARIABLES:
-        if variable is Abscissa.SESSION and not _has_session(inquiry):
+        if variable is Abscissa.SESSION and not _has_session(search_problem):
             continue
-        term = _ranged(inquiry, Smooth(variable), axis)
+        term = _ranged(search_problem, Smooth(variable), axis)
         families.append(tuple(replace(term, signed=sign) for sign in signs))
     families.append((Periodic(0), Periodic(1)))
-    for other in range(inquiry.axes):
+    for other in range(search_problem.axes):
         if other != axis:
-            term = _ranged(inquiry, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
+            term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
             families.append((replace(term, signed=1), replace(term, signed=0)))
     return tuple(families)
 
 
-def _has_session(inquiry: Inquiry) -> bool:
-    return any(not np.array_equal(run.time_s, run.session_s) for run in inquiry.rows)
+def _has_session(search_problem: SearchProblem) -> bool:
+    return any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
 
 
-def _ranged(inquiry: Inquiry, term: Smooth, axis: int) -> Smooth:
+def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:
     other = term.other_axis - 1 if term.other_axis else None
-    x = np.concatenate([values(term.variable, run, axis, other) for run in inquiry.rows])
-    x = x[inquiry.observation.use[axis]]
+    x = np.concatenate([values(term.variable, run, axis, other) for run in search_problem.rows])
+    x = x[search_problem.observation.use[axis]]
     if term.variable in FOLDED:
         x = np.abs(x)
     lower, upper = np.quantile(x, (0.0 if term.variable in FOLDED else TAIL, 1.0 - TAIL))

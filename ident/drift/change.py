@@ -25,7 +25,7 @@ FALSE_ALARM = 0.01
 
 _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
 """How many successive differences the prior is worth, and the pooled estimate beside an axis' own."""
-_FEWEST_DIFFERENCES = 4
+_MIN_DIFFERENCES = 4
 _CUT = 1.5
 """Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
 _FARTHEST = 1e100
@@ -146,7 +146,7 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     """
     values, stds = np.asarray(values, float), np.asarray(stds, float)
     count = values.shape[-1] - 1
-    if count < _FEWEST_DIFFERENCES:
+    if count < _MIN_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
     # Not about their own centre, which of few differences is too near to them.
     with np.errstate(over="ignore"):
@@ -187,14 +187,14 @@ def _holm(probabilities: FloatArray) -> FloatArray:
 def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:
     if not axes:
         return "no gain to compare"
-    told = [
+    parts = [
         f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {len(axes)})"
         for axis, change, p in zip(axes, changes, adjusted, strict=True)
     ]
-    changed = [text for text, p in zip(told, adjusted, strict=True) if p <= level]
+    changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= level]
     if changed:
         return f"changed by more than noise: {', '.join(changed)}"
-    largest = told[int(np.argmax([abs(change.sigmas) for change in changes]))]
+    largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
     return f"no gain has changed by more than noise: the largest change is {largest}"
 
 

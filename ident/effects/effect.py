@@ -60,7 +60,7 @@ def values(abscissa: Abscissa, signals: Signals, axis: int, other: int | None = 
         Abscissa.CURRENT: lambda: signals.current_a[axis],
         Abscissa.TORQUE_RATE: lambda: np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz,
         Abscissa.LOAD_CURVATURE: lambda: curvature(signals.load_torque_nm[axis], signals.rate_hz),
-        Abscissa.DISTANCE: lambda: way_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)[1],
+        Abscissa.DISTANCE: lambda: distance_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)[1],
         Abscissa.OTHER_VELOCITY: lambda: signals.velocity_rad_s[axis if other is None else other],
     }
     return np.asarray(given[abscissa](), dtype=np.float64)
@@ -71,7 +71,7 @@ def curvature(value: FloatArray, rate_hz: float) -> FloatArray:
     return np.asarray(np.gradient(np.gradient(value)) * rate_hz**2)
 
 
-def way_since_reversal(velocity_rad_s: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+def distance_since_reversal(velocity_rad_s: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
     """Direction of the last motion (−1, 0 before any, 1) and the way made in it [rad], both of shape (k,)."""
     moving = np.abs(velocity_rad_s) > STICKING_RAD_S
     way = np.cumsum(np.abs(velocity_rad_s) * moving) / rate_hz

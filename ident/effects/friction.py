@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.discovery.signals import Signals
-from ident.effects.effect import Abscissa, Property, Side, way_since_reversal
+from ident.effects.effect import Abscissa, Property, Side, distance_since_reversal
 from ident.model.model import Column
 
 FloatArray = NDArray[np.float64]
@@ -221,13 +221,13 @@ class Presliding:
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Torque per unit of each coefficient, shape (1, k)."""
-        direction, distance = way_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)
+        direction, distance = distance_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)
         return np.asarray(_lag_of_bristle(direction, distance, self.distance_rad))[None]
 
 
-def _lag_of_bristle(direction: FloatArray, way_rad: FloatArray, distance_rad: float) -> FloatArray:
+def _lag_of_bristle(direction: FloatArray, travel_rad: FloatArray, distance_rad: float) -> FloatArray:
     """z − direction: after a reversal it starts where the last one had come to, and dies out over the distance."""
-    faded = np.exp(-way_rad / distance_rad)
+    faded = np.exp(-travel_rad / distance_rad)
     starts = np.flatnonzero(np.diff(direction, prepend=np.nan) != 0)
     lag = np.empty_like(direction)
     bristle = 0.0

@@ -15,7 +15,7 @@ from scipy import linalg
 
 from ident.equations.observation import Observation
 from ident.errors import TooFewMoves
-from ident.estimators.estimate import FEWEST_MOVES
+from ident.estimators.estimate import MIN_MOVES
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -190,8 +190,8 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     """
     whole = np.arange(problem.moves) if whole is None else np.unique(whole, return_inverse=True)[1]
     moves = int(whole.max()) + 1
-    if moves < FEWEST_MOVES:
-        raise TooFewMoves(moves, FEWEST_MOVES)
+    if moves < MIN_MOVES:
+        raise TooFewMoves(moves, MIN_MOVES)
     count = min(count, moves)
     fold_of = whole % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]

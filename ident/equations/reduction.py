@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-MOST_CLUSTERS = 256
+MAX_CLUSTERS = 256
 """Moves of very long data are joined with their neighbours: 256 clusters say as much of a scatter as 3000."""
 
 
@@ -225,10 +225,10 @@ def reduce_runs(
                 moves.setdefault(move, []).append(parts)
         for pieces in moves.values():
             clusters.append(_cluster(mounting, pieces))
-            if len(clusters) > 2 * MOST_CLUSTERS:
+            if len(clusters) > 2 * MAX_CLUSTERS:
                 clusters = _joined(clusters)
         names.append(run.name)
-    if len(clusters) > MOST_CLUSTERS:
+    if len(clusters) > MAX_CLUSTERS:
         clusters = _joined(clusters)
     return Reduction(
         model=model,

@@ -121,7 +121,7 @@ class Estimate:
 # White 1985; for clusters Bell & McCaffrey 2002, CR3).
 
 
-FEWEST_MOVES = 8
+MIN_MOVES = 8
 """With fewer, leaving one out in turn tells little of the scatter, and folds of moves hold one each."""
 
 
@@ -144,8 +144,8 @@ def jackknife_covariance(
         TooFewMoves: their scatter says nothing of the uncertainty.
     """
     moves, count = len(system.moves), len(gains)
-    if moves < FEWEST_MOVES:
-        raise TooFewMoves(moves, FEWEST_MOVES)
+    if moves < MIN_MOVES:
+        raise TooFewMoves(moves, MIN_MOVES)
     free = slice(count if gains_fixed else 0, count + len(parameters))
     grams, scores = [], []
     for move in system.moves:

@@ -242,7 +242,7 @@ class Checker:
             blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
             if blocked.any():
                 question, sample = np.argwhere(blocked)[0]
-                return self._told(int(question), float(margins[question, sample]), position[:, sample])
+                return self._obstruction_at(int(question), float(margins[question, sample]), position[:, sample])
             half /= 2.0
             open_ = middles[unsure.any(axis=0)]
             middles = np.concatenate((open_ - half, open_ + half))
@@ -308,7 +308,7 @@ class Checker:
             link = self.robot.joints[link].parent
         return chain
 
-    def _told(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
+    def _obstruction_at(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
         where = tuple(float(value) for value in position)
         if question < len(self._questions):
             names = [thing.name for things in (self.scene.capsules, self.scene.boxes) for thing in things]

@@ -326,7 +326,7 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
     return ExpectedPayload(frozenset(payload.known), parameters)
 
 
-def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, lively: Motion) -> FloatArray:
+def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motion: Motion) -> FloatArray:
     """Of each joint [Nm or N], shape (n,): the URDF's effort limit, else TORQUE_RESERVE times what rigid links need.
 
     Args:
@@ -335,7 +335,7 @@ def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, lively: Mo
         links: inertial parameters with the payload on the last one, shape (n, 10).
         lively: motion as fast as the limits allow.
     """
-    columns = model.regressor(lively)
+    columns = model.regressor(fast_motion)
     rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
     largest = np.abs(np.einsum("jck,c->jk", rigid, links.reshape(-1))).max(axis=1)
     declared = read_urdf(urdf).effort_limit

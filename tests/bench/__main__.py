@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.bench.fleet import told as fleet_told
-from tests.bench.log_reading import told
+from tests.bench.fleet import summary_text as fleet_text
+from tests.bench.log_reading import summary_text
 
 OUT = Path("out/bench")
 RESULT = Path("out/bench.json")
@@ -58,14 +58,14 @@ def main() -> int:
         "fleet": fleet,
     }
     RESULT.write_text(json.dumps(result, indent=2) + "\n")
-    _tell(f"\nwritten: {RESULT}")
+    _print_line(f"\nwritten: {RESULT}")
     return 0
 
 
 def _comparison(repeats: int) -> dict[str, Any]:
     python = _figaroh_python()
     data = OUT / "measurements.npz"
-    _tell(f"{SAMPLES} samples × 6 axes: rows of 84 standard parameters, base parameters, least squares; one core")
+    _print_line(f"{SAMPLES} samples × 6 axes: rows of 84 standard parameters, base parameters, least squares; one core")
     make = [sys.executable, "-m", "tests.bench.synthetic", str(URDF), str(SAMPLES), str(data)]
     subprocess.run(make, env=ENVIRONMENT, check=True)
     predicted = {"ours": OUT / "predicted-ours.npy", "figaroh": OUT / "predicted-figaroh.npy"}
@@ -79,31 +79,33 @@ def _comparison(repeats: int) -> dict[str, Any]:
     }
     ours, theirs = (np.load(predicted[name]) for name in ("ours", "figaroh"))
     difference = float(np.max(np.abs(ours - theirs)) / np.max(np.abs(theirs)))
-    _tell(
+    _print_line(
         "\n| | processor time s, median (all) | base parameters | residual norm Nm | peak MB |\n|---|---|---|---|---|"
     )
     for name, figures in found.items():
         totals = [run["total"] for run in figures["seconds"]]
         figures["median_seconds"] = statistics.median(totals)
-        _tell(
+        _print_line(
             f"| {name} | {figures['median_seconds']:.3f} ({', '.join(f'{total:.3f}' for total in totals)}) "
             f"| {figures['base_parameters']} | {figures['residual_norm_nm']:.9g} | {figures['peak_mb']:.0f} |"
         )
     ratio = found["figaroh"]["median_seconds"] / found["ours"]["median_seconds"]
-    _tell(f"ratio {ratio:.1f}; predicted torques differ by {difference:.1e} of the largest")
+    _print_line(f"ratio {ratio:.1f}; predicted torques differ by {difference:.1e} of the largest")
     return {"samples": SAMPLES, **found, "ratio": ratio, "largest_relative_difference": difference}
 
 
 def _growth(sizes: tuple[int, ...]) -> list[dict[str, Any]]:
-    _tell("\n| samples | processor time s | µs a sample | against the first | peak MB | residual std Nm (true: 1) |")
-    _tell("|---" * 6 + "|")
+    _print_line(
+        "\n| samples | processor time s | µs a sample | against the first | peak MB | residual std Nm (true: 1) |"
+    )
+    _print_line("|---" * 6 + "|")
     rows: list[dict[str, Any]] = []
     for size in sizes:
         row = _json_of([sys.executable, "-m", "tests.bench.growth", str(URDF), str(size)])
         row["microseconds_a_sample"] = 1e6 * row["seconds"] / size
         row["against_first"] = row["microseconds_a_sample"] / (rows or [row])[0]["microseconds_a_sample"]
         rows.append(row)
-        _tell(
+        _print_line(
             f"| {size} | {row['seconds']:.2f} | {row['microseconds_a_sample']:.2f} | {row['against_first']:.2f} "
             f"| {row['peak_mb']:.0f} | {row['residual_std_nm']:.4f} |"
         )
@@ -127,25 +129,27 @@ def _whole_fit(repeats: int) -> dict[str, Any]:
             raise SystemExit(f"`{' '.join(command)}` ended with {child.returncode}")
         runs.append({"user": usage.ru_utime, "system": usage.ru_stime, "peak_mb": usage.ru_maxrss / 1024.0})
     seconds = statistics.median(run["user"] + run["system"] for run in runs)
-    _tell(f"\nfit by ml, two finished logs of 60 s at 1 kHz to calibration.yaml: {seconds:.2f} s of processor time")
+    _print_line(
+        f"\nfit by ml, two finished logs of 60 s at 1 kHz to calibration.yaml: {seconds:.2f} s of processor time"
+    )
     for run in runs:
-        _tell(f"  user {run['user']:.2f} s, system {run['system']:.2f} s, peak {run['peak_mb']:.0f} MB")
+        _print_line(f"  user {run['user']:.2f} s, system {run['system']:.2f} s, peak {run['peak_mb']:.0f} MB")
     return {"seconds": seconds, "runs": runs}
 
 
 def _log_reading(hour_s: int) -> dict[str, Any]:
-    _tell("")
+    _print_line("")
     found = _json_of([sys.executable, "-m", "tests.bench.log_reading", "--json", "--hour", str(hour_s)])
-    _tell(told(found))
+    _print_line(summary_text(found))
     return found
 
 
 def _fleet(cells: int, repeats: int) -> dict[str, Any]:
-    _tell(f"\n`drivegain fleet` on {cells} simulated cells, wall time of whole commands")
+    _print_line(f"\n`drivegain fleet` on {cells} simulated cells, wall time of whole commands")
     found = _json_of(
         [sys.executable, "-m", "tests.bench.fleet", "--json", "--cells", str(cells), "--repeats", str(repeats)]
     )
-    _tell(fleet_told(found))
+    _print_line(fleet_text(found))
     return found
 
 
@@ -154,7 +158,7 @@ def _figaroh_python() -> Path:
     python = FIGAROH_VENV / "bin" / "python"
     installed = FIGAROH_VENV / ".installed"
     if not installed.exists() or installed.read_text() != FIGAROH:
-        _tell(f"installing {FIGAROH} into {FIGAROH_VENV} (once)")
+        _print_line(f"installing {FIGAROH} into {FIGAROH_VENV} (once)")
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", "--clear", str(FIGAROH_VENV)], check=True)
         install = [sys.executable, "-m", "pip", "--python", str(python), "install", "-qq", FIGAROH]
         subprocess.run(install, check=True)
@@ -181,7 +185,7 @@ def _machine() -> dict[str, Any]:
     }
 
 
-def _tell(text: str) -> None:
+def _print_line(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from daq.workflow.calibration_file import as_document, load
 from daq.workflow.fit import calibration_of, fit
-from tests.bench.fleet_cells import CELLS, FleetCell, make_fleet, tell
+from tests.bench.fleet_cells import CELLS, FleetCell, make_fleet, print_line
 
 LOGS = Path("out/bench/fleet")
 OUT = Path("out/bench/fleet-results")
@@ -46,7 +46,7 @@ def main() -> int:
     if arguments.single is not None:
         sys.stdout.write(json.dumps({folder.name: _single(folder) for folder in sorted(arguments.single.iterdir())}))
         return 0
-    make_fleet(LOGS, arguments.cells, tell)
+    make_fleet(LOGS, arguments.cells, print_line)
     # A folder of as many as were asked for: more may have been made.
     chosen = OUT / "logs"
     shutil.rmtree(OUT, ignore_errors=True)
@@ -69,7 +69,7 @@ def main() -> int:
             runs[f"{kind} {workers}"].append(figures)
             same = sum(single[name] == _kept(out, name) for name in names)
             equal = min(equal, same)
-            tell(
+            print_line(
                 f"--scheduler {kind} --workers {workers}: {figures['seconds']:.1f} s, processor time "
                 f"{figures['processor_s']:.1f} s, largest process {figures['peak_mb']:.0f} MB, "
                 f"{same} of {len(names)} equal"
@@ -77,11 +77,11 @@ def main() -> int:
     found = {"cells": len(names), "single_s": single_s, "runs": runs, "equal": equal, "load": os.getloadavg()}
     medians = {name: statistics.median(run["seconds"] for run in several) for name, several in runs.items()}
     found |= {"seconds": medians, "ratio": medians["processes 1"] / medians["processes 2"]}
-    tell(json.dumps(found) if arguments.json else told(found))
+    print_line(json.dumps(found) if arguments.json else summary_text(found))
     return 0 if equal == len(names) else 1
 
 
-def told(found: dict[str, Any]) -> str:
+def summary_text(found: dict[str, Any]) -> str:
     """The figures, for a person."""
     lines = [f"{found['cells']} single fits in one process: {found['single_s']:.1f} s"]
     for name, runs in found["runs"].items():

@@ -150,18 +150,18 @@ def _write(path: Path, raw: RawRun, cell: Cell, files: dict[str, bytes], start_n
         log.conclude(True)
 
 
-def make_fleet(folder: Path, cells: int, told: Callable[[str], None]) -> None:
+def make_fleet(folder: Path, cells: int, print_line: Callable[[str], None]) -> None:
     """Make the cells that are missing, on two processes."""
     if all((folder / FleetCell(folder, number, ()).name).is_dir() for number in range(cells)):
         return
-    told(f"planning {3 * PLAN_SETS} runs of {DURATION_S:g} s")
+    print_line(f"planning {3 * PLAN_SETS} runs of {DURATION_S:g} s")
     plans = plans_of(PLAN_SETS, exchanges=300)
     tasks = [FleetCell(folder, number, plans[number % PLAN_SETS]) for number in range(cells)]
     for done, name in enumerate(side_by_side(make_cell, tasks, 2), start=1):
-        told(f"{name}: {done} of {cells} cells simulated")
+        print_line(f"{name}: {done} of {cells} cells simulated")
 
 
-def tell(line: str) -> None:
+def print_line(line: str) -> None:
     """A line at once."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
@@ -169,7 +169,7 @@ def tell(line: str) -> None:
 
 def main(folder: str, cells: str) -> int:
     """Make them."""
-    make_fleet(Path(folder), int(cells), tell)
+    make_fleet(Path(folder), int(cells), print_line)
     return 0
 
 

@@ -137,7 +137,7 @@ def measure(folder: Path, hour_s: int = HOUR_S) -> dict[str, Any]:
     }
 
 
-def told(found: dict[str, Any]) -> str:
+def summary_text(found: dict[str, Any]) -> str:
     """The figures of `measure`, for a person."""
     minute, long = found["passed_through"]["minute"], found["passed_through"]["hour"]
     return (
@@ -163,7 +163,7 @@ def main() -> int:
         return 0
     with TemporaryDirectory(prefix="log-reading-") as name:
         found = measure(Path(name), arguments.hour)
-    sys.stdout.write((json.dumps(found) if arguments.json else told(found)) + "\n")
+    sys.stdout.write((json.dumps(found) if arguments.json else summary_text(found)) + "\n")
     return 0 if found["ratio"] >= PROMISED_RATIO else 1
 
 

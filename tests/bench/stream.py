@@ -73,7 +73,7 @@ def main() -> int:
     path = Path(os.environ.get(OUT, "out")) / "bench-stream.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n")
-    _tell(f"written: {path}")
+    _print_line(f"written: {path}")
     return 0 if all(run["identity_holds"] for run in (*runs, quiet, flood)) else 1
 
 
@@ -114,9 +114,12 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
         seconds = time.monotonic() - begun_s
         main_s, all_s = time.thread_time() - main_before, time.process_time() - all_before
         capture_s = _processor_s(ends[0].capture_pid) - capture_before
-        told, losses = stream.statistics, ends[0].losses
+        reported, losses = stream.statistics, ends[0].losses
         sent_text, sending_s = sender.communicate()[0].split()
-    sent, received = int(sent_text), told.cycles + told.frames + told.late + told.duplicate + told.foreign
+    sent, received = (
+        int(sent_text),
+        reported.cycles + reported.frames + reported.late + reported.duplicate + reported.foreign,
+    )
     lost = losses.total
     steps_us = np.diff(stamps[: max(count - 1, 0)]) * 1e-3
     asked_hz = 1e6 / period_us if period_us else None
@@ -134,8 +137,8 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
         "lost_by_interface": losses.interface,
         "lost_in_backlog": losses.backlog,
         "identity_holds": sent == received + lost,
-        "missing_answers": told.missing,
-        "late_answers": told.late,
+        "missing_answers": reported.missing,
+        "late_answers": reported.late,
         "samples_of_mixed_cycles": wrong,
         "steps_of_more_than_a_period_and_a_half": regular.skipped_periods,
         "processor_share_capture": round(capture_s / seconds, 3),
@@ -145,7 +148,7 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
         "sync_step_us": _spread(steps_us),
         "read_after_sync_ms": _spread(waits[:count] * 1e-6),
     }
-    _tell(json.dumps(result))
+    _print_line(json.dumps(result))
     return result
 
 
@@ -209,7 +212,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 

@@ -62,12 +62,12 @@ def recorded(calibration: Calibration, at: datetime) -> Calibration:
 
 def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
     """The same with something else in what every log tells of its making."""
-    told = [(source, source.recording) for source in calibration.sources]
+    reported = [(source, source.recording) for source in calibration.sources]
     return replace(
         calibration,
         sources=tuple(
             source if recording is None else replace(source, recording=replace(recording, **changes))  # type: ignore[arg-type]
-            for source, recording in told
+            for source, recording in reported
         ),
     )
 

@@ -33,7 +33,7 @@ from ident.calibration import Calibration
 from tests.daq.calibrations import NAMEPLATE, demo_calibration
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-DOER = Applier("Kim", "kim")
+ACTOR = Applier("Kim", "kim")
 CONFIGS = Path(__file__).parents[2] / "configs"
 WHOLE = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
 REAL = GainObject(Parameter(0x2003, 2, ParameterKind.F32), 1.0)
@@ -89,10 +89,10 @@ def with_mapping(axis: Axis, mapping: Mapping) -> Axis:
     return replace(axis, profile=replace(axis.profile, save=replace(save, mapping=mapping)))
 
 
-def entered_gain(node: Node, told: GainObject = WHOLE) -> float:
+def entered_gain(node: Node, gain_object: GainObject = WHOLE) -> float:
     """What stands in a drive now [Nm/A]."""
-    word = int.from_bytes(node.read(told.parameter.index, told.parameter.subindex), "little")
-    return told.parameter.value(word) / told.factor
+    word = int.from_bytes(node.read(gain_object.parameter.index, gain_object.parameter.subindex), "little")
+    return gain_object.parameter.value(word) / gain_object.factor
 
 
 def saved_gain(node: Node) -> float:
@@ -149,11 +149,11 @@ def apply_in_drives(
             policy=cell.apply,
             configuration_changed=True,
             looked_at=base,
-            appliers=DOER.names,
+            appliers=ACTOR.names,
             file=Path("calibration.yaml"),
             content=encode(calibration),
         ),
-        doer=DOER,
+        actor=ACTOR,
         saving=saving,
         audit=cell.history.audit,
         yes=yes,

@@ -14,17 +14,17 @@ from daq.files import replace_file
 
 ACCESS, DEFAULT = "system.posix_acl_access", "system.posix_acl_default"
 READ, WRITE = 4, 2
-_OWNER, _USER, _GROUP, _MASK, _OTHERS, _NOBODY = 0x01, 0x02, 0x04, 0x10, 0x20, 0xFFFFFFFF
+_OWNER, _USER, _GROUP, _MASK, _OTHERS, _NO_ONE = 0x01, 0x02, 0x04, 0x10, 0x20, 0xFFFFFFFF
 
 
 def _access_list(user: int) -> bytes:
     """As Linux keeps it (version 2): the owner and one more user may read and write, nobody else."""
     entries = (
-        (_OWNER, READ | WRITE, _NOBODY),
+        (_OWNER, READ | WRITE, _NO_ONE),
         (_USER, READ | WRITE, user),
-        (_GROUP, 0, _NOBODY),
-        (_MASK, READ | WRITE, _NOBODY),
-        (_OTHERS, 0, _NOBODY),
+        (_GROUP, 0, _NO_ONE),
+        (_MASK, READ | WRITE, _NO_ONE),
+        (_OTHERS, 0, _NO_ONE),
     )
     return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *entry) for entry in entries)
 
@@ -133,7 +133,7 @@ def test_whom_the_folder_lets_into_new_files_stays_out_of_an_old_one(tmp_path: P
     assert _rights(path) == {"mode": 0o640}
 
 
-def test_nobody_else_can_open_the_unfinished_copy_of_a_file_of_one_s_own(
+def test_no_one_else_can_open_the_unfinished_copy_of_a_file_of_one_s_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before it has the file's rights: who has it open reads on."""

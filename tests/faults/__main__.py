@@ -50,7 +50,7 @@ def head(*cells: str) -> None:
 
 def after(outcome: Outcome, kind: EventKind) -> str:
     """Cycles from the fault to the first such event; "-" where there is none."""
-    cycles = [cycle - STRIKE for cycle in outcome.told(kind) if cycle >= STRIKE]
+    cycles = [cycle - STRIKE for cycle in outcome.cycles_of(kind) if cycle >= STRIKE]
     return str(cycles[0]) if cycles else "-"
 
 
@@ -87,5 +87,8 @@ head("fault from the start", "error", "moved", "states at the end", "settings ba
 for kind in REFUSALS:
     outcome = run(f"table start {kind.value}", FaultSpec(kind, 1))
     row(
-        kind.value, type(outcome.error).__name__, "yes" if outcome.told(EventKind.MOVE_START) else "no", *ended(outcome)
+        kind.value,
+        type(outcome.error).__name__,
+        "yes" if outcome.cycles_of(EventKind.MOVE_START) else "no",
+        *ended(outcome),
     )

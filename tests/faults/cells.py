@@ -30,7 +30,7 @@ from drivers.stream.sync import LockstepSync
 CONFIGS = Path(__file__).parents[2] / "configs"
 PERIOD_NS = 1_000_000
 ROOM = (AxisLimits(-20_000_000, 20_000_000, 900_000.0, 6_000_000.0),) * 6
-WAY_COUNTS = 150_000
+TRAVEL_COUNTS = 150_000
 STRIKE = 120
 """SYNCs since power-on: in the middle of the move, which begins at about 25 and takes more than 300."""
 
@@ -78,7 +78,7 @@ class Outcome:
         """Nodes that have the settings from before."""
         return tuple(axis for axis, (one, other) in enumerate(zip(*self.settings, strict=True)) if one == other)
 
-    def told(self, kind: EventKind, axis: int | None = None) -> list[int]:
+    def cycles_of(self, kind: EventKind, axis: int | None = None) -> list[int]:
         """Cycles, counted as `FaultSpec.at_cycle` is, of the events of a kind."""
         return [
             event.time_ns // PERIOD_NS
@@ -179,7 +179,7 @@ def _drive(network: CanopenNetwork, outcome: Outcome) -> None:
             first = next(stream)
             network.check_feedback(first)
             start = first.position_counts
-            there = synchronised_move(start, tuple(count + WAY_COUNTS for count in start), ROOM, dwell_cycles=10)
+            there = synchronised_move(start, tuple(count + TRAVEL_COUNTS for count in start), ROOM, dwell_cycles=10)
             back = synchronised_move(there.target_counts, start, ROOM, dwell_cycles=10)
             with closing(execute(network, stream, (there, back), MotionPermission("the test", ROOM))) as samples:
                 for _ in samples:

@@ -38,7 +38,7 @@ def test_a_fault_from_the_start_is_refused_by_name_before_anything_moves(kind: F
     with pytest.raises(error, match=text):
         raise outcome.error
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
-    assert not outcome.told(EventKind.MOVE_START)
+    assert not outcome.cycles_of(EventKind.MOVE_START)
     assert outcome.restored
 
 

@@ -11,7 +11,7 @@ from tests.drivers.scripted import ScriptedBus, cell
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_refused_nmt_command_is_told_within_its_bound(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_nmt_command_is_reported_within_its_bound(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     network, bus = cell(2)
     commanded_ns: dict[bytes, int] = {}
     send = ScriptedBus.send

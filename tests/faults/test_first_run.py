@@ -38,8 +38,8 @@ def recorded(folder: Path, speed: float) -> tuple[Path, list[list[int]]]:
     with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
         arguments = ["record", str(cell_file), str(plan), "--out", str(out), "--enable-motion", "--speed", str(speed)]
         assert main([*arguments, "--operator", "test"]) == ExitCode.OK
-        told = [profiles(cell, i) for i in (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)]
-    return out, told
+        reported = [profiles(cell, i) for i in (PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION)]
+    return out, reported
 
 
 def test_a_first_run_is_slower_in_speed_and_ramps_and_its_log_says_so(

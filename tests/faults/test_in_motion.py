@@ -93,15 +93,15 @@ def test_a_fault_is_named_logged_in_time_and_stops_all_axes(name: str) -> None:
     error = outcome.error
     assert isinstance(error, promise.error), error
     assert_matches(promise.text, error)
-    told = [cycle for cycle in outcome.told(promise.event) if cycle >= STRIKE]
-    assert told
-    assert told[0] - STRIKE <= promise.within_cycles
-    assert outcome.told(EventKind.STOP)[0] >= STRIKE
+    reported = [cycle for cycle in outcome.cycles_of(promise.event) if cycle >= STRIKE]
+    assert reported
+    assert reported[0] - STRIKE <= promise.within_cycles
+    assert outcome.cycles_of(EventKind.STOP)[0] >= STRIKE
     assert EventKind.STOP_UNCONFIRMED not in {event.kind for event in outcome.events}
     assert outcome.powerless
     if name != "reboots":  # which forgets by itself what it was told
         assert outcome.restored
-    assert len(outcome.told(EventKind.MOVE_END)) < 2  # of two: nobody went on
+    assert len(outcome.cycles_of(EventKind.MOVE_END)) < 2  # of two: nobody went on
 
 
 def assert_matches(text: str, error: DriverError) -> None:
@@ -109,15 +109,15 @@ def assert_matches(text: str, error: DriverError) -> None:
         raise error
 
 
-def test_a_cell_that_falls_silent_is_told_after_one_bound_not_after_one_a_node() -> None:
+def test_a_cell_that_falls_silent_is_reported_after_one_bound_not_after_one_a_node() -> None:
     outcome = run("silent", at(FaultKind.SILENT, axis=None), guard_ms=60_000)
     assert isinstance(outcome.error, CellSilent)
-    assert outcome.told(EventKind.SAMPLE_LOST, AXIS)[0] == STRIKE
+    assert outcome.cycles_of(EventKind.SAMPLE_LOST, AXIS)[0] == STRIKE
     assert outcome.ended_cycle - STRIKE <= 6  # each of them waits, but the first alone for a whole bound
     notes = " ".join(outcome.error.__notes__)
     assert "while stopping: node 1, 2, 3, 4, 5, 6 did not answer" in notes
     assert "while closing" in notes
-    assert outcome.told(EventKind.STOP_UNCONFIRMED)
+    assert outcome.cycles_of(EventKind.STOP_UNCONFIRMED)
 
 
 def test_an_axis_that_falls_silent_stops_the_others_and_is_shouted() -> None:
@@ -136,12 +136,12 @@ def test_an_axis_that_is_cut_off_stops_by_itself_since_it_hears_no_recorder() ->
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
 
 
-def test_bus_off_is_told_at_once_and_the_axes_stop_by_themselves() -> None:
+def test_bus_off_is_reported_at_once_and_the_axes_stop_by_themselves() -> None:
     outcome = run("bus off", at(FaultKind.BUS_OFF, axis=None), guard_ms=GUARD_MS, afterwards=2 * GUARD_MS)
     assert isinstance(outcome.error, BusError)
     assert_matches("bus-off", outcome.error)
-    assert outcome.told(EventKind.BUS_LOST)[0] - STRIKE <= 2
-    assert outcome.told(EventKind.STOP_UNCONFIRMED)
+    assert outcome.cycles_of(EventKind.BUS_LOST)[0] - STRIKE <= 2
+    assert outcome.cycles_of(EventKind.STOP_UNCONFIRMED)
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
 
 
@@ -156,17 +156,17 @@ def test_a_single_bad_frame_is_counted_and_the_run_goes_on(kind: FaultKind, fiel
     assert outcome.restored
 
 
-def test_an_error_passive_controller_is_told_and_the_run_goes_on() -> None:
+def test_an_error_passive_controller_is_reported_and_the_run_goes_on() -> None:
     outcome = run("passive", at(FaultKind.ERROR_PASSIVE, axis=None))
     assert outcome.error is None
-    assert outcome.told(EventKind.BUS_PASSIVE)[0] - STRIKE <= 2
+    assert outcome.cycles_of(EventKind.BUS_PASSIVE)[0] - STRIKE <= 2
     assert outcome.restored
 
 
 def test_toggle_bits_of_a_sound_cell_are_no_fault_and_a_lost_frame_is_none_of_theirs() -> None:
     outcome = run("toggles", at(FaultKind.LOST, cycles=2), toggle_bit=15)
     assert outcome.error is None
-    assert not outcome.told(EventKind.FROZEN)
+    assert not outcome.cycles_of(EventKind.FROZEN)
     assert outcome.restored
 
 
@@ -177,7 +177,7 @@ def test_a_short_frame_alone_is_counted_and_the_run_goes_on() -> None:
     assert (outcome.statistics.wrong_length, outcome.statistics.missing) == (1, 1)
 
 
-def test_somebody_who_only_asks_a_drive_is_told_and_does_not_stop_the_run() -> None:
+def test_someone_who_only_asks_a_drive_is_reported_and_does_not_stop_the_run() -> None:
     outcome = run("asks", at(FaultKind.SDO_MASTER, cycles=5))
     assert outcome.error is None
     assert [event.text for event in outcome.events if event.kind is EventKind.BUS_BUSY] == [

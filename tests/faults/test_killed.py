@@ -22,7 +22,7 @@ from drivers.stream.sync import LockstepSync
 from tests.faults.cells import CONFIGS, PERIOD_NS, ROOM, let_pass
 
 GUARD_MS = 2000
-WAY_COUNTS = 2_000_000
+TRAVEL_COUNTS = 2_000_000
 """Longer than the amplifiers wait, shorter than the test looks on."""
 
 
@@ -54,7 +54,7 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
         network.prepare()
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 5.0))
         start, start_rad = next(stream).position_counts, cell.plant.motor_rad.copy()
-        far = synchronised_move(start, tuple(count + WAY_COUNTS for count in start), ROOM)
+        far = synchronised_move(start, tuple(count + TRAVEL_COUNTS for count in start), ROOM)
         samples = execute(network, stream, (far,), MotionPermission("the test", ROOM))
         moving = list(islice(samples, 300))[-1]
         assert all(word & 0x6F == 0x27 for word in moving.statusword)
@@ -63,7 +63,7 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
         states = {node.drive.state for node in cell.nodes}
         turned = abs(cell.plant.motor_rad - start_rad) * 65536 / (2 * 3.141592653589793)
         assert states == {PowerState.SWITCH_ON_DISABLED if guarded else PowerState.OPERATION_ENABLED}
-        assert bool((turned > 0.99 * WAY_COUNTS).all()) != guarded
+        assert bool((turned > 0.99 * TRAVEL_COUNTS).all()) != guarded
         samples.close()
     device.shutdown()
     bus.shutdown()

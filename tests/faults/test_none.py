@@ -23,7 +23,7 @@ def test_a_cell_without_faults_moves_there_and_back_and_gets_its_settings_back()
     outcome = run("none")
     assert outcome.error is None
     assert not INCIDENTS & {event.kind for event in outcome.events}
-    assert outcome.told(EventKind.MOVE_START)[0] < STRIKE - 60
-    assert outcome.told(EventKind.MOVE_END)[0] > STRIKE + 100
+    assert outcome.cycles_of(EventKind.MOVE_START)[0] < STRIKE - 60
+    assert outcome.cycles_of(EventKind.MOVE_END)[0] > STRIKE + 100
     assert outcome.powerless
     assert outcome.restored

@@ -55,9 +55,9 @@ def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_l
     assert not out.exists()
     saved = tmp_path / "saved.mcap"
     assert main(["salvage", str(tmp_path / "a.mcap.part"), "--out", str(saved)]) == ExitCode.OK
-    told = [event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)]
-    assert [(event.kind, event.axis, event.code) for event in told[:1]] == [(EventKind.EMCY, 2, 0x2310)]
-    assert EventKind.STOP in {event.kind for event in told}
+    statistics = [event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)]
+    assert [(event.kind, event.axis, event.code) for event in statistics[:1]] == [(EventKind.EMCY, 2, 0x2310)]
+    assert EventKind.STOP in {event.kind for event in statistics}
 
 
 def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_the_help_of_simulate_shows_how_to_give_a_scenario(capsys: pytest.Captur
     "times",
     ["at_s: 1e308", "at_s: 1, for_s: 1e300", "at_cycle: 18446744073709551615", "at_s: 0, cycles: 1000000000001"],
 )
-def test_a_time_that_no_cell_lives_to_see_is_told(times: str, tmp_path: Path) -> None:
+def test_a_time_that_no_cell_lives_to_see_is_reported(times: str, tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text(f"faults:\n  - {{fault: silent, axis: J1, {times}}}\n", encoding="utf-8")
     with pytest.raises(SchemaMismatch, match="less than or equal to"):
@@ -197,7 +197,7 @@ def test_a_time_that_no_cell_lives_to_see_is_told(times: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("kind", [FaultKind.BUS_OFF, FaultKind.ERROR_PASSIVE])
-def test_a_fault_that_the_hub_cannot_carry_is_told_before_anybody_moves(kind: FaultKind) -> None:
+def test_a_fault_that_the_hub_cannot_carry_is_reported_before_anything_moves(kind: FaultKind) -> None:
     spec = replace(load_simulation(shipped_simulation("clean")), faults=(FaultSpec(kind, at_cycle=5),))
     with Hub(("can0",)) as hub, open_bus(hub.address()) as bus, pytest.raises(SpecInvalid, match=kind.value):
         SimulatedCell(spec, bus)

@@ -20,7 +20,7 @@ PERIOD_NS = 1_000_000
 BIT = 14
 
 
-def told(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()) -> list[int]:
+def alarm_cycles(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()) -> list[int]:
     """Cycles in which the first of two axes is told; the second has no such bit."""
     profile = replace(PROFILE, toggle_bit=BIT, update_period_us=update_period_us)
     bits = ToggleBits((Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None)))
@@ -33,17 +33,17 @@ def told(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[
     return found
 
 
-def test_a_bit_that_stands_is_told_once_after_two_periods() -> None:
-    assert told([0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1]) == [5, 11]
+def test_a_bit_that_is_stuck_is_reported_once_after_two_periods() -> None:
+    assert alarm_cycles([0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1]) == [5, 11]
 
 
 @settings(deadline=None)
 @given(st.integers(1, 5), st.integers(0, 4), st.integers(5, 60))
-def test_an_amplifier_that_is_slower_than_sync_is_told_after_two_of_its_periods(
+def test_an_amplifier_that_is_slower_than_sync_is_reported_after_two_of_its_periods(
     cycles_a_refresh: int, phase: int, hangs: int
 ) -> None:
     values = [(min(cycle, hangs) + phase) // cycles_a_refresh % 2 for cycle in range(hangs + 40)]
-    found = told(values, update_period_us=1000 * cycles_a_refresh)
+    found = alarm_cycles(values, update_period_us=1000 * cycles_a_refresh)
     assert len(found) == 1
     assert hangs < found[0] <= hangs + 2 * cycles_a_refresh
 
@@ -55,7 +55,7 @@ def test_a_lost_frame_proves_nothing(lost: set[int]) -> None:
     values: list[int] = []
     for cycle in range(200):
         values.append(values[-1] if cycle in lost and values else cycle % 2)
-    assert told(values, missing=tuple(lost)) == []
+    assert alarm_cycles(values, missing=tuple(lost)) == []
 
 
 def test_only_a_bit_that_is_the_makers_own_can_be_a_toggle_bit_and_it_needs_a_source() -> None:

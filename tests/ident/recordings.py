@@ -12,7 +12,7 @@ from scipy import signal
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
-from ident.discovery.candidates import ColumnCache, Inquiry, inquire
+from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
 from ident.discovery.loop import Evidence, gather
 from ident.equations.rows import decimate_rows
 from ident.estimators.identify import identify
@@ -163,6 +163,6 @@ def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
     return np.asarray(np.eye(count)[axis][:, None] * torque_nm)
 
 
-def inquiry_of(evidence: Evidence, cache: ColumnCache | None = None) -> Inquiry:
+def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
     """The residual of the runs of the fit."""
-    return inquire(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
+    return prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)

@@ -116,7 +116,7 @@ def test_what_fades_over_a_session_counts_from_its_first_run(truth: Truth, noisy
     assert _largest_difference(after) < 1e-9
 
 
-def test_a_motion_that_nobody_recorded_needs_the_same_current(identified: Evidence) -> None:
+def test_a_motion_that_no_one_recorded_needs_the_same_current(identified: Evidence) -> None:
     after = with_effects(identified, (PlacedEffect(Spring(), 2), PlacedEffect(LoadFriction(0), 1)))
     calibration, data = _of(after), after.datasets[1]
     asked = planned(data.motion(), data.rate_hz, data.payload)

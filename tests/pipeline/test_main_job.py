@@ -26,7 +26,7 @@ def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_summary_tells_the_whole_story(demonstration: Path) -> None:
+def test_the_summary_reports_the_whole_story(demonstration: Path) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
     assert [gain["axis"] for gain in summary["gains"]] == [f"J{number}" for number in range(1, 7)]
     # Runs of 15 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by the root of that ratio.
@@ -120,7 +120,7 @@ def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> No
         check_signs(estimate, nameplate)
 
 
-def test_validate_measures_the_calibration_on_the_unused_run(
+def test_validate_measures_the_calibration_on_the_holdout_run(
     demonstration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())

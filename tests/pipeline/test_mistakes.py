@@ -18,7 +18,7 @@ def copied_log(tmp_path: Path, checkout: Path, shared_data: Path) -> Path:
     return log
 
 
-def test_no_output_over_an_input_or_a_stranger(
+def test_no_output_over_an_input_or_another_file(
     copied_log: Path, tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = copied_log.read_bytes()
@@ -50,7 +50,7 @@ def test_one_recording_counts_once(copied_log: Path, tmp_path: Path, capsys: pyt
         assert "the same recording" in capsys.readouterr().err
 
 
-def test_the_demonstration_takes_no_strangers_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_demonstration_takes_no_other_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = tmp_path / "bare-1.mcap.part"
     recording.write_bytes(b"precious")
     assert main(["demo", "--out", str(tmp_path)]) == ExitCode.USAGE

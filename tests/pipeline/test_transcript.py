@@ -25,7 +25,7 @@ $ drivegain simulate demo
 """
 
 
-def test_commands_stand_in_their_order_with_what_follows_them() -> None:
+def test_commands_keep_their_order_with_what_follows_them() -> None:
     assert commands_of(PAGE) == (
         Command(3, "drivegain scan cell.yaml", "node 1 …", False),
         Command(5, "cat > x <<'END'\na: 1\nEND", "", False),
@@ -34,7 +34,7 @@ def test_commands_stand_in_their_order_with_what_follows_them() -> None:
     )
 
 
-def test_what_is_not_seen_is_told_and_order_counts() -> None:
+def test_what_is_not_seen_is_reported_and_order_counts() -> None:
     assert shows("gain … 33.9\n… written", "gain   J1  33.9\nall was written") is None
     assert shows("gain … 34.9", "gain J1 33.9") == "gain … 34.9"
     assert shows("b\na", "a b") == "a"

@@ -80,7 +80,7 @@ def wiring(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Wiring]:
             end.shutdown()
 
 
-def test_scan_tells_the_bus_of_each_node(wiring: Wiring, capsys: pytest.CaptureFixture[str]) -> None:
+def test_scan_reports_the_bus_of_each_node(wiring: Wiring, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scan", str(wiring.path), "--json"]) == ExitCode.OK
     rows = json.loads(capsys.readouterr().out)["nodes"]
     assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in rows] == [

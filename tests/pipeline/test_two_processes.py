@@ -27,9 +27,9 @@ def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[P
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=checkout) as process:
         try:
             assert process.stdout is not None
-            told = list(iter(process.stdout.readline, "\n")) + list(iter(process.stdout.readline, "\n"))
+            recorded = list(iter(process.stdout.readline, "\n")) + list(iter(process.stdout.readline, "\n"))
             # What it prints to paste is pasted.
-            bus = "".join(told[told.index("bus:\n") :])
+            bus = "".join(recorded[recorded.index("bus:\n") :])
             text = (configs / "cells" / "demo.yaml").read_text().replace("../robots", str(configs / "robots"))
             path = folder / "cell.yaml"
             path.write_text(re.sub(r"bus:\n.*?(?=axes:)", bus, text, flags=re.DOTALL))
@@ -102,13 +102,13 @@ def test_an_interrupted_recording_stops_the_axes_and_says_so(
     assert process.returncode == ExitCode.INTERRUPTED, err
     assert out == ""
     assert "Traceback" not in err
-    told = f"interrupted: axes stopped; what was recorded is in {part}, which is not usable for a fit"
-    assert [line for line in err.splitlines() if line.startswith(told)]
+    output = f"interrupted: axes stopped; what was recorded is in {part}, which is not usable for a fit"
+    assert [line for line in err.splitlines() if line.startswith(output)]
     assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion"]) == ExitCode.USAGE
-    told = " ".join(capsys.readouterr().err.split())
-    assert "the rest of a recording" in told
-    assert f"`rm {part}`" in told
-    assert "another --out" in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert "the rest of a recording" in output
+    assert f"`rm {part}`" in output
+    assert "another --out" in output
     assert sorted(tmp_path.iterdir()) == [part, plan]
     capsys.readouterr()
     assert main(["scan", str(cell), "--json"]) == ExitCode.OK

@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.simulation.demo import Settings, Telling, demonstrate, summary
+from daq.simulation.demo import ProgressReporter, Settings, demonstrate, summary
 from daq.simulation.simulation_file import shipped_simulation
 
 OUT = Path("out/gain-study")
@@ -22,19 +22,19 @@ DURATION_S = 40.0
 
 def one(seed: int) -> dict[str, Any]:
     """The demonstration on a clean cell."""
-    quiet = Telling(lambda _: None, lambda _done, _total, _remark: None)
+    quiet = ProgressReporter(lambda _: None, lambda _done, _total, _remark: None)
     settings = Settings(OUT / str(seed), shipped_simulation("clean"), seed, DURATION_S)
     outcome = demonstrate(settings, lambda: datetime.now(UTC), quiet)
-    told = summary(outcome)
-    ml = [gain["error_percent"] for gain in told["gains"]]
-    tls = [100.0 * (gain["paper_tls"] / gain["truth"] - 1.0) for gain in told["gains"]]
+    reported = summary(outcome)
+    ml = [gain["error_percent"] for gain in reported["gains"]]
+    tls = [100.0 * (gain["paper_tls"] / gain["truth"] - 1.0) for gain in reported["gains"]]
     return {
         "seed": seed,
         "floor_percent": outcome.calibration.relative_error_percent.total,
         "ml_error_percent": ml,
         "tls_error_percent": tls,
-        "scores": [gain["error_percent"] / gain["std_percent"] for gain in told["gains"]],
-        "effects": [effect["name"] for effect in told["effects"]],
+        "scores": [gain["error_percent"] / gain["std_percent"] for gain in reported["gains"]],
+        "effects": [effect["name"] for effect in reported["effects"]],
     }
 
 

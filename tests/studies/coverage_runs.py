@@ -113,7 +113,7 @@ def make_coverage(
     out: Path = OUT,
     duration_s: float = DURATION_S,
     processes: int = PROCESSES,
-    told: Callable[[str], None] = lambda _: None,
+    report_line: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Simulate and save cells; earlier ones in the folder are replaced.
 
@@ -122,7 +122,7 @@ def make_coverage(
         out: folder, made if it is not there.
         duration_s: of each run [s].
         processes: side by side.
-        told: what was done, a line a cell.
+        report_line: what was done, a line a cell.
 
     Raises:
         TaskFailed: planning or simulating failed.
@@ -138,7 +138,7 @@ def make_coverage(
         first = 2 * (number % pairs)
         tasks.append(_Task(out, FIRST_SEED + number, (plans[first], plans[first + 1])))
     for line in side_by_side(_simulate, tasks, processes):
-        told(line)
+        report_line(line)
 
 
 def difference(cell: Cell, spec: CellSpec, moves: Plan, folder: Path) -> tuple[str, ...]:
@@ -191,7 +191,7 @@ def _simulate(task: _Task) -> str:
     return f"cell {task.seed}: {samples} samples, at a limit {limited:.1%}, {spent_s:.1f} s, {size_mb:.2f} MB"
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -217,7 +217,7 @@ def main(arguments: list[str] | None = None) -> int:
         out=options.out,
         duration_s=options.duration,
         processes=options.processes,
-        told=_tell,
+        report_line=_print_line,
     )
     return 0
 

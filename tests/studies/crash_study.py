@@ -113,9 +113,19 @@ def recording(cell_file: Path, plan: Path, log: Path) -> Iterator[tuple[Tap, sub
         address = hub.address()
         bus = open_bus(address)
         tap = Tap(bus)
-        told = cell_file.with_name("cell-on-hub.yaml")
-        told.write_text(_on_hub(cell_file.read_text(encoding="utf-8"), address), encoding="utf-8")
-        command = [sys.executable, "-m", "daq", "record", str(told), str(plan), "--out", str(log), "--enable-motion"]
+        reported = cell_file.with_name("cell-on-hub.yaml")
+        reported.write_text(_on_hub(cell_file.read_text(encoding="utf-8"), address), encoding="utf-8")
+        command = [
+            sys.executable,
+            "-m",
+            "daq",
+            "record",
+            str(reported),
+            str(plan),
+            "--out",
+            str(log),
+            "--enable-motion",
+        ]
         try:
             with (
                 SimulatedCell(load_simulation(shipped_simulation("clean")), cast(can.BusABC, tap)),
@@ -294,12 +304,14 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
             recorder.wait()
         whole = read_log(log)
         length = len(whole.samples.cycle)
-        _tell(f"a whole recording: {tap.syncs} SYNCs, {length} samples, {time.monotonic() - begun:.0f} s of wall time")
+        _print_line(
+            f"a whole recording: {tap.syncs} SYNCs, {length} samples, {time.monotonic() - begun:.0f} s of wall time"
+        )
         done = []
         for number in range(kills):
             done.append(kill_once(cell_file, plan, folder, chance.randrange(1, length)))
             one = done[-1]
-            _tell(
+            _print_line(
                 f"kill {number + 1}: sent {one.sent} = recovered {one.recovered} + lost {one.lost}, as sent: {one.same}"
             )
         data = log.read_bytes()
@@ -318,7 +330,7 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
     }
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -335,12 +347,14 @@ def main(arguments: list[str] | None = None) -> int:
     document = study(options.kills, options.damages, options.seconds, options.seed)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    _tell(f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, {PROMISED_MS:g} promised")
+    _print_line(
+        f"largest loss of {len(document['kills'])} kills: {document['largest_loss_ms']} ms, {PROMISED_MS:g} promised"
+    )
     for title in ("bit_flips", "truncations"):
         found = document[title]
         counts = ", ".join(f"{key} {found[key]}" for key in ("named", "same", "wrong", "crashed", "salvage_wrong"))
-        _tell(f"{found['tried']} {title.replace('_', ' ')}: {counts}")
-    _tell(f"every promise kept: {document['kept']}; {options.out}")
+        _print_line(f"{found['tried']} {title.replace('_', ' ')}: {counts}")
+    _print_line(f"every promise kept: {document['kept']}; {options.out}")
     return 0 if document["kept"] else 1
 
 

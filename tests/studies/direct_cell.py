@@ -185,7 +185,7 @@ class DirectStream:
                 node_ids=tuple(axis.node_id for axis in axes),
                 guard=lambda: None,
                 unguard=lambda: None,
-                undisturbed=nullcontext,
+                block_signals=nullcontext,
                 find_silent=lambda _axes: None,
             ),
         )

@@ -63,8 +63,8 @@ def share_percent(late: NDArray[np.int64], within: int) -> float:
 
 def draw(rng: np.random.Generator, shape: tuple[int, ...], dispersion: float) -> tuple[FloatArray, FloatArray]:
     """Errors of gains in units of their true σ, and σ as the fits tell it."""
-    told = np.sqrt(rng.chisquare(MOVES, shape) / MOVES)
-    return dispersion * rng.standard_normal(shape), told
+    reported = np.sqrt(rng.chisquare(MOVES, shape) / MOVES)
+    return dispersion * rng.standard_normal(shape), reported
 
 
 def false_alarms(
@@ -133,10 +133,10 @@ def _ramp(step: float, before: int, count: int) -> FloatArray:
 def _days(values: FloatArray, stds: FloatArray, chart: Chart) -> Iterator[NDArray[np.bool_]]:
     """Alarms of the newest calibration, from the second one on: CUSUM, single, trend; shape (3, histories, axes)."""
     for day in range(2, values.shape[-1] + 1):
-        known, told = values[..., :day], stds[..., :day]
-        dispersion = dispersions(known, told)
-        deviations, upper, lower = (found[..., -1] for found in path(known, told, dispersion, chart))
-        slopes = trend(known, told, dispersion)[..., -1]
+        known, reported = values[..., :day], stds[..., :day]
+        dispersion = dispersions(known, reported)
+        deviations, upper, lower = (found[..., -1] for found in path(known, reported, dispersion, chart))
+        slopes = trend(known, reported, dispersion)[..., -1]
         yield np.stack(
             [
                 np.maximum(upper, lower) > chart.threshold,
@@ -174,9 +174,9 @@ def main(arguments: list[str] | None = None) -> int:
                 for late in (delay.cusum, delay.any)
             )
             middle, most = (int(np.quantile(delay.any, share, method="higher")) for share in (0.5, 0.95))
-            told = " | ".join("not by the end" if late == NEVER else f"{late:+d}" for late in (middle, most))
+            reported = " | ".join("not by the end" if late == NEVER else f"{late:+d}" for late in (middle, most))
             bound = most_percent(std_percent=std_percent, before=before, false_percent=1.1)
-            say(f"| {std_percent:g} | {before} | {delay.reached} | {cusum} | {of_any} | {told} | {bound:.0f} |\n")
+            say(f"| {std_percent:g} | {before} | {delay.reached} | {cusum} | {of_any} | {reported} | {bound:.0f} |\n")
     return 0
 
 

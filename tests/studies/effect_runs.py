@@ -67,7 +67,11 @@ class _Task:
 
 
 def make_runs(
-    cases: Iterable[EffectCase], *, out: Path = OUT, processes: int = 2, told: Callable[[str], None] = lambda _: None
+    cases: Iterable[EffectCase],
+    *,
+    out: Path = OUT,
+    processes: int = 2,
+    report_line: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Simulate and save what is missing.
 
@@ -77,9 +81,9 @@ def make_runs(
     (out / "plans").mkdir(parents=True, exist_ok=True)
     plans = [_PlanTask(out, number) for number in range(PLAN_SETS * PLANS_A_SET)]
     for line in side_by_side(_plan, plans, processes):
-        told(line)
+        report_line(line)
     for line in side_by_side(_simulate, [_Task(out, case) for case in cases], processes):
-        told(line)
+        report_line(line)
 
 
 def load_runs(case: EffectCase, out: Path = OUT) -> CaseRuns:
@@ -138,7 +142,7 @@ def _simulate(task: _Task) -> str:
     return f"{case.name}: {time.process_time() - begun_s:.1f} s"
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -151,7 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args(arguments)
     chosen = [case for case in ALL if not options.cases or case.name in options.cases]
-    make_runs(chosen, out=options.out, processes=options.processes, told=_tell)
+    make_runs(chosen, out=options.out, processes=options.processes, report_line=_print_line)
     return 0
 
 

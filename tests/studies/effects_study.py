@@ -119,12 +119,14 @@ def study(parts: Iterable[str], out: Path, processes: int, *, simulate: bool) ->
     """
     chosen = [(part, case) for part, cases in PARTS if part in parts for case in cases]
     if simulate:
-        make_runs({case.name: case for _, case in chosen}.values(), out=out, processes=processes, told=_tell)
+        make_runs(
+            {case.name: case for _, case in chosen}.values(), out=out, processes=processes, report_line=_print_line
+        )
     rows = []
     for row in side_by_side(_search, [_Task(part, case, out) for part, case in chosen], processes):
         rows.append(row)
         named = ", ".join(row.named) or "nothing"
-        _tell(
+        _print_line(
             f"{row.part} {row.case}: {named}; {row.error_before_percent:.2f} -> {row.error_after_percent:.2f} %, "
             f"worst gain {row.max_gain_error_percent:.2f} %, {row.processor_s:.0f} s"
         )
@@ -267,7 +269,7 @@ def table(rows: Iterable[Row]) -> str:
     return "\n".join(lines)
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -289,9 +291,9 @@ def main(arguments: list[str] | None = None) -> int:
         else [row for row in json.loads(REPORT.read_text())["rows"] if row["part"] not in options.only]
     )
     REPORT.write_text(json.dumps({"rows": [*kept, *(asdict(row) for row in rows)]}, indent=1) + "\n")
-    _tell(table(rows))
+    _print_line(table(rows))
     for line in verdicts(rows):
-        _tell(line)
+        _print_line(line)
     return 0
 
 

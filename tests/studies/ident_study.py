@@ -119,7 +119,7 @@ def coverage(model: Model, conditioning: Conditioning) -> tuple[FloatArray, Floa
         found = ml(_system(model, cell.runs, conditioning))
         scores.append((found.gains - np.array(cell.truth.gains_nm_per_a)) / found.gains_std)
         if len(scores) % 10 == 0:
-            _tell(f"coverage: {len(scores)} cells")
+            _print_line(f"coverage: {len(scores)} cells")
     inside = np.abs(scores) <= NORMAL_95
     return 100.0 * inside.mean(axis=0), np.sqrt(np.mean(np.square(scores), axis=0))
 
@@ -129,7 +129,7 @@ def _key(estimator: str) -> str:
     return "tls" if estimator == "tls, rows (paper)" else estimator
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stderr.write(line + "\n")
     sys.stderr.flush()
 
@@ -147,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.kept:
         logs = study_logs(options.seeds, options.floors)
     else:
-        logs = record_study(options.seeds, options.floors, told=_tell)
+        logs = record_study(options.seeds, options.floors, report_line=_print_line)
     result: dict[str, Any] = {_key(estimator.name): {} for estimator in ESTIMATORS}
     lines = ["| floor % | estimator | gain error mean / max % | second payload mean / max % |", "|---|---|---|---|"]
     cells: list[dict[str, Any]] = []
@@ -156,15 +156,16 @@ def main(arguments: list[str] | None = None) -> int:
         for seed, of in scored:
             cells += [{"floor": floor, "seed": seed, "estimator": name, **asdict(one)} for name, one in of.items()]
         for estimator in ESTIMATORS:
-            told = summarise([of[estimator.name] for _, of in scored])
-            result[_key(estimator.name)][floor] = asdict(told)
+            reported = summarise([of[estimator.name] for _, of in scored])
+            result[_key(estimator.name)][floor] = asdict(reported)
             lines.append(
-                f"| {told.relative_error_percent:.1f} | {estimator.name} | {told.mean_percent:.2f} / "
-                f"{told.max_percent:.2f} | {told.second_payload_percent:.2f} / {told.second_payload_max_percent:.2f} |"
+                f"| {reported.relative_error_percent:.1f} | {estimator.name} | {reported.mean_percent:.2f} / "
+                f"{reported.max_percent:.2f} | {reported.second_payload_percent:.2f} / "
+                f"{reported.second_payload_max_percent:.2f} |"
             )
     if options.cells:
         if len(list(COVERAGE.glob("*.npz"))) != options.cells:
-            make_coverage(options.cells, told=_tell)
+            make_coverage(options.cells, report_line=_print_line)
         inside, spread = coverage(model, cell.conditioning)
         result["coverage_percent"] = {axis: float(share) for axis, share in zip(axes, inside, strict=True)}
         result["score_rms"] = {axis: float(size) for axis, size in zip(axes, spread, strict=True)}

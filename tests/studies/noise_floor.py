@@ -42,8 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
             found = identify(model_of(cell), tuple(runs), cell.conditioning, method=Method.ML)
             true = [axis.gain_nm_per_a for axis in truth.bare.axes]
             errors = [100.0 * (gain / value - 1.0) for gain, value in zip(found.estimate.gains, true, strict=True)]
-            told = ", ".join(f"{error:+.2f}" for error in errors)
-            sys.stdout.write(f"| {seed} | {factor:g} | {found.training_error.total:.2f} | {told} |\n")
+            reported = ", ".join(f"{error:+.2f}" for error in errors)
+            sys.stdout.write(f"| {seed} | {factor:g} | {found.training_error.total:.2f} | {reported} |\n")
             sys.stdout.flush()
     return 0
 

@@ -97,7 +97,7 @@ def _merit(case: str, fitted: dict[str, Any], checked: dict[str, Any], truth: np
 
 def _drivegain(arguments: tuple[str, ...]) -> dict[str, Any]:
     """Run the command; what it prints as JSON."""
-    _tell("drivegain " + " ".join(arguments))
+    _print_line("drivegain " + " ".join(arguments))
     printed = io.StringIO()
     with redirect_stdout(printed):
         code = drivegain(list(arguments))
@@ -142,7 +142,7 @@ def _disc_run(logs: StudyLogs, letter: str, folder: Path) -> Path:
         return path
     for leftover in (path, path.with_name(path.name + ".part")):
         leftover.unlink(missing_ok=True)
-    _tell(f"recording {path}")
+    _print_line(f"recording {path}")
     spec = spec_of(study_cell(logs.seed, FLOORS[logs.floor]), "disc", 100 + ord(letter))
     bus = open_bus(bus_address(cell))
     try:
@@ -198,7 +198,7 @@ def page_of(folder: Path, merits: dict[int, dict[str, Merit]]) -> str:
     return "\n".join(parts)
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -210,13 +210,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--floor", choices=tuple(FLOORS), default=FLOOR)
     parser.add_argument("--processes", type=int, default=PROCESSES, help="that plan and record side by side")
     options = parser.parse_args(arguments)
-    logs = record_study(options.seeds, (options.floor,), processes=options.processes, told=_tell)
+    logs = record_study(options.seeds, (options.floor,), processes=options.processes, report_line=_print_line)
     merits = {cell.seed: one(cell) for cell in logs}
     before, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
     made = page_of(FOLDER / str(options.seeds[0]), merits)
     after = rest.split(MARKS[1])[1]
     PAGE.write_text(f"{before}{MARKS[0]}\n\n{made}\n{MARKS[1]}{after}", encoding="utf-8")
-    _tell(merit_table(merits).markdown())
+    _print_line(merit_table(merits).markdown())
     return 0
 
 

@@ -70,7 +70,7 @@ def one_job(rig: Rig, factor: float, seed: int, *faults: FaultSpec) -> str:
         bus.shutdown()
 
 
-def told(rig: Rig, factor: float) -> str:
+def week_text(rig: Rig, factor: float) -> str:
     """Of J4: drift and gain found, beside the truth and the controller's gain."""
     state = rig.sessions[-1].state
     if state.decision is None:
@@ -101,12 +101,12 @@ def study(weeks: int, seconds: float, folder: Path) -> int:
         if week == 1:
             rig.closed.unlink()
         outcome = one_job(rig, factor, week, *((FAULT,) if week == 2 else ()))
-        print(f"week {week}: {outcome:12} {told(rig, factor)}", flush=True)  # noqa: T201
+        print(f"week {week}: {outcome:12} {week_text(rig, factor)}", flush=True)  # noqa: T201
         rig.closed.touch()
         if week in (1, 2):
             rig.clock.go_on(days=1)
             outcome = one_job(rig, factor, 100 + week)
-            print(f"  next day: {outcome:12} {told(rig, factor)}", flush=True)  # noqa: T201
+            print(f"  next day: {outcome:12} {week_text(rig, factor)}", flush=True)  # noqa: T201
         wrong += [week] if outcome != expected else []
         rig.clock.go_on(days=7)
     print(f"{weeks - len(wrong)} of {weeks} weeks as expected{f'; not {wrong}' if wrong else ''}")  # noqa: T201

@@ -122,7 +122,7 @@ def record_study(
     out: Path = OUT,
     duration_s: float = DURATION_S,
     processes: int = PROCESSES,
-    told: Callable[[str], None] = lambda _: None,
+    report_line: Callable[[str], None] = lambda _: None,
 ) -> tuple[StudyLogs, ...]:
     """Record what is missing of some cells of the study.
 
@@ -131,7 +131,7 @@ def record_study(
         out: folder of the study.
         duration_s: of each run [s].
         processes: side by side.
-        told: what was done, a line a plan or run.
+        report_line: what was done, a line a plan or run.
 
     Raises:
         TaskFailed: planning or recording failed; what was finished before is kept.
@@ -147,9 +147,9 @@ def record_study(
             replace_file(path, (json.dumps(asdict(truth), indent=1, default=_plain) + "\n").encode())
     (out / "plans").mkdir(parents=True, exist_ok=True)
     for line in side_by_side(_plan, plans, processes):
-        told(line)
+        report_line(line)
     for line in side_by_side(_record, runs, processes):
-        told(line)
+        report_line(line)
     return study_logs(seeds, floors, out=out)
 
 
@@ -261,7 +261,7 @@ def _since(begun_s: float) -> str:
     return f"{time.perf_counter() - begun_s:.1f} s"
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 
@@ -281,7 +281,7 @@ def main(arguments: list[str] | None = None) -> int:
         out=options.out,
         duration_s=options.duration,
         processes=options.processes,
-        told=_tell,
+        report_line=_print_line,
     )
     return 0
 

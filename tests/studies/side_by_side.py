@@ -17,7 +17,7 @@ class TaskFailed(RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class _Told(Generic[Task, Made]):
+class _Reporting(Generic[Task, Made]):
     """Errors with keyword arguments do not survive pickling, and a pool then waits for ever: they go over as text."""
 
     function: Callable[[Task], Made]
@@ -41,7 +41,7 @@ def side_by_side(function: Callable[[Task], Made], tasks: Iterable[Task], proces
         TaskFailed: one of them raised; the rest is given up.
     """
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for made, trouble in pool.imap(_Told(function), tasks):
+        for made, trouble in pool.imap(_Reporting(function), tasks):
             if made is None:
                 raise TaskFailed(trouble)
             yield made

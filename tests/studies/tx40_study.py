@@ -43,7 +43,9 @@ def main() -> int:
     """Make the study and print its table."""
     data = Path(os.environ.get("DRIVEGAIN_DATA", SHARED)) / "tx40"
     if not data.is_dir():
-        _tell(f"found no {data}; expected the TX-40's recording there, or DRIVEGAIN_DATA to name the folder above it")
+        _print_line(
+            f"found no {data}; expected the TX-40's recording there, or DRIVEGAIN_DATA to name the folder above it"
+        )
         return 2
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "tx40.mcap"
@@ -69,10 +71,10 @@ def main() -> int:
         before += squares(start.holdout, start.estimate)[1]
         after += squares(end.holdout, end.estimate)[1]
         names = ", ".join(f"{placed.effect.name} on {cell.axis_names[placed.axis]}" for placed in end.effects)
-        _tell(f"fold {fold + 1}: {names or 'nothing'}")
-    _tell("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
-    _tell(_row("nothing added", of_squares(size, before)))
-    _tell(_row("effects added", of_squares(size, after)))
+        _print_line(f"fold {fold + 1}: {names or 'nothing'}")
+    _print_line("\n| | " + " | ".join(cell.axis_names) + " | mean | total |\n|" + "---|" * (n + 3))
+    _print_line(_row("nothing added", of_squares(size, before)))
+    _print_line(_row("effects added", of_squares(size, after)))
     return 0
 
 
@@ -81,7 +83,7 @@ def _row(name: str, error: RelativeError) -> str:
     return f"| {name} | " + " | ".join(f"{figure:.2f}" for figure in figures) + " |"
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 

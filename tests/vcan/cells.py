@@ -23,7 +23,7 @@ SIMULATION = "clean"
 ATTEMPTS = 10
 """A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the recorder, and the run is
 ended or marked invalid as at a real cell. One records again."""
-MOST_SUBSTEPS = 100
+MAX_SUBSTEPS = 100
 POSITION_CUTOFF, DECIMATION_CUTOFF = 0.2, 0.1
 """Of the sampling rate."""
 
@@ -52,7 +52,7 @@ def write_simulation(folder: Path, period_us: int) -> Path:
     text = (CONFIGURATIONS / "simulation" / f"{SIMULATION}.yaml").read_text(encoding="utf-8")
     text = text.replace("tx40-plant.urdf", str(CONFIGURATIONS / "simulation" / "tx40-plant.urdf"))
     text = re.sub(r"sync_period_us: \d+", f"sync_period_us: {period_us}", text)
-    text = re.sub(r"substeps: \d+", f"substeps: {min(4 * period_us // 1000, MOST_SUBSTEPS)}", text)
+    text = re.sub(r"substeps: \d+", f"substeps: {min(4 * period_us // 1000, MAX_SUBSTEPS)}", text)
     path = folder / "simulation.yaml"
     path.write_text(text, encoding="utf-8")
     return path

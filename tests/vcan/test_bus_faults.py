@@ -23,7 +23,7 @@ import pytest
 
 from daq.cli.app import main
 from daq.errors import ExitCode
-from daq.log.reader import Log, read_log, tells_losses_alone
+from daq.log.reader import Log, read_log, reports_only_losses
 from drivers.profiles.cia402 import State, decode
 from drivers.stream.sample import EventKind
 from tests.faults.test_scenario import PLAN
@@ -107,14 +107,14 @@ class Ended:
     """What became of a recording.
 
     Attributes:
-        code, told: exit code and what it said on stderr.
+        code, output: exit code and what it said on stderr.
         log: whole, or what was salvaged of it.
         after_cycles: samples in the log from after the strike.
         states: of the axes, once they came to rest without any recorder; and 50 SYNCs later.
     """
 
     code: int
-    told: str
+    output: str
     log: Log
     after_cycles: int
     states: tuple[list[State], list[State]]
@@ -217,9 +217,9 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
     tmp_path: Path, strike: Callable[[Wire], None], words: str, figure: Callable[[str], None]
 ) -> None:
     ended = record(tmp_path, strike)
-    assert ended.code == ExitCode.DEVICE_FAULT, ended.told
-    assert words in ended.told
-    assert "NOT ALL OF THEM ARE KNOWN TO STAND" in ended.told  # nobody could ask them
+    assert ended.code == ExitCode.DEVICE_FAULT, ended.output
+    assert words in ended.output
+    assert "NOT ALL OF THEM ARE KNOWN TO STAND" in ended.output  # nobody could ask them
     assert [event.text for event in ended.log.events if event.kind is EventKind.BUS_LOST and words in event.text]
     kinds = [event.kind for event in ended.log.events]
     assert EventKind.STOP_UNCONFIRMED in kinds
@@ -228,15 +228,15 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
     figure(f"{words}: told {ended.after_cycles} cycles after it happened; the axes stopped by their own 1016h")
 
 
-def test_error_passive_is_told_and_the_run_goes_on(tmp_path: Path, figure: Callable[[str], None]) -> None:
+def test_error_passive_is_reported_and_the_run_goes_on(tmp_path: Path, figure: Callable[[str], None]) -> None:
     ended = record(tmp_path, error_passive)
     # The run goes on to its end; a frame that was lost on the way makes it unfit, and nothing else may.
     counted = ended.log.statistics
-    assert ended.code == (ExitCode.OK if counted.valid else ExitCode.DATA_UNFIT), ended.told
-    assert counted.valid or tells_losses_alone(counted.reason), counted.reason
-    told = [event for event in ended.log.events if event.kind is EventKind.BUS_PASSIVE]
-    assert len(told) == 1
-    assert "error passive" in told[0].text
+    assert ended.code == (ExitCode.OK if counted.valid else ExitCode.DATA_UNFIT), ended.output
+    assert counted.valid or reports_only_losses(counted.reason), counted.reason
+    reported = [event for event in ended.log.events if event.kind is EventKind.BUS_PASSIVE]
+    assert len(reported) == 1
+    assert "error passive" in reported[0].text
     assert [event.kind for event in ended.log.events].count(EventKind.MOVE_END) == 2
     assert ended.states == ([State.SWITCH_ON_DISABLED] * len(NODES),) * 2
     figure(f"error passive: in the log, run {'valid' if ended.log.statistics.valid else 'invalid'}")

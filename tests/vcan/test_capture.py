@@ -175,7 +175,7 @@ def test_a_capture_that_is_killed_is_named(bus: SocketcanBus) -> None:
         bus.recv(WAIT_S)
 
 
-def test_bus_off_is_told(wire: socket.socket) -> None:
+def test_bus_off_is_reported(wire: socket.socket) -> None:
     link = Link(BusAddress("socketcan", INTERFACE), SdoPolicy(), time.monotonic_ns)
     link.open()
     try:
@@ -196,11 +196,11 @@ def test_a_recording_that_follows_the_kernels_sync_loses_nothing(tmp_path: Path,
     with simulated(simulation):
         for attempt in range(1, ATTEMPTS + 1):
             log = tmp_path / f"{attempt}.mcap"
-            told = record_once(cell, plan, log)
-            if told["valid"]:
+            reported = record_once(cell, plan, log)
+            if reported["valid"]:
                 break
-    assert told["valid"], told["reason"]
-    assert (told["lost_cycles"], told["missing"]) == (0, [0] * 6)
+    assert reported["valid"], reported["reason"]
+    assert (reported["lost_cycles"], reported["missing"]) == (0, [0] * 6)
     step_us = np.diff(read_log(log).samples.time_ns) * 1e-3
     spread = ", ".join(f"{np.percentile(step_us, share):.0f}" for share in (0, 1, 50, 99, 100))
     figure(

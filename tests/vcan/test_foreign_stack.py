@@ -81,15 +81,23 @@ def test_they_are_mapped_started_streamed_from_and_given_back(figure: Callable[[
         stream = SyncStream(network, LockstepSync(PERIOD_NS))
         samples = list(islice(stream, CYCLES))
         seconds = time.monotonic() - begun
-        told = stream.statistics
+        statistics = stream.statistics
         assert {network.link.nmt[node] for node in NODES} == {5}
     positions = np.array([sample.position_counts for sample in samples])
-    assert (told.missing, told.late, told.duplicate, told.surplus, told.wrong_length) == (0, 0, 0, 0, 0)
+    assert (statistics.missing, statistics.late, statistics.duplicate, statistics.surplus, statistics.wrong_length) == (
+        0,
+        0,
+        0,
+        0,
+        0,
+    )
     # The shaft turns STEP counts a SYNC: a sample that is repeated, left out or of another SYNC would show.
     assert (np.diff(positions, axis=0) == STEP).all()
     assert {sample.current_raw for sample in samples} == {(-11, -12)}
     assert {decode(word) for sample in samples for word in sample.statusword} == {State.SWITCH_ON_DISABLED}
-    figure(f"foreign stack: {CYCLES} cycles of {len(NODES)} drives in {seconds:.2f} s, {told.frames} answers, 0 lost")
+    figure(
+        f"foreign stack: {CYCLES} cycles of {len(NODES)} drives in {seconds:.2f} s, {statistics.frames} answers, 0 lost"
+    )
     with CanopenNetwork(ADDRESS, AXES) as network:
         for node, record in zip(NODES, before, strict=True):
             access = network.link.objects(node)

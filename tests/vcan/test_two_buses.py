@@ -71,7 +71,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield path
 
 
-def test_scan_tells_the_bus_of_each_node(cell: Path) -> None:
+def test_scan_reports_the_bus_of_each_node(cell: Path) -> None:
     found = [(node["bus"], node["node_id"], node["verdict"]) for node in say("scan", str(cell))["nodes"]]
     assert found == [("left", node, "ok") for node in LEFT] + [("right", node, "ok") for node in RIGHT]
 

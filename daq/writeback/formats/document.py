@@ -71,9 +71,9 @@ class ControllerDocument(Protocol):
 def format_of(name: str) -> ControllerFormat:
     """Format that a file's name tells, a backup's too; YAML where it tells none."""
     for suffix in reversed(Path(name).suffixes):
-        for known, told in _SUFFIXES:
+        for known, suffix_format in _SUFFIXES:
             if suffix.lower() == known:
-                return told
+                return suffix_format
     return ControllerFormat.YAML
 
 
@@ -88,12 +88,12 @@ def decode(content: bytes, name: str, format: ControllerFormat | None = None) ->
     Raises:
         ControllerUnfit: the bytes are no text of that format. What is wrong further in, `locate` tells.
     """
-    told = format or format_of(name)
-    if told is ControllerFormat.JSON:
+    chosen_format = format or format_of(name)
+    if chosen_format is ControllerFormat.JSON:
         return json_document(content, name)
-    if told is ControllerFormat.XML:
+    if chosen_format is ControllerFormat.XML:
         return xml_document(content, name)
-    if told is ControllerFormat.DCF:
+    if chosen_format is ControllerFormat.DCF:
         return dcf_document(content, name)
     return yaml_document(content, name)
 

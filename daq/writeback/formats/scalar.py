@@ -145,7 +145,7 @@ class Scalar:
 
 
 @dataclass(frozen=True, slots=True)
-class Respelling:
+class RewrittenGain:
     """A gain as it would stand in a document whose unit may be another.
 
     Attributes:
@@ -158,7 +158,7 @@ class Respelling:
     spelling: str
 
 
-def respell(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> Respelling:
+def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> RewrittenGain:
     """Put a gain in the place of a number.
 
     Args:
@@ -174,7 +174,7 @@ def respell(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> Re
     number = scalar.read(spelling)
     if number == scalar.value:
         spelling = scalar.text  # the same number in the human's own spelling is no change
-    return Respelling(scalar.value / factor, number / factor, spelling)
+    return RewrittenGain(scalar.value / factor, number / factor, spelling)
 
 
 def spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) -> str:

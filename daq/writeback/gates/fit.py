@@ -269,12 +269,14 @@ def _repeated(calibration: Calibration) -> Iterator[Refusal]:
 
 def _figures(calibration: Calibration, held_out: bool) -> Iterator[Refusal]:
     """A figure without a log is nobody's; a log without its figure hides one."""
-    told = calibration.holdout_error_percent is not None
-    if told != held_out:
+    has_holdout = calibration.holdout_error_percent is not None
+    if has_holdout != held_out:
         yield Refusal(
             Gate.HOLDOUT,
             "calibration",
-            "an error on held-out data, and no log of them" if told else "a log that was held out, and no error on it",
+            "an error on held-out data, and no log of them"
+            if has_holdout
+            else "a log that was held out, and no error on it",
             "both or neither",
             "fit the logs again",
         )

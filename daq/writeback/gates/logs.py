@@ -10,7 +10,7 @@ from daq.config.cell import WeighedPayload
 from daq.config.policy import ApplyPolicy
 from daq.workflow.safeguards import agree, tolerance_kg
 from daq.writeback.gates.fit import role_refusals
-from daq.writeback.gates.table import Circumstances, Gate, Refusal
+from daq.writeback.gates.table import Gate, GateContext, Refusal
 from daq.writeback.gates.target import axis_refusals
 from ident.calibration import Calibration, Source
 from ident.data.run import Recording
@@ -24,7 +24,7 @@ _LONGEST_DAYS = 1e5
 """Some 270 years: no log is so old."""
 
 
-def source_refusals(calibration: Calibration, policy: ApplyPolicy, held: Circumstances) -> tuple[Refusal, ...]:
+def source_refusals(calibration: Calibration, policy: ApplyPolicy, held: GateContext) -> tuple[Refusal, ...]:
     """Closed gates of the logs, and of what the calibration says of the axes.
 
     Args:
@@ -40,11 +40,11 @@ def source_refusals(calibration: Calibration, policy: ApplyPolicy, held: Circums
         )
     axes = [gain.axis for gain in calibration.gains]
     closed = [refusal for source in calibration.sources for refusal in _refusals(source, axes, policy, held)]
-    roles = role_refusals(calibration) if held.told else ()
+    roles = role_refusals(calibration) if held.is_given else ()
     return (*of_axes, *closed, *roles, *_exchanged(calibration.sources, axes))
 
 
-def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circumstances) -> Iterator[Refusal]:
+def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: GateContext) -> Iterator[Refusal]:
     name = f"log {source.name}"
     if source.name.endswith(_UNFINISHED) or not _SHA256.fullmatch(source.sha256):
         unfinished = source.name.endswith(_UNFINISHED)
@@ -58,9 +58,9 @@ def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circum
             "a recording that its recorder stands for to the end",
             "record it again and fit",
         )
-    told = source.recording
-    if told is None:
-        if held.told:
+    recording = source.recording
+    if recording is None:
+        if held.is_given:
             yield Refusal(
                 Gate.SOURCES,
                 name,
@@ -69,21 +69,21 @@ def _refusals(source: Source, axes: list[str], policy: ApplyPolicy, held: Circum
                 "fit the logs again",
             )
         return
-    if held.told:
-        yield from _incomplete(told, name, axes)
-    yield from _losses(source, told, name)
-    yield from _age(told, name, policy, held.now)
-    yield from _serials(told, name, axes, held)
-    yield from _saturation(told, name, axes, policy)
-    yield from _mass(source, told, name, held)
+    if held.is_given:
+        yield from _incomplete(recording, name, axes)
+    yield from _losses(source, recording, name)
+    yield from _age(recording, name, policy, held.now)
+    yield from _serials(recording, name, axes, held)
+    yield from _saturation(recording, name, axes, policy)
+    yield from _mass(source, recording, name, held)
 
 
-def _incomplete(told: Recording, name: str, axes: list[str]) -> Iterator[Refusal]:
+def _incomplete(recording: Recording, name: str, axes: list[str]) -> Iterator[Refusal]:
     """What a log does not tell of an axis must not pass for an axis with nothing to tell."""
     numbers = (
-        ("serial numbers", len(told.serials)),
-        ("shares of saturated samples", len(told.saturated_percent)),
-        ("counts of missing answers", len(told.missing)),
+        ("serial numbers", len(recording.serials)),
+        ("shares of saturated samples", len(recording.saturated_percent)),
+        ("counts of missing answers", len(recording.missing)),
     )
     for what, count in numbers:
         if count != len(axes):
@@ -94,8 +94,8 @@ def _incomplete(told: Recording, name: str, axes: list[str]) -> Iterator[Refusal
                 f"of each of the {len(axes)} axes that the calibration has",
                 "fit the logs again",
             )
-    shares = [percent for percent in told.saturated_percent if not 0.0 <= percent <= 100.0]
-    counts = [count for count in (told.lost_cycles, *told.missing) if count < 0]
+    shares = [percent for percent in recording.saturated_percent if not 0.0 <= percent <= 100.0]
+    counts = [count for count in (recording.lost_cycles, *recording.missing) if count < 0]
     if shares or counts:
         yield Refusal(
             Gate.SOURCES,
@@ -106,23 +106,23 @@ def _incomplete(told: Recording, name: str, axes: list[str]) -> Iterator[Refusal
         )
 
 
-def _losses(source: Source, told: Recording, name: str) -> Iterator[Refusal]:
+def _losses(source: Source, recording: Recording, name: str) -> Iterator[Refusal]:
     # A log whose losses somebody has accepted is called partial: once is enough.
-    if not source.partial and (told.lost_cycles or any(told.missing)):
+    if not source.partial and (recording.lost_cycles or any(recording.missing)):
         yield Refusal(
             Gate.LOSSY,
             name,
-            f"{told.lost_cycles} SYNC cycles lost, {sum(told.missing)} answers missing",
+            f"{recording.lost_cycles} SYNC cycles lost, {sum(recording.missing)} answers missing",
             "a recording without losses",
             "record it again, with less load on the bus and the computer, and fit",
         )
 
 
-def _age(told: Recording, name: str, policy: ApplyPolicy, now: datetime | None) -> Iterator[Refusal]:
+def _age(recording: Recording, name: str, policy: ApplyPolicy, now: datetime | None) -> Iterator[Refusal]:
     if now is None or policy.max_age_days is None:
         return
     expected = f"recorded within the last {_span(policy.max_age_days)}"
-    days = None if told.recorded_s is None else (now.timestamp() - told.recorded_s) / _DAY_S
+    days = None if recording.recorded_s is None else (now.timestamp() - recording.recorded_s) / _DAY_S
     # In numbers, not in dates: a hand-made date may be one that no calendar has.
     if days is not None and -_CLOCKS_DAYS <= days <= policy.max_age_days:
         return
@@ -130,7 +130,7 @@ def _age(told: Recording, name: str, policy: ApplyPolicy, now: datetime | None) 
         found = "no date: it was imported"
         remedy = "record with drivegain, or allow it with `max_age_days: null` in the cell's `policy: {apply: ...}`"
     elif not abs(days) < _LONGEST_DAYS:
-        found, remedy = f"a date that cannot be, {told.recorded_s:g} s of Unix time", "fit the logs again"
+        found, remedy = f"a date that cannot be, {recording.recorded_s:g} s of Unix time", "fit the logs again"
     else:
         found = f"recorded {_span(days)} ago" if days > 0 else f"recorded {_span(-days)} from now"
         remedy = "record again and fit" if days > 0 else "set the clocks of this computer and of the recorder"
@@ -142,9 +142,9 @@ def _span(days: float) -> str:
     return f"{round(days, 1):g} days" if days >= 1.0 else f"{24.0 * days:.2g} hours"
 
 
-def _serials(told: Recording, name: str, axes: list[str], held: Circumstances) -> Iterator[Refusal]:
+def _serials(recording: Recording, name: str, axes: list[str], held: GateContext) -> Iterator[Refusal]:
     declared = {} if held.serials is None else held.serials
-    for axis, serial in zip(axes, told.serials, strict=False):
+    for axis, serial in zip(axes, recording.serials, strict=False):
         wanted = declared.get(axis)
         if wanted is not None and serial != wanted:
             yield Refusal(
@@ -176,8 +176,8 @@ def _exchanged(sources: tuple[Source, ...], axes: list[str]) -> Iterator[Refusal
             )
 
 
-def _saturation(told: Recording, name: str, axes: list[str], policy: ApplyPolicy) -> Iterator[Refusal]:
-    for axis, percent in zip(axes, told.saturated_percent, strict=False):
+def _saturation(recording: Recording, name: str, axes: list[str], policy: ApplyPolicy) -> Iterator[Refusal]:
+    for axis, percent in zip(axes, recording.saturated_percent, strict=False):
         if percent > policy.max_saturated_percent:
             yield Refusal(
                 Gate.SATURATED,
@@ -188,17 +188,17 @@ def _saturation(told: Recording, name: str, axes: list[str], policy: ApplyPolicy
             )
 
 
-def _mass(source: Source, told: Recording, name: str, held: Circumstances) -> Iterator[Refusal]:
+def _mass(source: Source, recording: Recording, name: str, held: GateContext) -> Iterator[Refusal]:
     if held.payloads is None:
         return
     if source.payload is None:
-        if source.mass_kg is not None or told.entered_kg is not None:
+        if source.mass_kg is not None or recording.entered_kg is not None:
             yield Refusal(Gate.MASS, name, "a mass, and no payload", "both or neither", "fit the logs again")
         return
     subject, fitted_kg = f"{name}, payload {source.payload}", source.mass_kg
     yield from _mass_now(subject, source.payload, fitted_kg, held.payloads)
     at_apply_kg = held.entered_kg.get(source.payload)
-    entered = [kg for kg in (told.entered_kg, at_apply_kg) if kg is not None]
+    entered = [kg for kg in (recording.entered_kg, at_apply_kg) if kg is not None]
     if fitted_kg is None or not entered:
         found = "no mass" if fitted_kg is None else f"{fitted_kg:g} kg, entered once (in the cell file)"
         yield Refusal(

@@ -60,7 +60,7 @@ class Refusal:
 # The error for closed gates.
 
 
-def closed(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
+def refusal_error(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
     """What to raise for at least one closed gate; several are listed one a line.
 
     Args:
@@ -83,7 +83,7 @@ def closed(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
 
 
 @dataclass(frozen=True, slots=True)
-class Circumstances:
+class GateContext:
     """Whatever is None is not compared.
 
     Attributes:
@@ -101,12 +101,12 @@ class Circumstances:
     axes: tuple[Axis, ...] | None = None
 
     @property
-    def told(self) -> bool:
+    def is_given(self) -> bool:
         """Whether there is anything to compare with."""
         return any(one is not None for one in (self.now, self.serials, self.payloads, self.axes))
 
 
-def circumstances(cell: Cell, now: datetime, entered_kg: Mapping[str, float]) -> Circumstances:
+def gate_context(cell: Cell, now: datetime, entered_kg: Mapping[str, float]) -> GateContext:
     """All of them, of one cell."""
     serials = {axis.name: None if axis.identity is None else axis.identity.serial for axis in cell.axes}
-    return Circumstances(now, serials, cell.payloads, entered_kg, cell.axes)
+    return GateContext(now, serials, cell.payloads, entered_kg, cell.axes)

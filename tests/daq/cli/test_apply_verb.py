@@ -141,14 +141,14 @@ def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     changes = begun.details["changes"]
     assert isinstance(changes, list)
     assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == ("J4", -11.52, -9.21)
-    told = begun.details["calibration"]
-    assert isinstance(told, dict)
-    assert told["file"] == str(bench.calibration)
+    reported = begun.details["calibration"]
+    assert isinstance(reported, dict)
+    assert reported["file"] == str(bench.calibration)
     assert begun.details["sha256_before"] != begun.details["sha256_after"]
     assert len(bench.controller.read_bytes()) != len(before)
 
 
-def test_another_configuration_is_refused_until_somebody_says_so(
+def test_another_configuration_is_refused_until_someone_says_so(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bench.cell.write_text(bench.cell.read_text() + "# changed\n")
@@ -198,7 +198,7 @@ def test_a_policy_that_wants_more_signatures_than_it_names_is_refused(bench: Ben
     assert bench.apply() == ExitCode.CONFIGURATION
 
 
-def test_a_rollback_without_a_cell_says_that_it_is_not_written_down(
+def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
@@ -220,7 +220,7 @@ def test_without_room_for_the_audit_nothing_is_written(bench: Bench, capsys: pyt
     assert not list(bench.controller.parent.glob("*.bak"))
 
 
-def test_nobody_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
+def test_no_one_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
     other = tmp_path / "other.jsonl"
     assert bench.apply("--yes", "--audit", str(other)) == ExitCode.USAGE
     assert bench.apply("--yes") == ExitCode.OK
@@ -287,14 +287,14 @@ def test_a_name_that_cannot_be_shown_is_no_name(bench: Bench, name: str) -> None
     assert bench.controller.read_bytes() == before
 
 
-def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
+def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def killed(*_: object) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("daq.cli.apply.tell_history", killed)
+        patch.setattr("daq.cli.apply.record_in_history", killed)
         assert bench.apply("--yes") == ExitCode.INTERRUPTED
     assert b"-9.2100" in bench.controller.read_bytes()
     capsys.readouterr()
@@ -312,7 +312,7 @@ def test_after_a_kill_behind_the_write_the_same_command_tells_the_history(
         assert store.in_force(str(bench.controller)) == store.entries()[0].digest
 
 
-def test_a_dry_run_of_what_stands_there_already_tells_the_history_nothing(bench: Bench) -> None:
+def test_a_dry_run_of_what_is_there_already_enters_the_history_nothing(bench: Bench) -> None:
     bench.controller.write_bytes(bench.controller.read_bytes())
     assert bench.apply() == ExitCode.OK
     assert not bench.cell.with_name("cell.history.sqlite").exists()
@@ -365,7 +365,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     assert "σ of both" in capsys.readouterr().out
 
 
-def _told_base(shown: str) -> str:
+def _shown_base(shown: str) -> str:
     """What the dry run says to repeat."""
     return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
 
@@ -375,7 +375,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
 ) -> None:
     before, fitted = bench.controller.read_bytes(), bench.calibration.read_bytes()
     assert bench.apply() == ExitCode.OK
-    base = _told_base(capsys.readouterr().out)
+    base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--json") == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["base"] == base
     # Another calibration under the same name.
@@ -385,7 +385,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
     assert "the keys or the factors have changed since the dry run" in " ".join(capsys.readouterr().err.split())
     assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
-    assert _told_base(capsys.readouterr().out) != base
+    assert _shown_base(capsys.readouterr().out) != base
     bench.calibration.write_bytes(fitted)
     # Other keys in the cell: the gains of J1 and J2 exchanged.
     cell = bench.cell.read_text()
@@ -409,7 +409,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
         assert bench.apply("--yes", "--base", wrong) == ExitCode.USAGE
 
 
-def test_a_dry_run_of_a_file_that_changed_since_the_recording_tells_the_way_on(
+def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     known = decode(bench.calibration.read_bytes(), "")
@@ -419,7 +419,7 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_tells_the_way_on(
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--base" not in capsys.readouterr().out
     assert bench.apply() == ExitCode.CALIBRATION_REFUSED
-    base = _told_base(capsys.readouterr().out)
+    base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
     assert "--yes" not in capsys.readouterr().out  # another gate is closed
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
@@ -488,8 +488,8 @@ def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -
     capsys.readouterr()
     for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
         assert code == ExitCode.CALIBRATION_REFUSED
-    told = " ".join(capsys.readouterr().err.split())
-    assert told.count(found) == 3
+    output = " ".join(capsys.readouterr().err.split())
+    assert output.count(found) == 3
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.CALIBRATION_REFUSED
     assert found in " ".join(capsys.readouterr().err.split())
     assert before == (bench.controller.read_bytes() if bench.controller.exists() else b"")

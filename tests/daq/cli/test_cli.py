@@ -41,10 +41,10 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
         assert shown.example.startswith("drivegain " + " ".join(command))
         assert output.splitlines()[-1].strip() == shown.example
         # Nothing of a help text is taken for markup: units stand in brackets.
-        told = _squeezed(output)
+        reported = _squeezed(output)
         for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
             (option,) = parameter.annotation.__metadata__
-            assert _squeezed(option.help) in told
+            assert _squeezed(option.help) in reported
 
 
 def test_the_list_shows_every_verb_with_its_whole_summary(capsys: pytest.CaptureFixture[str]) -> None:
@@ -75,7 +75,7 @@ def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) 
     assert done.stderr == "[]\n"
 
 
-def test_what_was_written_is_told_line_by_line(tmp_path: Path) -> None:
+def test_what_was_written_is_reported_line_by_line(tmp_path: Path) -> None:
     out = io.StringIO()
     (tmp_path / "[s] pictures").mkdir()
     say_written(Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures")
@@ -142,7 +142,7 @@ def test_info_of_a_damaged_log_is_exit_code_4(log: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("more", [[], ["--json"]])
-def test_an_output_that_cannot_be_written_is_told(log: Path, checkout: Path, more: list[str]) -> None:
+def test_an_output_that_cannot_be_written_is_reported(log: Path, checkout: Path, more: list[str]) -> None:
     command = [sys.executable, "-m", "daq", "info", str(log), *more]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=checkout, check=False)
@@ -152,7 +152,7 @@ def test_an_output_that_cannot_be_written_is_told(log: Path, checkout: Path, mor
 
 
 @pytest.mark.parametrize("more", [[], ["--json"]])
-def test_a_reader_that_has_seen_enough_is_no_error_to_tell(log: Path, checkout: Path, more: list[str]) -> None:
+def test_a_reader_that_has_seen_enough_is_no_error_to_report(log: Path, checkout: Path, more: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     try:

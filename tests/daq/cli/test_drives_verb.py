@@ -24,7 +24,7 @@ from drivers.canopen.parameters import Saving
 from drivers.canopen.sdo import ObjectAccess
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import DOER, NOW, apply_in_drives, entered_gain, on_its_own_bus, saved_gain, simulated
+from tests.daq.drives import ACTOR, NOW, apply_in_drives, entered_gain, on_its_own_bus, saved_gain, simulated
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def simulation(cell: Cell) -> Iterator[SimulatedCell]:
 
 def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
     assert cell.history is not None
-    rollback_drives(cell, now=NOW, doer=DOER, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
+    rollback_drives(cell, now=NOW, actor=ACTOR, saving=Saving.KNOWN, audit=cell.history.audit, yes=yes, json=as_json)
 
 
 def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,23 +53,23 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     base = shown.split("--base ")[1].split()[0]
 
     apply_in_drives(cell, yes=True, base=base)
-    told = capsys.readouterr().out
-    assert "Written to the drives and read back" in told
-    assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in told
+    output = capsys.readouterr().out
+    assert "Written to the drives and read back" in output
+    assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
     apply_in_drives(cell)
     assert "The drives have these gains already" in capsys.readouterr().out
 
     _back(cell, yes=False)
-    told = capsys.readouterr().out
-    assert "J4, 2003h:01: -9210 -> -11520" in told
-    assert "the write of 2025-01-02T03:04:05+00:00 by Kim (login kim)" in told
-    assert "Dry run, nothing was written." in told
+    output = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in output
+    assert "the write of 2025-01-02T03:04:05+00:00 by Kim (login kim)" in output
+    assert "Dry run, nothing was written." in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
     _back(cell)
-    told = capsys.readouterr().out
-    assert "J4, 2003h:01: -9210 -> -11520" in told
-    assert "The drives have saved." in told
+    output = capsys.readouterr().out
+    assert "J4, 2003h:01: -9210 -> -11520" in output
+    assert "The drives have saved." in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     assert cell.history is not None
     assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
@@ -101,26 +101,26 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
 
 
 @pytest.mark.usefixtures("simulation")
-def test_a_program_is_told_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
     apply_in_drives(cell, as_json=True)
-    looked = json.loads(capsys.readouterr().out)
-    assert (looked["applied"], looked["refusals"]) == (False, [])
-    assert looked["changes"][3]["new"] == -9.21
+    reviewed = json.loads(capsys.readouterr().out)
+    assert (reviewed["applied"], reviewed["refusals"]) == (False, [])
+    assert reviewed["changes"][3]["new"] == -9.21
     apply_in_drives(cell, as_json=True, yes=True, saving=Saving.RAM)
     written = json.loads(capsys.readouterr().out)
     assert (written["applied"], written["saved"]) == (True, False)
-    assert written["base_sha256"] == looked["base_sha256"]
+    assert written["base_sha256"] == reviewed["base_sha256"]
     assert Path(written["record"]).is_file()
     for yes in (False, True):
         _back(cell, yes=yes, as_json=True)
-        told = json.loads(capsys.readouterr().out)
-        assert (told["source"], told["restored"]) == (written["record"], yes)
-        assert told["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
+        document = json.loads(capsys.readouterr().out)
+        assert (document["source"], document["restored"]) == (written["record"], yes)
+        assert document["changes"][3] == {"axis": "J4", "object": "2003h:01", "old": -9210.0, "new": -11520.0}
 
 
 @pytest.mark.parametrize("yes", [False, True])
 @pytest.mark.parametrize("as_json", [False, True])
-def test_a_closed_gate_is_told_and_nothing_written(
+def test_a_failed_check_is_reported_and_nothing_written(
     cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str], yes: bool, as_json: bool
 ) -> None:
     calibration = demo_calibration()
@@ -157,7 +157,7 @@ def test_an_interrupt_puts_back_what_was_written(
 
 
 @pytest.mark.usefixtures("simulation")
-def test_a_bus_that_somebody_else_has_is_left_alone(cell: Cell) -> None:
+def test_a_bus_that_another_client_has_is_left_alone(cell: Cell) -> None:
     with bus_lock(cell), pytest.raises(BusTaken):
         apply_in_drives(cell)
     apply_in_drives(cell)

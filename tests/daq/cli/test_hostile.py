@@ -135,10 +135,10 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
     show_error(error, Console(stderr=True, soft_wrap=True))
-    told = capsys.readouterr().err
-    assert "node 3: object 6041h:00: no answer" in told
-    assert "emergency stop" in told
-    assert "all axes were stopped" not in told
+    output = capsys.readouterr().err
+    assert "node 3: object 6041h:00: no answer" in output
+    assert "emergency stop" in output
+    assert "all axes were stopped" not in output
 
 
 def test_a_stop_that_was_confirmed_is_not(capsys: pytest.CaptureFixture[str]) -> None:

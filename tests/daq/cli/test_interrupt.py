@@ -44,21 +44,21 @@ def test_a_signal_interrupts_once_and_again_after_the_stop_had_its_time(number: 
 
 def test_what_must_not_be_disturbed_is_not_for_as_long_as_a_stop_takes() -> None:
     now_s = 100.0
-    with interruptible(lambda: now_s) as undisturbed:
-        with undisturbed():
+    with interruptible(lambda: now_s) as block_signals:
+        with block_signals():
             signal.raise_signal(signal.SIGINT)  # the first of all: a fault began this stop
             now_s += GRACE_S / 2
             signal.raise_signal(signal.SIGTERM)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         now_s += GRACE_S + 1
-        with undisturbed():
+        with block_signals():
             now_s += GRACE_S
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)  # nobody is left without a way out
 
 
-def test_what_is_not_known_to_stand_is_not_said_to() -> None:
+def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     out = Path("run.mcap")
     assert "axes stopped" in _interrupted(KeyboardInterrupt(), None, out)
     fault = DriveFault(3, "EMCY 7305h")

@@ -151,7 +151,7 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     assert len(bus.sent) == asked + 6
 
 
-def test_a_late_answer_to_somebody_else_is_no_reading(bus: QuietBus) -> None:
+def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
     monitor = _monitor(bus)
     monitor.watch(QUIET_S + 0.01)
     other = bytes((0x43, 0x75, 0x60, 0)) + struct.pack("<I", 2000)

@@ -43,7 +43,7 @@ def _failing(error: DriverError, part: Path | None) -> object:
     ("valid", "code", "said"),
     [(True, ExitCode.OK, "complete"), (False, ExitCode.DATA_UNFIT, "INVALID: 2 missing answers; a fit will refuse it")],
 )
-def test_a_recording_with_losses_is_told_of_and_is_no_success(
+def test_a_recording_with_losses_is_reported_and_is_no_success(
     cells: dict[str, str],
     valid: bool,
     code: ExitCode,
@@ -82,11 +82,11 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
     assert main(command) == ExitCode.USAGE
     second = " ".join(capsys.readouterr().err.split())
     assert "the rest of a recording" in second
-    for told in (first, second):
-        assert f"`rm {shlex.quote(str(part))}`" in told
-        assert f"`mv {shlex.quote(str(part))} " in told
-        assert f"`drivegain salvage {shlex.quote(str(part))} --out " in told
-        assert "choose another --out" in told
+    for run in (first, second):
+        assert f"`rm {shlex.quote(str(part))}`" in run
+        assert f"`mv {shlex.quote(str(part))} " in run
+        assert f"`drivegain salvage {shlex.quote(str(part))} --out " in run
+        assert "choose another --out" in run
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_lost_sample_with_a_timed_pacing_names_lockstep(
     monkeypatch.setattr("daq.cli.record.record", _failing(error, None))
     command = ["record", cells[pacing], "plan.yaml", "--out", str(tmp_path / "run.mcap")]
     assert main(command) == ExitCode.DEVICE_FAULT
-    told = " ".join(capsys.readouterr().err.split())
-    assert ("hint:" in told) is hinted
-    assert ("`sync.pacing: lockstep`" in told) is hinted
-    assert "kept:" not in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert ("hint:" in output) is hinted
+    assert ("`sync.pacing: lockstep`" in output) is hinted
+    assert "kept:" not in output

@@ -76,7 +76,7 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_words(cell: Cell) -> Non
         assert sum("ENABLED" in line for line in lines) == 6
 
 
-def test_identity_and_power_are_told_apart(cell: Cell) -> None:
+def test_identity_and_power_are_distinguished(cell: Cell) -> None:
     (row, *_) = scan_rows(cell, (_node(1, 0x237, serial=9),), "demo")
     assert (row["verdict"], row["enabled"]) == ("other identity", True)
 
@@ -99,9 +99,9 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         assert "--reset-faults" in shown
         assert simulated.nodes[2].drive.state is PowerState.FAULT
         assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
-        told = json.loads(capsys.readouterr().out)
-        assert told["reset"] == ["J3"]
-        assert [node["verdict"] for node in told["nodes"]] == ["ok"] * 6
+        document = json.loads(capsys.readouterr().out)
+        assert document["reset"] == ["J3"]
+        assert [node["verdict"] for node in document["nodes"]] == ["ok"] * 6
         assert [node.drive.state for node in simulated.nodes] == [PowerState.SWITCH_ON_DISABLED] * 6
         # Asked of a cell without a fault it does nothing.
         assert main(["scan", file, "--reset-faults"]) == ExitCode.OK
@@ -116,7 +116,7 @@ def two(checkout: Path) -> Cell:
     return cell_from_bundle({**files, "cell.yaml": text.encode()})
 
 
-def test_a_node_is_told_where_it_is_and_where_it_belongs(two: Cell) -> None:
+def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
     left = scan_rows(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
     assert [(row["bus"], row["node_id"], row["axis"], row["verdict"]) for row in left] == [
         ("left", 1, "J1", "ok"),

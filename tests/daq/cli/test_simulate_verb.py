@@ -86,7 +86,7 @@ def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
     code = (
         "import sys\n"
         "sys.modules.update(dict.fromkeys(('numba', 'pinocchio', 'llvmlite'), None))\n"
-        "import ident.clearance, ident.nominal, ident.physical\n"
+        "import ident.planning.clearance, ident.planning.excitation, ident.physical.physical\n"
         "from daq.cli.app import VERBS\n"
         "print(len([listed.load() for listed in VERBS]))\n"
     )

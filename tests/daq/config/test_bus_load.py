@@ -158,14 +158,14 @@ def test_a_move_sends_no_more_than_is_counted() -> None:
         for _ in execute(network, stream, (), permission()):
             pass
         bus.sent.clear()
-        told = Counter[int]()
+        reported = Counter[int]()
         for sample in execute(network, stream, moves, permission()):
             assert not sample.missing
-        told.update(message.arbitration_id for message in bus.sent)
+        reported.update(message.arbitration_id for message in bus.sent)
     enabling = 3 + 2  # three commands up; the stop's quick stop and power off
     for node_id in (1, 2):
-        assert told[0x300 + node_id] == told[0x400 + node_id] == len(moves)
-        assert told[0x200 + node_id] <= SETPOINTS * len(moves) + enabling
+        assert reported[0x300 + node_id] == reported[0x400 + node_id] == len(moves)
+        assert reported[0x200 + node_id] <= SETPOINTS * len(moves) + enabling
 
 
 def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of() -> None:

@@ -38,13 +38,13 @@ def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
 
 
 def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
-    told = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
+    reported = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
     alone = _cell(tmp_path, f"{{objects: {OBJECTS}}}")
-    assert alone.controller == Controller(None, (), objects=(told,) * 6)
+    assert alone.controller == Controller(None, (), objects=(reported,) * 6)
     assert alone.controller_path is None
     beside = _cell(tmp_path, f"{{file: robot.json, gains: [a, b, c, d, e, f], objects: {OBJECTS}}}")
     assert beside.controller is not None
-    assert (beside.controller.objects, beside.controller.file) == ((told,) * 6, "robot.json")
+    assert (beside.controller.objects, beside.controller.file) == ((reported,) * 6, "robot.json")
 
 
 @pytest.mark.parametrize(

@@ -92,8 +92,8 @@ def test_the_page_of_the_drives_names_every_profile(name: str, checkout: Path) -
     row = next(
         line for line in (checkout / "docs/drives.md").read_text(encoding="utf-8").splitlines() if f"`{name}`" in line
     )
-    for told in (str(profile.current), profile.amplitude.value, profile.current_scale.form.value):
-        assert told in row
+    for reported in (str(profile.current), profile.amplitude.value, profile.current_scale.form.value):
+        assert reported in row
     assert ("ACTUAL" in row) is (profile.tap is TapPoint.ACTUAL)
 
 
@@ -133,7 +133,7 @@ def test_profiles_without_reference_are_those_of_the_notes() -> None:
 # -- strictness --------------------------------------------------------------------------------------------------------
 
 
-def test_a_peak_current_that_nobody_entered_is_named_with_its_line() -> None:
+def test_a_peak_current_that_no_one_entered_is_named_with_its_line() -> None:
     text = (FOLDER / "technosoft-ipos.yaml").read_bytes()
     with pytest.raises(ConfigurationInconsistent, match=r"ipos\.yaml:9: current_scale\.peak_current_a: .*data sheet"):
         drive_from_text(text, "ipos.yaml")
@@ -232,12 +232,12 @@ def test_the_standard_profile_does_not_fit_these_drives(file: str, missing: str,
 
 
 @pytest.mark.parametrize(("name", "file"), [("elmo-gold", "Elmo_cob.dcf"), ("elmo-gold", "ElmoSimplIQ_cob.dcf")])
-def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_told(name: str, file: str, shared_data: Path) -> None:
-    told, profile = sheet(shared_data, file), profile_of(name)
+def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_reported(name: str, file: str, shared_data: Path) -> None:
+    reported, profile = sheet(shared_data, file), profile_of(name)
     wide = replace(profile, current=replace(profile.current, bits=32))
-    assert disagreements(wide, told) == (f"6074h:00 (torque_demand): i16 in {file}, i32 in the profile",)
+    assert disagreements(wide, reported) == (f"6074h:00 (torque_demand): i16 in {file}, i32 in the profile",)
     rated = replace(profile, current=profile.current_scale.objects[0])
-    assert disagreements(rated, told) == (f"6075h:00 (motor_rated_current): cannot be mapped by {file}",)
+    assert disagreements(rated, reported) == (f"6075h:00 (motor_rated_current): cannot be mapped by {file}",)
 
 
 SHEET = """[FileInfo]
@@ -266,10 +266,10 @@ PDOMapping=
 
 
 def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
-    told = eds_from_text(SHEET.encode(), "x")
-    assert told.description == "a drive"
-    assert set(told.objects) == {(0x6064, 0), (0x1008, 0), (0x1018, 1)}
-    position, name, vendor = told.objects[0x6064, 0], told.objects[0x1008, 0], told.objects[0x1018, 1]
+    reported = eds_from_text(SHEET.encode(), "x")
+    assert reported.description == "a drive"
+    assert set(reported.objects) == {(0x6064, 0), (0x1008, 0), (0x1018, 1)}
+    position, name, vendor = reported.objects[0x6064, 0], reported.objects[0x1008, 0], reported.objects[0x1018, 1]
     assert (position.bits, position.signed, position.readable, position.mappable) == (32, True, True, True)
     assert (name.bits, vendor.readable, vendor.mappable) == (0, False, False)
 
@@ -317,7 +317,7 @@ MAKES = {
 
 
 @dataclass(frozen=True)
-class Told:
+class RecordedRun:
     """A run, and the true currents of every SYNC [A]."""
 
     cell_file: Path
@@ -328,7 +328,7 @@ class Told:
     actual_a: NDArray[np.float64]
 
 
-def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: Dialect) -> Told:
+def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: Dialect) -> RecordedRun:
     """A short run of the demo cell, its amplifiers being of another make."""
     make = MAKES[dialect]
     drives = folder / "drives"
@@ -366,18 +366,18 @@ def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: D
         bus.shutdown()
     assert done.log.valid, done.log.reason
     run, _ = load_run(done.path)
-    return Told(cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True)))
+    return RecordedRun(cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True)))
 
 
 @pytest.mark.parametrize("dialect", list(Dialect))
 def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
     dialect: Dialect, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told = recorded(checkout, tmp_path, monkeypatch, dialect)
-    profile = told.cell.axes[0].profile
+    reported = recorded(checkout, tmp_path, monkeypatch, dialect)
+    profile = reported.cell.axes[0].profile
     assert profile is not None
-    truth = told.actual_a if profile.tap is TapPoint.ACTUAL else told.reference_a
-    measured, half_step = told.run.current_a, 0.5001 * np.array(STEP_A[dialect])
+    truth = reported.actual_a if profile.tap is TapPoint.ACTUAL else reported.reference_a
+    measured, half_step = reported.run.current_a, 0.5001 * np.array(STEP_A[dialect])
     assert np.abs(measured).max(axis=0).min() > 0.2  # the arm moves: a dead channel would pass every bound
     starts = range(len(truth) - len(measured) + 1)
     fits = [k for k in starts if (np.abs(truth[k : k + len(measured)] - measured) <= half_step).all()]
@@ -387,21 +387,21 @@ def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
 def test_an_actual_current_is_said_to_be_one(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = recorded(checkout, tmp_path, monkeypatch, Dialect.IPOS)
+    reported = recorded(checkout, tmp_path, monkeypatch, Dialect.IPOS)
     capsys.readouterr()
-    assert main(["info", str(told.log), "--json"]) == ExitCode.OK
+    assert main(["info", str(reported.log), "--json"]) == ExitCode.OK
     shown = json.loads(capsys.readouterr().out)["current"]
-    drive = read_log(told.log).head.readback.axes[0].drive
+    drive = read_log(reported.log).head.readback.axes[0].drive
     assert (drive["tap"], drive["signal"]) == ("actual", "ACTUAL current 6077h:00")
-    assert [axis.gain_unit for axis in told.cell.axes] == ["Nm/A(actual)"] * 6
-    assert shown == dict.fromkeys(told.cell.axis_names, "ACTUAL current 6077h:00, amplitude unstated")
+    assert [axis.gain_unit for axis in reported.cell.axes] == ["Nm/A(actual)"] * 6
+    assert shown == dict.fromkeys(reported.cell.axis_names, "ACTUAL current 6077h:00, amplitude unstated")
     spec = load_simulation(checkout / "configs/simulation/clean.yaml")
-    bus = open_bus(bus_address(told.cell))
+    bus = open_bus(bus_address(reported.cell))
     try:
         with SimulatedCell(replace(spec, axes=tuple(replace(a, dialect=Dialect.IPOS) for a in spec.axes)), bus):
-            assert main(["scan", str(told.cell_file)]) == ExitCode.OK
+            assert main(["scan", str(reported.cell_file)]) == ExitCode.OK
             assert "J1, J2, J3, J4, J5, J6: ACTUAL current, not the reference" in capsys.readouterr().out
-            assert main(["scan", str(told.cell_file), "--json"]) == ExitCode.OK
+            assert main(["scan", str(reported.cell_file), "--json"]) == ExitCode.OK
             assert json.loads(capsys.readouterr().out)["current"] == shown
     finally:
         bus.shutdown()

@@ -151,7 +151,7 @@ def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])
-def test_an_integer_that_nothing_can_hold_is_told(text: str) -> None:
+def test_an_integer_that_nothing_can_hold_is_reported(text: str) -> None:
     with pytest.raises(YamlInvalid):
         _read(f"axes:\n  - {{name: J1, limits: {{velocity_deg_s: {text}}}}}\n")
 

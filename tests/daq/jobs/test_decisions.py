@@ -21,16 +21,16 @@ from drivers.errors import DriveFault
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
-BY_A_PERSON, BY_THE_JOB = (
+NEEDS_PERSON, BY_THE_JOB = (
     {"motion": "allowed", "apply": {"by": by, "max_std_percent": 8, "max_age_days": None}} for by in ("person", "job")
 )
 """The logs of these tests are as old as the year in which they play."""
 
 
-def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_told(
+def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_shown(
     tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=BY_A_PERSON)
+    rig = made_rig(tmp_path / "cell", made, policy=NEEDS_PERSON)
     before = rig.controller.read_bytes()
     ended = rig.job()
     assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
@@ -140,7 +140,7 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     assert len(begun) == len(ended) == len(outcomes)
 
 
-def test_a_write_that_the_history_was_not_told_of_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
+def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
     """Whoever wrote them was killed right behind it: taken for exact, they would differ from each new one too often."""
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     assert rig.job().outcome is Outcome.APPLIED
@@ -154,7 +154,7 @@ def test_a_write_that_the_history_was_not_told_of_is_known_by_its_numbers(tmp_pa
     assert all(gain.old_std > 0 for gain in decision.gains)
 
 
-def test_a_drift_is_told_although_the_job_applies_it_in_slices(tmp_path: Path, made: Made) -> None:
+def test_a_drift_is_reported_although_the_job_applies_it_in_slices(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     for week in range(12):
         rig.tools = made.tools(rig, J4=0.98**week)
@@ -168,11 +168,11 @@ def test_a_drift_is_told_although_the_job_applies_it_in_slices(tmp_path: Path, m
     assert [(event["level"], event["axis"], event["text"]) for event in warned] == [("warning", "J4", alarms["J4"])]
     assert alarms["J4"] in (rig.sessions[-1].folder / "summary.txt").read_text()
     metrics = (rig.cells / "drivegain_demo.prom").read_text()
-    told = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
-    assert [line for line in told if line not in metrics] == []
+    reported = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
+    assert [line for line in reported if line not in metrics] == []
 
 
-def test_nothing_is_removed_while_nobody_knows_what_is_in_force(tmp_path: Path, made: Made) -> None:
+def test_nothing_is_removed_while_no_one_knows_what_is_in_force(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
     for outcome in (Outcome.APPLIED, Outcome.UNCHANGED):
         assert rig.job().outcome is outcome
@@ -184,7 +184,7 @@ def test_nothing_is_removed_while_nobody_knows_what_is_in_force(tmp_path: Path, 
     assert "no old session removed" in {event["event"] for event in rig.events}
 
 
-def test_what_is_written_stays_told_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:
+def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_history(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB)
     apply = rig.tools.apply
 
@@ -203,7 +203,7 @@ def test_what_is_written_stays_told_as_written_whatever_becomes_of_the_history(t
     assert "drivegain rollback" in " ".join(json.loads((rig.session.folder / "summary.json").read_text())["to_do"])
 
 
-def test_a_history_that_cannot_be_read_is_told_before_anything_moves(tmp_path: Path, made: Made) -> None:
+def test_a_history_that_cannot_be_read_is_reported_before_anything_moves(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made)
     (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
     with pytest.raises(HistoryUnreadable):
@@ -216,7 +216,7 @@ def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
 ) -> None:
     public = generate(tmp_path, "bob")[1].line
     signed = {"by": "person", "max_std_percent": 8, "max_age_days": None, "signatures": 1, "signers": {"bob": public}}
-    rig = made_rig(tmp_path / "cell", made, policy={**BY_A_PERSON, "apply": signed})
+    rig = made_rig(tmp_path / "cell", made, policy={**NEEDS_PERSON, "apply": signed})
     assert rig.job().outcome is Outcome.PROPOSED
     sign, _, _, apply = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
     assert main(apply.split()[1:]) == ExitCode.CALIBRATION_REFUSED

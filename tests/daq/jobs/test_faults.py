@@ -83,7 +83,7 @@ def test_a_fault_in_motion_ends_the_job_and_leaves_the_controller_as_it_was(
 
 
 @pytest.mark.parametrize("name", CUT_OFF)
-def test_a_cell_that_is_cut_off_ends_the_job_and_what_nobody_can_reach_is_said(
+def test_a_cell_that_is_cut_off_ends_the_job_and_what_no_one_can_reach_is_said(
     tmp_path: Path, short_plan: Path, name: str
 ) -> None:
     fault, kind = CUT_OFF[name]

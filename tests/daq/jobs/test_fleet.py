@@ -30,11 +30,11 @@ from daq.cli import main
 from daq.config.cell_file import bundle
 from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputExists, OutputFailed, UsageError
 from daq.jobs import fleet as fleet_module
-from daq.jobs import workers as crew_module
-from daq.jobs.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell, open_shelf
+from daq.jobs import workers as workers_module
+from daq.jobs.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, each, fit_fleet
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
-from daq.jobs.workers import Crew, Processes, Scheduler, Threads, crew_of
+from daq.jobs.workers import Processes, Scheduler, Threads, WorkerPool, worker_pool
 from daq.workflow.calibration_file import as_document, load
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
@@ -87,12 +87,12 @@ def _files(out: Path) -> dict[str, dict[str, Any]]:
 
 
 def _fitted(logs: Path, out: Path | None, loop: Loop = Loop.OPEN) -> tuple[FleetRow, ...]:
-    with Threads(2).engaged() as crew:
-        shelf = None if out is None else open_shelf(out, loop)
-        return fit_fleet(list_logs(str(logs)), crew, loop, shelf, lambda: CREATED)
+    with Threads(2).start_pool() as pool:
+        shelf = None if out is None else open_cache(out, loop)
+        return fit_fleet(list_logs(str(logs)), pool, loop, shelf, lambda: CREATED)
 
 
-def _told(rows: tuple[FleetRow, ...]) -> list[FleetRow]:
+def _reported(rows: tuple[FleetRow, ...]) -> list[FleetRow]:
     """All but what differs from one run to the next."""
     return [replace(row, seconds=0.0, kept=False) for row in rows]
 
@@ -109,12 +109,14 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
     out, table = tmp_path / "out", tmp_path / "fleet.csv"
     code = main(["fleet", str(fleet), "--workers", "2", "--out", str(out), "--csv", str(table), "--json"])
     assert code == ExitCode.OK
-    told = json.loads(capsys.readouterr().out)
-    assert (told["fitted"], told["failed"]) == (CELLS, 0)
+    document = json.loads(capsys.readouterr().out)
+    assert (document["fitted"], document["failed"]) == (CELLS, 0)
     assert _files(out) == single
-    assert [cell["error_on"] for cell in told["cells"]] == ["holdout"] * WITH_HOLDOUT + ["fit"] * (CELLS - WITH_HOLDOUT)
+    assert [cell["error_on"] for cell in document["cells"]] == ["holdout"] * WITH_HOLDOUT + ["fit"] * (
+        CELLS - WITH_HOLDOUT
+    )
     rows = list(csv.DictReader(io.StringIO(table.read_text())))
-    for row, cell in zip(rows, told["cells"], strict=True):
+    for row, cell in zip(rows, document["cells"], strict=True):
         assert row["cell"] == cell["cell"]
         assert [float(row[f"{gain['axis']} gain"]) for gain in cell["gains"]] == [
             gain["value"] for gain in single[row["cell"]]["gains"]
@@ -164,8 +166,8 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys
     (few / "nobody's.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
     write(few / "foreign.mcap", content(2), samples([(1, 2)] * 5))
     assert main(["fleet", str(few), "--json"]) == ExitCode.DATA_UNFIT
-    told = json.loads(capsys.readouterr().out)
-    errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in told["cells"]}
+    document = json.loads(capsys.readouterr().out)
+    errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in document["cells"]}
     assert errors == {
         "cell-000": "DataUnfit",
         "cell-002": "LogTruncated",
@@ -173,12 +175,12 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys
         "foreign.mcap": "SchemaMismatch",
         "nobody's.mcap": "LogTruncated",
     }
-    assert [cell["exit_code"] for cell in told["cells"]] == [4, 4, 0, 6, 4]
-    (truncated,) = (cell for cell in told["cells"] if cell["cell"] == "cell-002")
+    assert [cell["exit_code"] for cell in document["cells"]] == [4, 4, 0, 6, 4]
+    (truncated,) = (cell for cell in document["cells"] if cell["cell"] == "cell-002")
     assert str(few / "cell-002" / "bare.mcap") in truncated["error"]["text"]
 
 
-def test_a_run_that_its_recorder_marked_invalid_is_told_of_its_cell(tmp_path: Path, checkout: Path) -> None:
+def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(tmp_path: Path, checkout: Path) -> None:
     files = bundle(checkout / "configs/cells/demo.yaml")
     write(tmp_path / "a.mcap", content(6, None, files), samples([(0,) * 6] * 9), verdict=(False, "the drives fell off"))
     (row,) = _fitted(tmp_path, None)
@@ -196,9 +198,9 @@ def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
     for name, carried in (("a", files), ("b", other), ("c", files)):
         write(tmp_path / f"{name}.mcap", content(6, None, carried), samples([(0,) * 6] * 9))
     assert main(["fleet", str(tmp_path), "--json"]) == ExitCode.DATA_UNFIT
-    told = json.loads(capsys.readouterr().out)["cells"]
-    assert [(cell["cell"], cell["configurations"]) for cell in told] == [("demo", 2), ("demo", 2)]
-    assert sorted(len(cell["fit"]) for cell in told) == [1, 2]
+    document = json.loads(capsys.readouterr().out)["cells"]
+    assert [(cell["cell"], cell["configurations"]) for cell in document] == [("demo", 2), ("demo", 2)]
+    assert sorted(len(cell["fit"]) for cell in document) == [1, 2]
     assert main(["fleet", str(tmp_path)]) == ExitCode.DATA_UNFIT
     assert "demo: logs of 2 configurations" in " ".join(capsys.readouterr().out.split())
 
@@ -225,7 +227,7 @@ def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     assert [row.kept for row in _fitted(few, out)] == [True, False, False]
     for cell in ("cell-000", "cell-002"):
         shutil.rmtree(few / cell)
-    assert _told(_fitted(few, None)) == [replace(_told(third)[2], file=None)]
+    assert _reported(_fitted(few, None)) == [replace(_reported(third)[2], file=None)]
 
 
 def _only(few: Path, cell: str) -> CellLogs:
@@ -244,14 +246,14 @@ def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
 ) -> None:
     cell, out = _only(few, "cell-003"), tmp_path / "out"
     (first,) = _fitted(few, out)
-    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     file.unlink()
     if what == "pipe":
         os.mkfifo(file)
     else:
         with file.open("wb") as stream:
             stream.truncate(2**40)
-    assert _told(_fitted(few, out)) == _told((first,))
+    assert _reported(_fitted(few, out)) == _reported((first,))
     assert file.is_file()
     assert file.stat().st_size < 2**20
     (third,) = _fitted(few, out)
@@ -260,12 +262,12 @@ def test_no_file_of_ours_on_the_shelf_is_replaced_and_not_waited_for(
 
 @pytest.mark.parametrize("ending", [".yaml", ".json"])
 @pytest.mark.parametrize("what", ["folder", "link to a folder", "link to a device"])
-def test_what_cannot_be_replaced_on_the_shelf_is_told_before_anything_is_fitted(
+def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fitted(
     ending: str, what: str, few: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell, out = _only(few, "cell-003"), tmp_path / "out"
     monkeypatch.setattr(fleet_module, "fit_cell", None)
-    file = open_shelf(out, Loop.OPEN).file(cell).with_suffix(ending)
+    file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
     if what == "folder":
         file.mkdir()
     else:
@@ -282,14 +284,16 @@ def test_what_cannot_be_replaced_on_the_shelf_is_told_before_anything_is_fitted(
     assert main(["fleet", str(few), "--out", str(out)]) == ExitCode.USAGE
 
 
-def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_told_by_its_name(few: Path, tmp_path: Path) -> None:
+def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its_name(
+    few: Path, tmp_path: Path
+) -> None:
     cell = _only(few, "cell-003")
-    shelf, made = open_shelf(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
+    shelf, made = open_cache(tmp_path / "out", Loop.OPEN), fit_cell(cell, Loop.OPEN, CREATED)
     note = shelf.file(cell).with_suffix(".json")
     note.mkdir()
     assert isinstance(made, Fitted)
     with pytest.raises(OutputFailed, match=re.escape(str(note))):
-        shelf.keep(cell, made)
+        shelf.store(cell, made)
 
 
 def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
@@ -297,7 +301,7 @@ def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
         shutil.rmtree(few / cell)
     logs = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
     _fitted(few, tmp_path / "out")
-    opened, closed = (open_shelf(tmp_path / "out", loop) for loop in (Loop.OPEN, Loop.CLOSED))
+    opened, closed = (open_cache(tmp_path / "out", loop) for loop in (Loop.OPEN, Loop.CLOSED))
     assert all(opened.standing(cell) is not None for cell in logs)
     assert all(closed.standing(cell) is None for cell in logs)
 
@@ -306,19 +310,18 @@ KILLED = """
 import os, signal, sys
 from datetime import UTC, datetime
 from importlib import import_module
-from daq.fleet.cell_fit import Loop
-from daq.fleet.crew import Threads
-from daq.fleet.fleet import fit_fleet
-from daq.fleet.log_store import list_logs
-from daq.fleet.shelf import open_shelf
+from daq.jobs.cell_fit import Loop, open_cache
+from daq.jobs.fleet import fit_fleet
+from daq.jobs.fleet_survey import list_logs
+from daq.jobs.workers import Threads
 
-def told(done, total, remark):
+def report(done, total, remark):
     if remark.startswith("cell-") and done == int(sys.argv[3]):
         os.kill(os.getpid(), signal.SIGKILL)
 
-with Threads(2).engaged() as crew:
-    shelf = open_shelf(__import__("pathlib").Path(sys.argv[2]), Loop.OPEN)
-    fit_fleet(list_logs(sys.argv[1]), crew, Loop.OPEN, shelf, lambda: datetime.now(UTC), told)
+with Threads(2).start_pool() as pool:
+    cache = open_cache(__import__("pathlib").Path(sys.argv[2]), Loop.OPEN)
+    fit_fleet(list_logs(sys.argv[1]), pool, Loop.OPEN, cache, lambda: datetime.now(UTC), report)
 """
 
 
@@ -357,12 +360,12 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         assert len(made) == 3
         assert list(scratch.iterdir()) == []
         seen = by_cell(log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog))
-        assert all(open_shelf(out, Loop.OPEN).standing(cell) is not None for cell in seen)
+        assert all(open_cache(out, Loop.OPEN).cached(cell) is not None for cell in seen)
         # What is wrong with a copy is told of what it is a copy of.
         whole = store.cat_file("/hall/cell-002/bare.mcap")
         store.pipe("/hall/cell-002/bare.mcap", whole[:-100])
-        with Threads(1).engaged() as crew:
-            rows = fit_fleet(list_logs("memory://hall"), crew, Loop.OPEN, None, lambda: CREATED)
+        with Threads(1).start_pool() as pool:
+            rows = fit_fleet(list_logs("memory://hall"), pool, Loop.OPEN, None, lambda: CREATED)
         (failed,) = (row.result for row in rows if isinstance(row.result, Failure))
         assert failed.text.startswith("memory:///hall/cell-002/bare.mcap")
     finally:
@@ -372,10 +375,10 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
 def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
     by_path, by_address = list_logs(str(few)), list_logs(f"file://{few}")
     assert [log.name for log in by_path] == [log.name for log in by_address]
-    told = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]
+    reported = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]
             for logs in (by_path, by_address)]  # fmt: skip
-    assert told[0] == told[1]
-    assert len(told[0]) == 7
+    assert reported[0] == reported[1]
+    assert len(reported[0]) == 7
 
 
 @pytest.mark.parametrize("address", ["{}", "file://{}", "local://{}"])
@@ -393,8 +396,8 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
     with socket.socket(socket.AF_UNIX) as one:
         one.bind(str(logs / "socket.mcap"))
         assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
-    told = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
-    assert {name: cell["error"]["text"].split("; expected")[0] for name, cell in told.items()} == {
+    output = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
+    assert {name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()} == {
         "folder.mcap": f"{logs}/folder.mcap: found a folder",
         "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to {tmp_path}/unmounted.mcap, "
         "which leads nowhere",
@@ -404,7 +407,7 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
         "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
         "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
     }
-    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in told.values()} == {("LogMissing", 4)}
+    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in output.values()} == {("LogMissing", 4)}
 
 
 def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
@@ -433,17 +436,17 @@ def test_what_is_not_installed_is_named_with_the_line_that_installs_it(monkeypat
     def absent(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr(crew_module, "import_module", absent)
-    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), Processes(1).engaged():
+    monkeypatch.setattr(workers_module, "import_module", absent)
+    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), Processes(1).start_pool():
         pass
     with pytest.raises(ConfigurationMissing, match="nonsense"):
         list_logs("nonsense://bucket/logs")
 
 
-def test_processes_of_this_machine_listen_to_nobody_else() -> None:
-    with Processes(1).engaged() as crew:
-        assert crew.executor.submit(len, "abc").result() == 3
-        assert crew.present()
+def test_processes_of_this_machine_listen_to_no_one_else() -> None:
+    with Processes(1).start_pool() as pool:
+        assert pool.executor.submit(len, "abc").result() == 3
+        assert pool.present()
         psutil = import_module("psutil")  # distributed brings it
         here = psutil.Process()
         ours = [here, *here.children(recursive=True)]
@@ -457,20 +460,23 @@ def test_processes_of_this_machine_listen_to_nobody_else() -> None:
     assert set(listening) == {"127.0.0.1"}
 
 
-def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew_module, "CONNECT_S", 0.2)
+def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers_module, "CONNECT_S", 0.2)
     # Port 9, discard: nobody answers there.
-    with pytest.raises(UsageError, match="a dask scheduler that answers"), Scheduler("tcp://127.0.0.1:9", 1).engaged():
+    with (
+        pytest.raises(UsageError, match="a dask scheduler that answers"),
+        Scheduler("tcp://127.0.0.1:9", 1).start_pool(),
+    ):
         pass
 
 
 def test_the_words_of_scheduler() -> None:
-    assert crew_of("threads", 3) == Threads(3)
-    assert crew_of("processes", 2) == Processes(2)
-    assert crew_of("tcp://10.0.0.1:8786", None) == Scheduler("tcp://10.0.0.1:8786", None)
-    assert crew_of("threads", None).workers
+    assert worker_pool("threads", 3) == Threads(3)
+    assert worker_pool("processes", 2) == Processes(2)
+    assert worker_pool("tcp://10.0.0.1:8786", None) == Scheduler("tcp://10.0.0.1:8786", None)
+    assert worker_pool("threads", None).workers
     with pytest.raises(UsageError):
-        crew_of("process", None)
+        worker_pool("process", None)
 
 
 def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) -> None:
@@ -482,7 +488,7 @@ def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) ->
     assert main(["fleet", str(few), "--out", str(notes)]) == ExitCode.USAGE
 
 
-def test_an_error_that_nobody_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Unfitted:
         if cell.cell == "cell-002":
@@ -495,7 +501,7 @@ def test_an_error_that_nobody_expected_is_a_row(few: Path, monkeypatch: pytest.M
     assert rows[1].result == Failure("MemoryError", "MemoryError", ExitCode.UNEXPECTED)
 
 
-def test_heads_that_nobody_could_read_are_rows(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_heads_that_no_one_could_read_are_rows(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def killed(_logs: object) -> None:
         raise MemoryError
 
@@ -525,7 +531,7 @@ def test_a_name_that_is_no_text_ends_nothing(few: Path, tmp_path: Path, capsys: 
     assert "b\\udcff.mcap" in " ".join(cells[0]["fit"])
 
 
-def test_a_log_that_changes_meanwhile_is_told(few: Path) -> None:
+def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
     cells = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
     shutil.copy(few / "cell-002" / "bare.mcap", few / "cell-003" / "loaded.mcap")
     shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "unused.mcap")
@@ -559,12 +565,12 @@ class _Gone(Executor):
 @pytest.mark.parametrize("cancels", [True, False])
 def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_module, "LOOK_S", 0.01)
-    crew = Crew(_Gone(cancels), 2, lambda: False)
+    pool = WorkerPool(_Gone(cancels), 2, lambda: False)
 
     def submit(piece: int) -> Future[str]:
-        return crew.executor.submit(str, piece)
+        return pool.executor.submit(str, piece)
 
-    outcomes = each(submit, (1, 2, 3), crew)
+    outcomes = each(submit, (1, 2, 3), pool)
     with pytest.raises(UsageError, match="goes on where it was"):
         next(outcomes)
 
@@ -581,7 +587,7 @@ def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) ->
             return executor.submit(pow, piece, 2)
 
         results = {}
-        for piece, made in each(submit, range(pieces), Crew(executor, workers, lambda: True)):
+        for piece, made in each(submit, range(pieces), WorkerPool(executor, workers, lambda: True)):
             results[piece] = made
             back += 1
     assert results == {piece: piece**2 for piece in range(pieces)}
@@ -632,7 +638,7 @@ def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) ->
     assert by_cell(shuffled) == cells
 
 
-def test_a_log_that_cannot_be_read_is_told_by_its_name(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_read_is_reported_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere")
     (found,) = survey([StoredLog(str(tmp_path / "gone.mcap"), "gone.mcap")])
     assert isinstance(found, UnknownLog)

@@ -31,7 +31,7 @@ from daq.errors import (
     TimeBoundReached,
     exit_code,
 )
-from daq.jobs.interlock import TOLD, Finished, require_release, run_command, time_bound
+from daq.jobs.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command, time_bound
 from daq.jobs.job import preview
 from daq.jobs.journal import Form, Journal
 from daq.jobs.preflight import section_of
@@ -150,7 +150,7 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
     shared = replace(
         rig.cell, buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
     )
-    told, tell = os.pipe()
+    read_end, tell = os.pipe()
     child = os.fork()
     if child == 0:
         with suppress(BaseException), bus_lock(shared, rig.folder):
@@ -158,13 +158,13 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
             signal.pause()
         os._exit(0)
     try:
-        assert os.read(told, 1) == b"x"
+        assert os.read(read_end, 1) == b"x"
         with pytest.raises(BusTaken), bus_lock(shared, rig.folder):
             pass
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        os.close(told)
+        os.close(read_end)
         os.close(tell)
     with bus_lock(shared, rig.folder):
         pass
@@ -272,8 +272,8 @@ def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path
 
 
 def test_an_alarm_does_not_cut_a_stop_short() -> None:
-    with time_bound(60.0) as undisturbed:
-        with undisturbed():
+    with time_bound(60.0) as block_signals:
+        with block_signals():
             signal.raise_signal(signal.SIGALRM)
             # It comes again.
             left_s, _ = signal.getitimer(signal.ITIMER_REAL)
@@ -297,8 +297,8 @@ def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one
 
         rig.tools = replace(rig.tools, free=room)
         before = rig.controller.read_bytes()
-        with interruptible() as undisturbed, pytest.raises(KeyboardInterrupt):
-            rig.job(undisturbed=undisturbed)
+        with interruptible() as block_signals, pytest.raises(KeyboardInterrupt):
+            rig.job(block_signals=block_signals)
         assert powerless(cell)
     assert rig.controller.read_bytes() == before
     assert rig.session.state.outcome is Outcome.INTERRUPTED
@@ -306,7 +306,7 @@ def test_a_service_manager_that_ends_the_job_ends_the_motion(tmp_path: Path, one
     assert rig.audit[-1].details["outcome"] == "interrupted"
 
 
-def test_a_disk_that_is_full_is_told_of_before_and_during_a_run(tmp_path: Path, one_move: Path) -> None:
+def test_a_disk_that_is_full_is_reported_before_and_during_a_run(tmp_path: Path, one_move: Path) -> None:
     rig = make_rig(tmp_path / "cell", one_move, min_free_mb=1000)
     rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
     error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
@@ -426,7 +426,7 @@ def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Pat
         tracemalloc.stop()
     assert ended.code == 3
     assert ended.said.endswith("0\nthe end")
-    assert len(ended.said) == TOLD
+    assert len(ended.said) == MAX_OUTPUT_CHARACTERS
     assert peak < 1_000_000
     endless = run_command(Command(("yes",), 0.2), (), tmp_path)
     assert endless == Finished(None, "not ended within 0.2 s")

@@ -17,7 +17,7 @@ from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import WHO, Rig
 
 
-def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_it(
+def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it(
     whole_job: tuple[Rig, Made],
 ) -> None:
     rig, _ = whole_job
@@ -61,7 +61,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_tells_of_i
     assert {event["level"] for event in rig.events} <= {"info", "notice", "warning"}
 
 
-def test_the_way_back_and_back_again_to_what_a_job_wrote_is_known(tmp_path: Path, made: Made) -> None:
+def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made)
     rig.job()
     target, digest = str(rig.controller), rig.audit[-1].details["calibration_sha256"]

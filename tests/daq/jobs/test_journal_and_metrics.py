@@ -88,6 +88,6 @@ def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: P
     assert "drivegain_recalibration_last_success_timestamp_seconds" not in families
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputFailed, match="no such file"):
         write_metrics(figures(Outcome.APPLIED), tmp_path / "none")

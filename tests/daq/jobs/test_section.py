@@ -15,7 +15,7 @@ import yaml
 from daq.config.cell_file import load_cell
 from daq.config.recalibration import RecalibrationModel, RunModel
 from daq.errors import SchemaMismatch
-from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, save, sessions, to_take_up
+from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, resumable_session, save, sessions
 from tests.daq.jobs.rig import BEGAN, make_rig
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "recalibration.md"
@@ -93,12 +93,12 @@ def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) ->
     assert found == tuple(made)
     assert last_good(found) == made[4]
     now = BEGAN + timedelta(days=35)
-    assert to_take_up(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
+    assert resumable_session(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
     for basis in (replace(BASIS, configuration_sha256="d" * 64), replace(BASIS, plans_sha256="d" * 64)):
-        assert to_take_up(found, basis, now + timedelta(hours=1), 2.0) is None
+        assert resumable_session(found, basis, now + timedelta(hours=1), 2.0) is None
     for later_h in (3, -1):
-        assert to_take_up(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
-    assert to_take_up(found[:5], BASIS, made[4].began, 2.0) is None
+        assert resumable_session(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
+    assert resumable_session(found[:5], BASIS, made[4].began, 2.0) is None
     # The calibration of the third week is in force: its logs and signatures are what the controller rests on.
     fitted = Fitted(calibration_sha256="f" * 64, sentences=())
     save(replace(made[2], state=made[2].state.with_(fitted=fitted)))

@@ -55,7 +55,7 @@ def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
     assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
 
 
-def test_nobody_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None:
+def test_no_one_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None:
     session = begin(tmp_path, BASIS, BEGAN)
     (session.folder / STATE).unlink()
     os.mkfifo(session.folder / STATE)
@@ -83,8 +83,8 @@ def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, ti
 
 @given(st.datetimes(timezones=st.just(UTC)), st.integers(0, 10**9))
 def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s: int) -> None:
-    at, told = BEGAN + timedelta(seconds=later_s), began.isoformat()
-    state = SessionState(session="s", cell="demo", configuration_sha256="", began=told, attempt_began=told)
+    at, reported = BEGAN + timedelta(seconds=later_s), began.isoformat()
+    state = SessionState(session="s", cell="demo", configuration_sha256="", began=reported, attempt_began=reported)
     if began > at + CLOCK_SLACK:
         with pytest.raises(ClockWentBack):
             require_clock((Session(Path("s"), state),), at)
@@ -92,7 +92,7 @@ def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s:
         require_clock((Session(Path("s"), state),), at)
 
 
-def test_a_session_of_the_far_future_is_told_and_does_not_end_all_calibrations(tmp_path: Path, made: Made) -> None:
+def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(tmp_path: Path, made: Made) -> None:
     rig = made_rig(tmp_path / "cell", made)
     foreign = begin(rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099))
     ended = foreign.state.with_(outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat())

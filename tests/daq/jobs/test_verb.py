@@ -25,9 +25,9 @@ def test_a_dry_run_says_what_a_job_would_do(
     command = ["recalibrate", "--cell", str(rig.cell_file), "--dry-run"]
     with serving(rig):
         assert main([*command, "--json"]) == ExitCode.OK
-        told = capsys.readouterr()
-        assert json.loads(told.out)["steps"][0] == "mount none, record bare-1"
-        assert [json.loads(line)["level"] for line in told.err.splitlines()] == ["info", "info"]
+        captured = capsys.readouterr()
+        assert json.loads(captured.out)["steps"][0] == "mount none, record bare-1"
+        assert [json.loads(line)["level"] for line in captured.err.splitlines()] == ["info", "info"]
         assert main(command) == ExitCode.OK
     assert "a new session" in capsys.readouterr().out
     assert not (rig.cells / "recalibration").exists()
@@ -39,11 +39,11 @@ def test_a_job_that_is_held_says_so_in_its_exit_code_and_in_json_alone(
     rig = make_rig(tmp_path / "cell", short_plan)
     rig.closed.unlink()
     assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
-    told = capsys.readouterr()
-    events = [json.loads(line) for line in told.err.splitlines()]
+    captured = capsys.readouterr()
+    events = [json.loads(line) for line in captured.err.splitlines()]
     assert events[-1]["error"] == "NotReleased"
     assert events[-1]["level"] == "error"
-    assert told.out == ""
+    assert captured.out == ""
     assert main(["recalibrate", "--cell", str(rig.cell_file), "--json"]) == ExitCode.NOT_RELEASED
     assert rig.session.state.attempt == 2
 
@@ -55,12 +55,12 @@ def test_a_person_at_a_terminal_reads_what_to_do(
     rig.closed.unlink()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
-    told = capsys.readouterr().err
-    assert "session ended: outcome stopped" in told
-    assert "close the cell" in told
+    output = capsys.readouterr().err
+    assert "session ended: outcome stopped" in output
+    assert "close the cell" in output
 
 
-def test_a_cell_without_the_section_is_told_what_it_lacks(
+def test_a_cell_without_the_section_names_what_it_lacks(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cell = checkout / "configs" / "cells" / "demo.yaml"

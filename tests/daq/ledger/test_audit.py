@@ -170,7 +170,7 @@ def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
-def test_what_killed_writers_leave_stays_and_is_told(cuts: list[float], data: st.DataObject) -> None:
+def test_what_killed_writers_leave_stays_and_is_reported(cuts: list[float], data: st.DataObject) -> None:
     """Each write is cut at any byte; whoever comes next begins a line of its own, and the chain holds throughout."""
     with _folder() as folder:
         path = folder / "a"
@@ -272,7 +272,7 @@ def _write(begun: AuditAction, path: Path, subject: Path, before: bytes, after: 
     ("now", "content"),
     [(b"old", Content.BEFORE), (b"new", Content.AFTER), (b"edited", Content.OTHER), (None, Content.OTHER)],
 )
-def test_of_a_write_without_an_end_the_file_tells_which_it_is(
+def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     tmp_path: Path, begun: AuditAction, now: bytes | None, content: Content
 ) -> None:
     path, file = tmp_path / "a", tmp_path / "x.yaml"
@@ -304,7 +304,7 @@ def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == b""
 
 
-def test_what_is_no_regular_file_is_refused_and_nobody_waits(tmp_path: Path) -> None:
+def test_what_is_no_regular_file_is_refused_and_no_one_waits(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path / "fifo", tmp_path, Path("/dev/zero")):
         with pytest.raises(AuditUnusable):
@@ -329,7 +329,7 @@ def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
     assert flushed == [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
 
 
-def test_a_full_disk_is_told_and_leaves_a_line_that_the_next_entry_tells_of(
+def test_a_full_disk_is_reported_and_leaves_a_line_that_the_next_entry_reports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a"
@@ -364,7 +364,7 @@ def test_many_writers_make_one_chain(tmp_path: Path) -> None:
         assert [one.details["k"] for one in verdict.entries if one.who == who] == list(range(25))
 
 
-def test_a_lock_that_is_never_given_back_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lock_that_is_never_given_back_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(audit, "_PAUSE_S", 0.0)
     with (tmp_path / "a").open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
@@ -392,9 +392,9 @@ def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
 def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object) -> None:
     """A chain that holds can be written by anybody."""
-    path, strangers = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
+    path, foreign_details = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
     for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
-        append(path, action, at=NOW, who="", subject="x", details=strangers)
+        append(path, action, at=NOW, who="", subject="x", details=foreign_details)
     verdict = verify(path)
     assert verdict.holds
     assert len(verdict.open_writes) == 2

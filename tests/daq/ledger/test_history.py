@@ -24,17 +24,17 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
-from daq.jobs.verdict import Past
+from daq.jobs.verdict import GainHistory
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
-from daq.ledger.entry import Acknowledgement, Deed, Entry, Event, logs_of, recorded_at
+from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, logs_of, recorded_at
 from daq.ledger.store import HistoryStore
-from daq.ledger.watch import Series, alarm_words, dispersions_of, questions, watch
+from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS
-from daq.report.history_view import deed_words
+from daq.report.history_view import describe_actions
 from daq.workflow.calibration_file import save
 from daq.writeback.drive_proposal import drives_of
 from daq.writeback.formats.document import decode as read_controller
-from daq.writeback.formats.scalar import respell
+from daq.writeback.formats.scalar import rewrite_gain
 from daq.writeback.gates.target import GainChange
 from ident.calibration import Calibration, Gain
 from ident.drift.change import DISPERSION, dispersions
@@ -112,7 +112,7 @@ def _put(cell: Path, digest: str) -> str:
     keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
     document = read_controller(controller.read_bytes(), controller.name)
     scalars = document.locate(tuple(keys.values()))
-    spelling = {s.key: respell(s, g.value, g.std).spelling for s, g in zip(scalars, entry.gains, strict=True)}
+    spelling = {s.key: rewrite_gain(s, g.value, g.std).spelling for s, g in zip(scalars, entry.gains, strict=True)}
     controller.write_bytes(document.with_values(spelling).content)
     return str(controller.resolve())
 
@@ -146,7 +146,9 @@ def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixt
     assert len(_series(cell)[0].points) == 1
 
 
-def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
+    cell: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     digests = _filled(cell, 26, drifting)
     with HistoryStore(_place(cell).store) as store:
         store.applied(digests[8], at=BEGIN + timedelta(weeks=8), who="anna", target="x.yaml")
@@ -170,18 +172,18 @@ def test_a_drift_is_told_with_its_time_its_size_and_a_question(cell: Path, capsy
     assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
 
 
-def test_a_drift_from_the_first_day_is_told_as_steady(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_drift_from_the_first_day_is_reported_as_steady(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _filled(cell, 9, sloping)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    told = re.search(r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until now, (\d\.\d) σ", out)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
+    reported = re.search(r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until now, (\d\.\d) σ", out)
+    assert reported is not None
+    assert float(reported[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
     assert "demagnetised" in out
     found = _json(capsys, str(cell), "--axis", "J4")
     point = found["axes"][0]["points"][-1]
     assert point["alarm"] == "trend"
-    assert abs(point["trend_sigmas"]) == pytest.approx(float(told[2]), abs=0.05)
+    assert abs(point["trend_sigmas"]) == pytest.approx(float(reported[2]), abs=0.05)
     assert point["trend_sigmas"] < -found["chart"]["trend"]
     picture = cell.parent / "history.svg"
     assert main(["history", str(cell), "--plot", str(picture)]) == 0
@@ -193,7 +195,7 @@ def test_an_alarm_that_has_passed_has_no_date(cell: Path, capsys: pytest.Capture
     _filled(cell, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
     series = _series(cell)[3]
     assert series.alarm_at(3) is not None
-    assert (series.alarmed, series.onset, alarm_words(series)) == (False, None, None)
+    assert (series.alarmed, series.onset, alarm_text(series)) == (False, None, None)
     (axis,) = _json(capsys, str(cell), "--axis", "J4")["axes"]
     assert (axis["alarmed"], axis["alarm"], axis["since"]) == (False, None, None)
     known = [point.gain.value for point in series.points[:12]]
@@ -235,7 +237,7 @@ def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
     _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
     series = _series(cell)[3]
     assert series.points[-1].gain.value < 0
-    words = alarm_words(series)
+    words = alarm_text(series)
     assert words is not None
     assert words.startswith("gain of J4 fell 9.6 %")
 
@@ -266,7 +268,7 @@ def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
     assert logs_of(replace(fits[0], sources=()), "its own") == "its own"
 
 
-def test_old_logs_fitted_today_tell_of_their_own_time(cell: Path) -> None:
+def test_old_logs_fitted_today_report_their_own_time(cell: Path) -> None:
     """A gain that was another one a year ago has not changed today."""
     _filled(cell, 20, lambda _: FLAT)
     year_ago = recorded(calibration_of(30, (0.9,) * 6), BEGIN - timedelta(days=400))
@@ -299,11 +301,11 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
     declared = load_cell(cell)
     controller = declared.controller_path
     assert controller is not None
-    with Past(declared, _place(cell), controller, lambda: BEGIN, "job") as past:
+    with GainHistory(declared, _place(cell), controller, lambda: BEGIN, "job") as past:
         if own is not None:
             file = cell.parent / "own.yaml"
             save(own, file)
-            past.keep(own, file)
+            past.enter(own, file)
         changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
         return dict(past.known(changes).dispersions)
 
@@ -335,7 +337,7 @@ def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
     assert {series.axis: series.dispersion for series in _series(cell)} != found
 
 
-def test_the_scatter_of_axes_is_told_together_where_the_same_recordings_know_them() -> None:
+def test_the_scatter_of_axes_is_reported_together_where_the_same_recordings_know_them() -> None:
     rng = np.random.default_rng(12)
     names = tuple(f"J{number}" for number in range(1, 4))
     values = rng.normal(10.0, 0.3, (9, 3))
@@ -411,7 +413,7 @@ def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
     with HistoryStore(_place(cell).store) as store:
         store.acknowledge(Acknowledgement("J4", BEGIN.replace(year=2130), BEGIN, "anna", "x", "0" * 64))
     series = _series(cell)[3]
-    assert (series.began, series.drift, series.onset, alarm_words(series)) == (20, None, None, None)
+    assert (series.began, series.drift, series.onset, alarm_text(series)) == (20, None, None, None)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
 
 
@@ -419,9 +421,9 @@ def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: py
     _filled(cell, 3, lambda _: FLAT)
     explain = ["history", str(cell), "--acknowledge", "J4", "--why", "planned", "--since"]
     assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert "2130-01-02 02:04:05 UTC" in told
-    assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert "2130-01-02 02:04:05 UTC" in output
+    assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in output
     assert not _place(cell).audit.exists()
     assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
 
@@ -498,7 +500,7 @@ def test_a_picture_has_its_kind_and_replaces_only_its_like(cell: Path) -> None:
     assert main(["history", str(cell), "--plot", str(cell.parent / "none" / "history.png")]) == 1
 
 
-def test_a_broken_audit_is_told_by_its_first_line(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_audit_is_reported_by_its_first_line(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     audit = _place(cell).audit
     for number in range(4):
         append(audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number})
@@ -546,7 +548,7 @@ def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: py
 
 
 @pytest.mark.parametrize(("content", "says"), [(b"old", "as before the write"), (b"new", "the new content")])
-def test_a_write_that_never_ended_is_told_with_what_the_file_is(
+def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
     cell: Path, capsys: pytest.CaptureFixture[str], content: bytes, says: str
 ) -> None:
     file = cell.parent / "controller.yaml"
@@ -557,7 +559,7 @@ def test_a_write_that_never_ended_is_told_with_what_the_file_is(
     assert says in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_broken_history_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_broken_history_is_reported(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     place = _place(cell)
     place.store.write_bytes(b"no history" * 1000)
     assert main(["history", str(cell)]) == 4
@@ -594,12 +596,12 @@ def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What --verify finds, in one line; empty where all is well."""
     capsys.readouterr()
     code = main(["history", str(cell), "--verify"])
-    told = " ".join(capsys.readouterr().err.split())
-    assert code == (4 if told else 0)
-    return told
+    output = " ".join(capsys.readouterr().err.split())
+    assert code == (4 if output else 0)
+    return output
 
 
-def test_a_write_of_which_the_history_does_not_know_is_told_and_entered_by_hand(
+def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_hand(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
@@ -608,9 +610,9 @@ def test_a_write_of_which_the_history_does_not_know_is_told_and_entered_by_hand(
     first, back = _write_down(cell, digest), _write_down(cell, digest, back=True)
     # Of another target the history of this cell need not know.
     append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="/other.yaml", details={"begun": 1})
-    told = _verified(cell, capsys)
+    reported = _verified(cell, capsys)
     for part in (f"entry {first.number} of", "applied by anna", digest[:12], f"entry {back.number} of", "--add"):
-        assert part in told
+        assert part in reported
     assert main(["history", str(cell), "--verify", "--json"]) == 4
     found = json.loads(capsys.readouterr().out)["audit"]
     assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [(2, digest), (4, None)]
@@ -618,9 +620,9 @@ def test_a_write_of_which_the_history_does_not_know_is_told_and_entered_by_hand(
     assert capsys.readouterr().err.count("Entered too") == 2
     assert _verified(cell, capsys) == ""
     with HistoryStore(_place(cell).store) as store:
-        assert [(event.deed, event.at, event.who, event.audit) for event in store.events()] == [
-            (Deed.APPLIED, BEGIN, "anna", first.sha256),
-            (Deed.ROLLED_BACK, BEGIN, "anna", back.sha256),
+        assert [(event.action, event.at, event.who, event.audit) for event in store.events()] == [
+            (WriteAction.APPLIED, BEGIN, "anna", first.sha256),
+            (WriteAction.ROLLED_BACK, BEGIN, "anna", back.sha256),
         ]
         assert store.in_force() is None
     assert main(["history", str(cell), "--add", str(file)]) == 0
@@ -631,9 +633,9 @@ def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.
     first, second = _filled(cell, 2, lambda _: FLAT)
     lost, known = _write_down(cell, first), _write_down(cell, second)
     _enter_write(cell, second, known)
-    told = _verified(cell, capsys)
-    assert f"entry {lost.number} of" in told
-    assert "it knows of a later write" in told
+    reported = _verified(cell, capsys)
+    assert f"entry {lost.number} of" in reported
+    assert "it knows of a later write" in reported
     file = cell.parent / "calibration.yaml"
     save(calibration_of(5), file)
     assert main(["history", str(cell), "--add", str(file)]) == 0
@@ -641,7 +643,7 @@ def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.
     assert f"entry {lost.number} of" in _verified(cell, capsys)
 
 
-def test_nothing_is_entered_from_an_audit_that_somebody_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
     save(calibration, file)
     _write_down(cell, digest_of(calibration))
@@ -673,7 +675,7 @@ def test_nothing_is_entered_from_an_audit_that_somebody_changed(cell: Path, caps
         ("gain SET value = value * 1.01 WHERE axis = 'J4'", "gain of J4 in calibration"),
     ],
 )
-def test_a_row_that_is_not_what_the_audit_tells_is_told(
+def test_a_row_that_is_not_what_the_audit_reports_is_reported(
     cell: Path, capsys: pytest.CaptureFixture[str], change: str, says: str
 ) -> None:
     (digest,) = _filled(cell, 1, lambda _: FLAT)
@@ -686,15 +688,15 @@ def test_a_row_that_is_not_what_the_audit_tells_is_told(
     assert says in _verified(cell, capsys)
 
 
-def test_a_row_that_was_taken_away_is_told(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_row_that_was_taken_away_is_reported(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     _enter_write(cell, digest, _write_down(cell, digest))
     with closing(sqlite3.connect(_place(cell).store)) as other:
         other.execute("DELETE FROM event")
         other.commit()
-    told = _verified(cell, capsys)
-    assert "event 1: found no such row" in told
-    assert "no event of entry 2" in told
+    reported = _verified(cell, capsys)
+    assert "event 1: found no such row" in reported
+    assert "no event of entry 2" in reported
 
 
 def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -709,7 +711,7 @@ def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsy
     assert _verified(cell, capsys) == ""
 
 
-def test_a_write_that_a_job_entered_stands_within_the_job(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_write_that_a_job_entered_holds_within_the_job(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     audit = _place(cell).audit
 
@@ -745,8 +747,8 @@ def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: p
             subject=subject,
             details={"sha256_before": before, "sha256_after": "1" * 64, **evidence},
         )
-        told = {"begun": begun.number}
-        ended = append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details=told)
+        reported = {"begun": begun.number}
+        ended = append(_place(cell).audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=subject, details=reported)
         ends.append(ended)
         assert f"entry {ends[0].number} of" in _verified(cell, capsys)
     with HistoryStore(_place(cell).store) as store:
@@ -785,31 +787,31 @@ def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pyte
     assert told() is None
 
 
-def test_what_was_done_is_told_in_the_words_of_who_did_it() -> None:
-    def event(digest: str | None, deed: Deed, who: str, target: str = "x") -> Event:
-        return Event(digest, deed, BEGIN, who, target)
+def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
+    def event(digest: str | None, action: WriteAction, who: str, target: str = "x") -> Event:
+        return Event(digest, action, BEGIN, who, target)
 
     entries = tuple(_entry(name) for name in ("a", "b", "c"))
-    done = [event("a", Deed.APPLIED, "anna")]
-    assert deed_words(entries, done, "a") == {"a": "applied by anna, in force", "b": "-", "c": "-"}
-    done += [event("b", Deed.APPLIED, "ben"), event("c", Deed.APPLIED, "cem", "y")]
-    assert deed_words(entries, done, "b") == {
+    done = [event("a", WriteAction.APPLIED, "anna")]
+    assert describe_actions(entries, done, "a") == {"a": "applied by anna, in force", "b": "-", "c": "-"}
+    done += [event("b", WriteAction.APPLIED, "ben"), event("c", WriteAction.APPLIED, "cem", "y")]
+    assert describe_actions(entries, done, "b") == {
         "a": "applied by anna",
         "b": "applied by ben, in force",
         "c": "applied by cem",
     }
-    done += [event("a", Deed.ROLLED_BACK, "dora")]
-    assert deed_words(entries, done, "a") == {
+    done += [event("a", WriteAction.ROLLED_BACK, "dora")]
+    assert describe_actions(entries, done, "a") == {
         "a": "restored by dora, in force",
         "b": "applied by ben, taken back by dora",
         "c": "applied by cem",
     }
-    done += [event(None, Deed.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
-    assert deed_words(entries, done, None)["c"] == "applied by cem, taken back by eva"
-    assert deed_words(entries, done, "c")["c"] == "applied by cem, taken back by eva, in force"
+    done += [event(None, WriteAction.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
+    assert describe_actions(entries, done, None)["c"] == "applied by cem, taken back by eva"
+    assert describe_actions(entries, done, "c")["c"] == "applied by cem, taken back by eva, in force"
 
 
-def test_nobody_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
+def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
     os.mkfifo(cell.parent / "pipe")
     for path in (cell.parent / "pipe", Path("/dev/zero"), cell.parent):
         assert main(["history", str(cell), "--add", str(path)]) == 4

@@ -21,14 +21,14 @@ from hypothesis import strategies as st
 
 from daq.errors import HistoryMixed, HistoryUnreadable, OutputFailed, exit_code
 from daq.ledger import schema
-from daq.ledger.entry import Acknowledgement, Deed, iso, utc
+from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
 from daq.ledger.store import HistoryStore
 from daq.workflow.calibration_file import decode, encode
 from tests.daq.calibrations import AXES, demo_calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter
 
 FORK = multiprocessing.get_context("fork")
-NOBODY = 65534
+NO_ONE = 65534
 
 
 def test_without_a_file_it_is_empty_and_makes_none(tmp_path: Path) -> None:
@@ -104,13 +104,13 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, different: str) -> N
     assert "nothing was entered" in refused.value.remedy
 
 
-def test_what_is_applied_and_rolled_back_is_told(tmp_path: Path) -> None:
+def test_what_is_applied_and_rolled_back_is_reported(tmp_path: Path) -> None:
     with HistoryStore(tmp_path / "h") as store:
         first, second = (enter(store, calibration_of(week)) for week in range(2))
-        told = []
+        reported = []
 
         def in_force() -> None:
-            told.append({None: "-", first: "first", second: "second"}[store.in_force("x.yaml")])
+            reported.append({None: "-", first: "first", second: "second"}[store.in_force("x.yaml")])
 
         def back(to: str, target: str = "x.yaml") -> str | None:
             return store.rolled_back(at=BEGIN, who="anna", target=target, sha256_after=to)
@@ -126,11 +126,15 @@ def test_what_is_applied_and_rolled_back_is_told(tmp_path: Path) -> None:
         store.applied(second, at=BEGIN, who="job", target="another.yaml", sha256_after="1")
         assert back("1") == first
         in_force()
-        assert told == ["first", "-", "first", "second", "first"]
+        assert reported == ["first", "-", "first", "second", "first"]
         assert store.in_force("another.yaml") == second
         assert store.in_force() == first
         assert store.audited() == {"a" * 64}
-        assert [event.deed for event in store.entries()[0].events] == [Deed.APPLIED, Deed.ROLLED_BACK, Deed.ROLLED_BACK]
+        assert [event.action for event in store.entries()[0].events] == [
+            WriteAction.APPLIED,
+            WriteAction.ROLLED_BACK,
+            WriteAction.ROLLED_BACK,
+        ]
         assert all(entry.applied for entry in store.entries())
         with pytest.raises(ValueError, match="not in the history"):
             store.applied("0" * 64, at=BEGIN, who="anna", target="x.yaml")
@@ -226,7 +230,7 @@ def _die_while_writing(path: Path) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_an_unfinished_transaction_is_taken_back_by_whoever_opens_the_file(tmp_path: Path) -> None:
+def test_an_unfinished_transaction_is_taken_back_by_the_next_program_that_opens_the_file(tmp_path: Path) -> None:
     path = tmp_path / "h"
     with HistoryStore(path) as store:
         for week in range(30):
@@ -268,7 +272,7 @@ def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
         assert store.integrity() == ()
 
 
-def test_who_waits_too_long_is_told_by_whom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_waits_too_long_is_reported_by_whom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "h"
     with HistoryStore(path) as store:
         enter(store, calibration_of(0))
@@ -317,7 +321,7 @@ def test_another_version_is_refused_and_left_alone(tmp_path: Path, version: int)
 
 @settings(max_examples=30, deadline=None)
 @given(st.randoms(use_true_random=False))
-def test_a_damaged_file_is_told_and_never_a_surprise(random_: random.Random) -> None:
+def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "h"
         with HistoryStore(path) as store:
@@ -339,7 +343,7 @@ def test_a_damaged_file_is_told_and_never_a_surprise(random_: random.Random) -> 
 @pytest.mark.parametrize(
     "change", ["calibration SET created = 'once'", "calibration SET entered = '2026-01-01'", "event SET at = ''"]
 )
-def test_a_row_that_somebody_wrote_is_told(tmp_path: Path, change: str) -> None:
+def test_a_row_that_someone_wrote_is_reported(tmp_path: Path, change: str) -> None:
     path = tmp_path / "h"
     with HistoryStore(path) as store:
         store.applied(enter(store, calibration_of(0)), at=BEGIN, who="anna", target="x.yaml")
@@ -373,7 +377,7 @@ def test_a_row_that_somebody_wrote_is_told(tmp_path: Path, change: str) -> None:
         ("UPDATE event SET number = 9000000000000000000", "event 1, 2, 3, 4, 5: found no such row"),
     ],
 )
-def test_rows_that_contradict_each_other_are_told(tmp_path: Path, change: str, says: str) -> None:
+def test_rows_that_contradict_each_other_are_reported(tmp_path: Path, change: str, says: str) -> None:
     path = tmp_path / "h"
     with HistoryStore(path) as store:
         digest = enter(store, calibration_of(0))
@@ -384,17 +388,17 @@ def test_rows_that_contradict_each_other_are_told(tmp_path: Path, change: str, s
         other.execute(change)
         other.commit()
     with HistoryStore(path) as store:
-        told = store.integrity()
-    assert any(says.format(digest=digest[:12]) in sentence for sentence in told), told
+        reported = store.integrity()
+    assert any(says.format(digest=digest[:12]) in sentence for sentence in reported), reported
 
 
 @contextmanager
-def _nobody() -> Iterator[None]:
+def _no_one() -> Iterator[None]:
     """Without root's leave to write everywhere."""
     if os.geteuid() != 0:
         yield
         return
-    os.seteuid(NOBODY)
+    os.seteuid(NO_ONE)
     try:
         yield
     finally:
@@ -409,7 +413,7 @@ def test_where_nothing_can_be_written_reading_works() -> None:
         path.chmod(0o444)
         folder.chmod(0o555)
         try:
-            with _nobody(), HistoryStore(path) as store:
+            with _no_one(), HistoryStore(path) as store:
                 assert len(store.entries()) == 1
                 assert store.integrity() == ()
                 with pytest.raises(OutputFailed) as refused:
@@ -420,7 +424,7 @@ def test_where_nothing_can_be_written_reading_works() -> None:
             folder.chmod(0o755)
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with HistoryStore(tmp_path / "none" / "h") as store, pytest.raises(OutputFailed):
         enter(store, calibration_of(0))
     with pytest.raises(HistoryUnreadable), HistoryStore(tmp_path) as store:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from daq.errors import RunInvalid
 from daq.log.conversion import load_run
-from daq.log.reader import MASKED, LossyLogs, tells_losses_alone
+from daq.log.reader import MASKED, LossyLogs, reports_only_losses
 from daq.workflow.record import _verdict
 from drivers.stream.stream import StreamStatistics
 from tests.daq.logs import demo_content, samples, write
@@ -18,7 +18,7 @@ from tests.daq.logs import demo_content, samples, write
 
 @given(st.lists(st.tuples(st.integers(1, 10**9), st.sampled_from(MASKED)), min_size=1, max_size=6))
 def test_counted_losses_may_be_accepted(losses: list[tuple[int, str]]) -> None:
-    assert tells_losses_alone(", ".join(f"{count} {kind}" for count, kind in losses))
+    assert reports_only_losses(", ".join(f"{count} {kind}" for count, kind in losses))
 
 
 @pytest.mark.parametrize(
@@ -34,7 +34,7 @@ def test_counted_losses_may_be_accepted(losses: list[tuple[int, str]]) -> None:
     ],
 )
 def test_nothing_else_may(reason: str) -> None:
-    assert not tells_losses_alone(reason)
+    assert not reports_only_losses(reason)
 
 
 def test_a_lossy_log_is_refused_until_it_is_accepted_and_is_then_partial(checkout: Path, tmp_path: Path) -> None:
@@ -55,6 +55,6 @@ def test_the_recorder_counts_them_by_these_names() -> None:
     )
     valid, reason = _verdict(counted)
     assert not valid
-    assert tells_losses_alone(reason)
+    assert reports_only_losses(reason)
     assert {part.split(" ", 1)[1] for part in reason.split(", ")} == set(MASKED)
-    assert not tells_losses_alone(_verdict(StreamStatistics(missing=1, skipped_periods=1))[1])
+    assert not reports_only_losses(_verdict(StreamStatistics(missing=1, skipped_periods=1))[1])

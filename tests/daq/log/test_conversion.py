@@ -85,7 +85,7 @@ def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder)
     assert load_run(log, other)[0].payload == DISC
 
 
-def test_no_moves_written_down_is_none(record: Recorder) -> None:
+def test_no_moves_recorded_is_none(record: Recorder) -> None:
     assert load_run(record(samples([[0] * 6] * 3)))[0].move is None
 
 

@@ -183,10 +183,10 @@ def test_a_file_that_appeared_meanwhile_is_not_replaced(
             log.conclude(True)
             path.write_bytes(b"somebody else's")
 
-    with pytest.raises(OutputExists, match=r"a\.mcap\.part") as told:
+    with pytest.raises(OutputExists, match=r"a\.mcap\.part") as raised:
         record()
     assert path.read_bytes() == b"somebody else's"
-    assert "which was not there" in told.value.found
+    assert "which was not there" in raised.value.found
     path.unlink()
     (tmp_path / "a.mcap.part").rename(path)
     log = read_log(path)
@@ -253,8 +253,8 @@ def test_the_size_of_a_block_changes_nothing_but_the_blocks(
     np.testing.assert_array_equal(saved, np.arange(900))
 
 
-def test_a_log_of_which_nobody_said_how_it_went_is_not_valid(tmp_path: Path) -> None:
+def test_a_log_of_which_no_one_said_how_it_went_is_not_valid(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "a.mcap", content(1), joints, clock_ns=lambda: 0) as log:
         log.write(samples([[1]])[0])
-    told = read_log(tmp_path / "a.mcap").statistics
-    assert (told.valid, told.reason) == (False, "not concluded")
+    statistics = read_log(tmp_path / "a.mcap").statistics
+    assert (statistics.valid, statistics.reason) == (False, "not concluded")

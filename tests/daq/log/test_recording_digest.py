@@ -71,7 +71,7 @@ def test_whatever_else_changes_is_another_recording(configs: Path, file: str, wa
     assert after.recording_digest != before.recording_digest
 
 
-def test_a_log_tells_the_same_as_the_files(configs: Path) -> None:
+def test_a_log_reports_the_same_as_the_files(configs: Path) -> None:
     _said(configs, "policy: {motion: allowed}\n")
     cell = load_cell(configs / DEMO)
     assert cell_from_bundle(bundle(configs / DEMO)).recording_digest == cell.recording_digest

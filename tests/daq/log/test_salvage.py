@@ -27,7 +27,7 @@ from daq.log.writer import LogWriter
 from daq.workflow.calibration_file import as_document, decode, encode, save
 from daq.workflow.fit import Reading
 from daq.writeback.gates.logs import source_refusals
-from daq.writeback.gates.table import Circumstances, Gate
+from daq.writeback.gates.table import Gate, GateContext
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
@@ -209,9 +209,7 @@ def test_a_recording_that_ended_in_a_fault_is_invalid_too(
 
 
 @pytest.mark.parametrize("key", ["payload_known", "started_wall_ns", "operator", SEAL])
-def test_metadata_of_a_log_without_its_end_stand_under_a_seal_of_their_own(
-    key: str, part: Path, tmp_path: Path
-) -> None:
+def test_metadata_of_a_log_without_its_end_are_under_a_seal_of_their_own(key: str, part: Path, tmp_path: Path) -> None:
     """The payload's mass scales every gain, and no chunk covers it."""
     record: dict[str, str] = {"payload_known": '{"m": 4.59}', "started_wall_ns": "1", "operator": "Ada"}
     whole = sealed(record)
@@ -228,7 +226,7 @@ def test_metadata_of_a_log_without_its_end_stand_under_a_seal_of_their_own(
         salvage(part, tmp_path / "saved.mcap")
 
 
-def test_whoever_reads_it_is_told_and_the_calibration_says_so(
+def test_the_reader_is_reported_and_the_calibration_says_so(
     part: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     saved = salvage(part, tmp_path / "saved.mcap").log
@@ -247,8 +245,8 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     again = decode(encode(partial), "calibration.yaml")
     assert again == partial
     policy = ApplyPolicy()
-    assert not source_refusals(good, policy, Circumstances())
-    assert [refusal.gate for refusal in source_refusals(again, policy, Circumstances())] == [Gate.PARTIAL]
+    assert not source_refusals(good, policy, GateContext())
+    assert [refusal.gate for refusal in source_refusals(again, policy, GateContext())] == [Gate.PARTIAL]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
 
 
@@ -276,8 +274,13 @@ def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["info", str(part)]) == ExitCode.DATA_UNFIT
     assert "drivegain salvage" in capsys.readouterr().err
     assert main(["salvage", str(part), "--out", str(out), "--json"]) == ExitCode.OK
-    told = json.loads(capsys.readouterr().out)
-    assert (told["samples"], told["partial"], told["valid"], told["left_out_bytes"]) == (700, True, True, 0)
+    document = json.loads(capsys.readouterr().out)
+    assert (document["samples"], document["partial"], document["valid"], document["left_out_bytes"]) == (
+        700,
+        True,
+        True,
+        0,
+    )
     assert main(["info", str(out), "--json"]) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["partial"] is True
     assert main(["salvage", str(part), "--out", str(out)]) == ExitCode.USAGE

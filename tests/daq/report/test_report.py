@@ -143,7 +143,7 @@ def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: s
 
 
 def test_pictures_need_no_screen_and_no_global_state() -> None:
-    modules = "daq.report.torque, daq.report.residual, daq.report.gains"
+    modules = "daq.report.fit, daq.report.residual_plots, daq.report.gains"
     code = f"import sys, {modules}; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"

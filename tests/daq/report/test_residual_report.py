@@ -21,8 +21,8 @@ from daq.cli.verb import json_text
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputExists, OutputFailed
-from daq.report.effect_names import WORDS, in_words, other_axis, placed_name
-from daq.report.residual_document import fell, residual_document, summary
+from daq.report.effect_names import WORDS, effect_text, other_axis, placed_name
+from daq.report.residual_document import error_change_text, residual_document, summary
 from daq.report.residual_page import page, paragraph, residual_page, table
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
@@ -75,8 +75,8 @@ class Closed:
 
     def document(self) -> dict[str, Any]:
         made = residual_document(self.fitted, self.account, calibration_of(self.fitted, CREATED))
-        told: dict[str, Any] = json.loads(json_text(made))
-        return told
+        document: dict[str, Any] = json.loads(json_text(made))
+        return document
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ class Reader(HTMLParser):
         return " ".join(self.texts)
 
 
-def test_the_page_stands_for_itself(closed: Closed) -> None:
+def test_the_page_is_self_contained(closed: Closed) -> None:
     page = Reader(closed.page())
     tags = {element.tag for element in page.elements}
     assert not tags & {"script", "link", "iframe", "object", "embed", "base", "form", "a"}
@@ -174,10 +174,10 @@ def test_the_page_stands_for_itself(closed: Closed) -> None:
 
 
 def test_the_page_says_the_outcome_first(closed: Closed) -> None:
-    told = closed.account.total
-    assert told.before.holdout is not None
-    assert told.after.holdout is not None
-    before, after = told.before.holdout.axes[2], told.after.holdout.axes[2]
+    reported = closed.account.total
+    assert reported.before.holdout is not None
+    assert reported.after.holdout is not None
+    before, after = reported.before.holdout.axes[2], reported.after.holdout.axes[2]
     page = Reader(closed.page())
     first = next(text for text in page.texts if text.startswith("J3 has"))
     assert first.startswith(
@@ -186,7 +186,7 @@ def test_the_page_says_the_outcome_first(closed: Closed) -> None:
     assert page.texts.index(first) < page.texts.index("Before and after")
     assert "These data cannot tell it from: load-friction on J2." in page.text
     assert "1.2 Nm on J2" in page.text
-    for error in (told.before.in_sample, told.after.cross_validated, told.after.holdout):
+    for error in (reported.before.in_sample, reported.after.cross_validated, reported.after.holdout):
         assert f"{error.total:.2f}" in page.texts
     assert "scales all gains alike" in page.text
 
@@ -210,8 +210,8 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
 
 
 def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
-    told, document = closed.account.total, closed.document()
-    for key, errors in (("before", told.before), ("after", told.after)):
+    reported, document = closed.account.total, closed.document()
+    for key, errors in (("before", reported.before), ("after", reported.after)):
         assert document[key]["relative_error_percent"]["axes"] == pytest.approx(errors.in_sample.axes)
         assert document[key]["cross_validated_error_percent"]["total"] == pytest.approx(errors.cross_validated.total)
         assert errors.holdout is not None
@@ -249,7 +249,7 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
     assert set(document["before"]) == set(document["after"]) == set(turn["before"])
 
 
-def test_silence_is_told_with_its_size(closed: Closed) -> None:
+def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
     start = closed.fitted.evidence()
     silent = replace(closed.fitted, steps=(replace(last, after=start),))
@@ -263,17 +263,17 @@ def test_silence_is_told_with_its_size(closed: Closed) -> None:
 
 
 def test_what_rises_is_not_said_to_fall() -> None:
-    assert fell(6.94, 2.8) == "falls from 6.9 to 2.8 %"
-    assert fell(2.8, 6.9) == "rises from 2.8 to 6.9 %"
-    assert fell(2.81, 2.79) == "stays at 2.8 %"
+    assert error_change_text(6.94, 2.8) == "falls from 6.9 to 2.8 %"
+    assert error_change_text(2.8, 6.9) == "rises from 2.8 to 6.9 %"
+    assert error_change_text(2.81, 2.79) == "stays at 2.8 %"
 
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
     axes = ("base", "arm", "wrist")
     assert placed_name(PlacedEffect(Coupling(3, 1), 0), axes) == "coupling on base with wrist"
-    assert in_words(Coupling(3, 1), axes) == "friction shared with wrist"
+    assert effect_text(Coupling(3, 1), axes) == "friction shared with wrist"
     term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
-    assert in_words(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"
+    assert effect_text(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"
     assert other_axis(Spring()) is None
     assert set(WORDS) <= {family[0].name for family in EFFECTS}
 

@@ -9,7 +9,7 @@ import pytest
 from daq.config.cell_file import load_cell
 from daq.log.metadata import RunStatistics
 from daq.simulation import demo
-from daq.simulation.demo import RETRIES, Settings, Telling
+from daq.simulation.demo import RETRIES, ProgressReporter, Settings
 from daq.workflow.plan import Plan
 from daq.workflow.record import Recorded
 from drivers.stream.stream import StreamStatistics
@@ -41,7 +41,7 @@ def test_an_invalid_run_is_made_again_and_said_so(
         load_cell(cell_file),
         plans,
         0,
-        Telling(steps.append, lambda *_: None),
+        ProgressReporter(steps.append, lambda *_: None),
     )
     assert attempts == min(spoilt, RETRIES) + 1
     assert done.log.valid is (spoilt <= RETRIES)

@@ -136,7 +136,7 @@ def test_a_misspelt_prismatic_axis_is_refused(configurations: Path, old: str, ne
         load_cell(path)
 
 
-def test_positions_outside_the_limits_are_told_in_mm() -> None:
+def test_positions_outside_the_limits_are_reported_in_mm() -> None:
     position = np.full((10, 5), 0.2)
     position[3, 1] = 350.0
     with pytest.raises(PositionImplausible) as caught:

@@ -56,7 +56,7 @@ def test_the_document_has_what_fit_json_promises() -> None:
     assert set(document["relative_error_percent"]) == {"axes", "total"}
 
 
-def test_one_entry_stands_on_one_line(path: Path) -> None:
+def test_one_entry_is_on_one_line(path: Path) -> None:
     assert len(re.findall(r"^- \{axis: J\d, value: .* change_percent: \S+\}$", path.read_text(), re.MULTILINE)) == 6
 
 
@@ -136,7 +136,7 @@ def test_a_number_that_is_not_finite_is_not_saved(path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_exit_codes_tell_data_from_refusal() -> None:
+def test_the_exit_codes_distinguish_data_from_refusal() -> None:
     assert exit_code(CalibrationUnreadable) == 4
     assert exit_code(CalibrationMissing) == 4
     assert exit_code(CalibrationEdited) == 3

@@ -166,7 +166,7 @@ def found(shelf: Shelf, calibrations: dict[str, Calibration]) -> CrossValidation
         return cross_validate(calibrations, _paths("disc2", "bare3", "disc3", "plate1", "plate2"))
 
 
-def test_cross_validation_tells_good_gains_from_bad(found: CrossValidation) -> None:
+def test_cross_validation_distinguishes_good_gains_from_bad(found: CrossValidation) -> None:
     """Tables 7 and 8: mass errors follow the gains' errors; the mean of Table 6 is least for the best."""
     errors: dict[str, list[float]] = {label: [] for label in found.calibrations}
     for run in found.weighed:

@@ -47,10 +47,10 @@ def test_what_was_not_checked_and_what_is_no_reference_is_said(checkout: Path) -
     actual = replace(first, profile=replace(first.profile, tap=TapPoint.ACTUAL), gain_unit="Nm/A(actual)")
     other = replace(cell.axes[1], gain_unit="Nm/V")
     changed = replace(cell, axes=(actual, other, *cell.axes[2:]))
-    told = readings(cell)
+    reported = readings(cell)
     for index in (2, 4):
-        told[index] = replace(told[index], rated_torque_nm=None, warnings=("nothing",))
-    note, unit, nothing = check_currents(changed, told)
+        reported[index] = replace(reported[index], rated_torque_nm=None, warnings=("nothing",))
+    note, unit, nothing = check_currents(changed, reported)
     assert note.startswith("J1: ACTUAL current, not the reference (generic-cia402 has none to log)")
     assert unit == "J2: the gain is in Nm/V; the torque constant cannot be checked"
     assert nothing == "J3, J5: nothing"

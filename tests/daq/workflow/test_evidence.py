@@ -58,7 +58,7 @@ def test_metadata_carries_second_weighing_and_controller(entered: float | None, 
     assert run_from_record(run_record(run)) == run
 
 
-def test_logs_of_earlier_versions_tell_neither() -> None:
+def test_logs_of_earlier_versions_report_neither() -> None:
     record_of = run_record(content(6, DISC).run)
     del record_of["payload_entered_kg"], record_of["controller_sha256"]
     run = run_from_record(record_of)
@@ -119,7 +119,7 @@ def truth_runs() -> dict[str, Run]:
 
 
 @pytest.mark.parametrize("nameplate_is_true", [False, True])
-def test_a_hold_out_is_told_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(
+def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch, nameplate_is_true: bool
 ) -> None:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
@@ -184,7 +184,7 @@ def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
     return [(one.gate, one.subject) for one in fit_refusals(calibration, "demo", None, ApplyPolicy())]
 
 
-def test_what_an_effect_tells_is_not_credited_to_the_gains(with_effect: Fit) -> None:
+def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -> None:
     """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
     nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
     gains = with_effect.final.estimate.gains

@@ -152,7 +152,7 @@ def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -
     assert np.linalg.norm(rigid + friction - expected) <= 2e-6 * np.linalg.norm(expected)
 
 
-def test_an_impossible_calibration_is_projected_and_told(
+def test_an_impossible_calibration_is_projected_and_reported(
     tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cell, _, standard = tx40

@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from daq.workflow.safeguards import short_searches
+from daq.workflow.safeguards import defer_full_gc
 
 
 class Ring:
@@ -17,17 +17,17 @@ class Ring:
         self.itself = self
 
 
-def test_everything_is_searched_by_nobody_and_what_is_made_meanwhile_by_all() -> None:
+def test_everything_is_searched_by_no_one_and_what_is_made_meanwhile_by_all() -> None:
     searched: list[int] = []
 
-    def note(phase: str, told: dict[str, int]) -> None:
+    def note(phase: str, reported: dict[str, int]) -> None:
         if phase == "start":
-            searched.append(told["generation"])
+            searched.append(reported["generation"])
 
     gc.collect()
     gc.callbacks.append(note)
     try:
-        with short_searches():
+        with defer_full_gc():
             fresh = weakref.ref(Ring())
             kept = [[number] for number in range(4 * len(gc.get_objects()))]
         assert fresh() is None
@@ -41,7 +41,7 @@ def test_everything_is_searched_by_nobody_and_what_is_made_meanwhile_by_all() ->
 
 def test_a_run_that_fails_leaves_everything_as_it_was() -> None:
     before = gc.get_threshold()
-    with pytest.raises(ValueError, match="bus"), short_searches():
+    with pytest.raises(ValueError, match="bus"), defer_full_gc():
         assert gc.get_threshold() != before
         raise ValueError("bus")
     assert gc.get_threshold() == before

@@ -78,7 +78,7 @@ def test_an_inertia_that_no_body_has_is_refused(configurations: Path, inertia: s
         _cell(configurations, f"mass_kg: 4.59\n    centre_m: [0, 0, 0]\n    inertia_kg_m2: {inertia}")
 
 
-def test_a_mounting_stands_for_one_body(configurations: Path) -> None:
+def test_a_mounting_is_one_body(configurations: Path) -> None:
     second = "mass_kg: 4.59\n  - name: plate\n    mounting: flange-a\n    mass_kg: 1.686"
     with pytest.raises(ConfigurationInconsistent, match=r"flange-a, used 2 times.*a name of its own"):
         _cell(configurations, second)
@@ -103,7 +103,7 @@ def test_moving_an_inertia_keeps_it_a_bodys(half: list[float], centre: list[floa
     assert np.linalg.eigvalsh(pseudo).min() > 0.0
 
 
-def test_a_fit_is_told_as_much_as_it_asks_for(configurations: Path) -> None:
+def test_a_fit_reports_as_much_as_it_asks_for(configurations: Path) -> None:
     cell = _cell(configurations, DRAWN)
     logged = cell.payloads[0].payload
     assert payload_as(logged, cell, Known.NOTHING).known == {}

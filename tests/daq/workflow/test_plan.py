@@ -54,13 +54,15 @@ def _worst(made: Plan) -> float:
 
 def test_the_worst_gain_is_a_quarter_better_than_by_random_moves(demo: Cell, experiment: Experiment) -> None:
     random = [plan(demo, seed=seed, exchanges=0, experiment=experiment) for seed in range(5)]
-    told: list[float] = []
-    made = plan(demo, seed=1, exchanges=600, experiment=experiment, progress=lambda _done, worst: told.append(worst))
+    reported: list[float] = []
+    made = plan(
+        demo, seed=1, exchanges=600, experiment=experiment, progress=lambda _done, worst: reported.append(worst)
+    )
     assert made.duration_s <= 40.0
     assert all(one.duration_s <= 40.0 for one in random)
     assert _worst(made) <= 0.75 * float(np.median([_worst(one) for one in random]))
     # The second half of the search still finds something: the figure is no accident of the first moves.
-    assert told[-1] < told[len(told) // 2] < told[0]
+    assert reported[-1] < reported[len(reported) // 2] < reported[0]
 
 
 def test_the_same_seed_gives_the_same_plan(demo: Cell, experiment: Experiment) -> None:

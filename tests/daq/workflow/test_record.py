@@ -22,7 +22,7 @@ from daq.log.salvage import salvage
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, record
 from daq.workflow.safeguards import NEVER
-from drivers.canopen.network import CanopenNetwork, Undisturbed
+from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.errors import NodeMisplaced, SampleLost
 from drivers.stream.sample import EventKind
 from drivers.stream.socketcan import Losses
@@ -54,7 +54,7 @@ class Rig:
         self.network, self.bus = cell(6)
         self.bus.nodes[ELBOW - 1].position = ELBOW_COUNTS
 
-        def network_of(_cell: Cell, _undisturbed: Undisturbed) -> CanopenNetwork:
+        def network_of(_cell: Cell, _undisturbed: SignalBlocker) -> CanopenNetwork:
             return self.network
 
         patch.setattr("daq.workflow.record.network_of", network_of)
@@ -105,7 +105,7 @@ def silent_at_first(bus: ScriptedBus, cycles: int) -> None:
     bus.tamper = tamper
 
 
-def test_no_search_for_garbage_delays_a_sync(timed: Rig) -> None:
+def test_no_full_collection_delays_a_sync(timed: Rig) -> None:
     usual, during = gc.get_threshold(), set()
 
     def tamper(message: can.Message) -> Iterable[can.Message]:
@@ -227,7 +227,7 @@ def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
 
 
-def test_what_is_told_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_reported_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """The interface's own counters are looked at five times a second, so they may tell after the last cycle."""
     bus, recv = lockstep.bus, lockstep.bus.recv
     ended_ns: list[int] = []

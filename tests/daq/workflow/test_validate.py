@@ -15,7 +15,7 @@ from daq.errors import CalibrationUnreadable
 from daq.log.csv_import import import_csv
 from daq.workflow.calibration_file import load, save
 from daq.workflow.fit import calibration_of, fit
-from daq.workflow.validate import Acquaintance, conditioning_of, together, validate
+from daq.workflow.validate import DataUse, conditioning_of, together, validate
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
@@ -68,9 +68,9 @@ def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, 
     (source,) = calibration.sources
     changed = replace(calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64)
     (held_out,) = validate(changed, [log])
-    assert (held_out.acquaintance, held_out.same_configuration) == (Acquaintance.HOLDOUT, False)
+    assert (held_out.data_use, held_out.same_configuration) == (DataUse.HOLDOUT, False)
     (new,) = validate(replace(calibration, sources=(replace(source, sha256="0" * 64),)), [log])
-    assert new.acquaintance is Acquaintance.NEW
+    assert new.data_use is DataUse.NEW
     # Twice the same rows weigh the same.
     assert together((new, new)).total == pytest.approx(new.error.total)
 
@@ -141,7 +141,7 @@ def test_refusals_have_their_exit_codes(
     assert "none.yaml" in capsys.readouterr().err
 
 
-def test_a_robot_that_stood_still_tells_nothing(
+def test_a_robot_that_was_at_rest_reports_nothing(
     complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = write(tmp_path / "still.mcap", demo_content(checkout), samples([[0] * 6] * 3000))

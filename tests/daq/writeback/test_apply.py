@@ -21,7 +21,7 @@ import pytest
 from daq.cli.app import main
 from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read
-from daq.writeback.file_access import backups, only_writer
+from daq.writeback.file_access import backups, exclusive_writer
 from daq.writeback.file_proposal import Proposal, apply, propose
 from daq.writeback.file_target import roll_back
 from daq.writeback.request import Request
@@ -143,7 +143,7 @@ def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: 
     lock, made = tmp_path / ".x.yaml.lock", 0
     umask = os.umask(0o077)
     try:
-        with only_writer(file):
+        with exclusive_writer(file):
             made = stat.S_IMODE(lock.stat().st_mode)
     finally:
         os.umask(umask)
@@ -160,10 +160,10 @@ def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: 
     os.seteuid(65534)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+        with pytest.raises(ControllerBusy), exclusive_writer(shared / "x.yaml"):
             pass
         fcntl.flock(held, fcntl.LOCK_UN)
-        with only_writer(shared / "x.yaml"), pytest.raises(ControllerBusy), only_writer(shared / "x.yaml"):
+        with exclusive_writer(shared / "x.yaml"), pytest.raises(ControllerBusy), exclusive_writer(shared / "x.yaml"):
             pass
         assert lock.exists()  # root's, in a folder where each removes their own
     finally:
@@ -218,7 +218,7 @@ class _Failing:
 
 
 @pytest.mark.parametrize("name", ["open", "fchmod", "fsync", "replace"])
-def test_whatever_step_fails_the_old_file_stands_and_nothing_is_left(
+def test_whatever_step_fails_the_old_file_stays_and_nothing_is_left(
     controller: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every use of every system call on the way fails in turn, until one run goes through."""
@@ -286,7 +286,7 @@ def test_what_a_person_saves_during_the_write_is_not_lost(
     assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.FAILED]
 
 
-def test_a_file_that_somebody_makes_during_a_way_back_stays(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_someone_makes_during_a_rollback_stays(controller: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     apply(_propose(demo_calibration(), controller), NOW)
     controller.unlink()
     fsync = os.fsync
@@ -327,8 +327,8 @@ def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path
     assert all(a != b for a, b in itertools.pairwise(contents))
 
 
-def _make_backup(controller: Path, was: bytes, became: bytes, stamp: str = "20250102T030405Z") -> Path:
-    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (was, became))
+def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str = "20250102T030405Z") -> Path:
+    digests = "-".join(hashlib.sha256(content).hexdigest()[:12] for content in (was, after_digest))
     path = controller.parent / f"demo.yaml.{stamp}.{digests}.bak"
     path.write_bytes(was)
     return path
@@ -402,6 +402,6 @@ def test_an_edit_since_the_write_is_not_lost(controller: Path, capsys: pytest.Ca
     edited = controller.read_bytes().replace(b"120.0", b"130.0")
     controller.write_bytes(edited)
     assert main(["rollback", "--to", str(controller)]) == 3
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"`diff {shlex.quote(str(written.backup))} {shlex.quote(str(controller))}`" in told
+    output = " ".join(capsys.readouterr().err.split())
+    assert f"`diff {shlex.quote(str(written.backup))} {shlex.quote(str(controller))}`" in output
     assert controller.read_bytes() == edited

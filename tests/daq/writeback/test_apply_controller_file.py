@@ -143,7 +143,7 @@ def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, dat
         for axis, share, old in zip(axes, shares, olds, strict=True)
     )
     spelt = tuple(
-        text if float(told := spell(gain.value, gain.std, text)) == float(text) else told
+        text if float(reported := spell(gain.value, gain.std, text)) == float(text) else reported
         for gain, text in zip(gains, case.numbers, strict=True)
     )
     with tempfile.TemporaryDirectory() as folder:

@@ -20,7 +20,7 @@ from daq.errors import ControllerUnfit
 from daq.writeback.formats.dcf_document import DcfDocument
 from daq.writeback.formats.document import MAX_BYTES, ControllerDocument, decode, format_of, read_bytes
 from daq.writeback.formats.json_document import JsonDocument
-from daq.writeback.formats.scalar import respell
+from daq.writeback.formats.scalar import rewrite_gain
 from daq.writeback.formats.xml_document import XmlDocument
 from daq.writeback.formats.yaml_document import YamlDocument
 
@@ -204,7 +204,7 @@ def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObje
     found = document.locate(case.keys)
     assert [scalar.text for scalar in found] == list(case.numbers)
     spelt = tuple(
-        respell(scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)).spelling
+        rewrite_gain(scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)).spelling
         for scalar, gain in zip(
             found, data.draw(st.lists(_gains, min_size=len(found), max_size=len(found))), strict=True
         )
@@ -269,7 +269,7 @@ def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObje
     begin=st.sampled_from([b"", b"\xff\xfe", b"[", b"{", b"{}", b"<a", b"<a/>", b"[6076]\n", b"\0"]),
     noise=st.binary(max_size=60),
 )
-def test_whatever_stands_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
+def test_whatever_is_in_the_file_it_is_refused_in_words(kind: ControllerFormat, begin: bytes, noise: bytes) -> None:
     with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
         decode(begin + noise, "robot", kind).locate(("6076.nowhere",))
 
@@ -507,12 +507,12 @@ def test_an_integer_keeps_its_style_and_another_unit_its_factor(
 ) -> None:
     document = DcfDocument("drive.dcf", _DCF)
     (scalar,) = document.locate((key,))
-    told = respell(scalar, gain, std, factor)
-    assert told.spelling == spelling
-    assert abs(told.new - gain) <= std
-    assert told.old == scalar.value / factor
+    reported = rewrite_gain(scalar, gain, std, factor)
+    assert reported.spelling == spelling
+    assert abs(reported.new - gain) <= std
+    assert reported.old == scalar.value / factor
     (read,) = document.with_values({key: spelling}).locate((key,))
-    assert read.value / factor == told.new
+    assert read.value / factor == reported.new
 
 
 @pytest.mark.parametrize(
@@ -526,24 +526,24 @@ def test_an_integer_keeps_its_style_and_another_unit_its_factor(
         ("2005", 33.0, 0.1, 1000.0, "33000 for an integer of -32768 to 32767"),
     ],
 )
-def test_an_integer_that_does_not_tell_the_gain_is_refused(
+def test_an_integer_that_does_not_report_the_gain_is_refused(
     key: str, gain: float, std: float, factor: float, says: str
 ) -> None:
     (scalar,) = DcfDocument("drive.dcf", _DCF).locate((key,))
     if says == "0.4":
-        assert respell(scalar, gain, std, factor).spelling == "400"
+        assert rewrite_gain(scalar, gain, std, factor).spelling == "400"
         return
     with pytest.raises(ControllerUnfit) as caught:
-        respell(scalar, gain, std, factor)
+        rewrite_gain(scalar, gain, std, factor)
     assert says in str(caught.value)
 
 
 def test_the_same_number_stays_as_the_human_wrote_it() -> None:
     (hexadecimal,) = DcfDocument("drive.dcf", _DCF).locate(("6076",))
-    assert respell(hexadecimal, 1.5, 0.01, 1000.0).spelling == "0x5DC"
+    assert rewrite_gain(hexadecimal, 1.5, 0.01, 1000.0).spelling == "0x5DC"
     (decimal,) = JsonDocument("robot", '{"a": 32960}').locate(("a",))
-    assert respell(decimal, 32.96, 0.01, 1000.0).spelling == "32960"
-    assert respell(decimal, 32.97, 0.01, 1000.0) != respell(decimal, 32.96, 0.01, 1000.0)
+    assert rewrite_gain(decimal, 32.96, 0.01, 1000.0).spelling == "32960"
+    assert rewrite_gain(decimal, 32.97, 0.01, 1000.0) != rewrite_gain(decimal, 32.96, 0.01, 1000.0)
 
 
 @pytest.mark.parametrize("name", ["Elmo_cob.dcf", "ElmoSimplIQ_cob.dcf", "Schunk_0_63_cob.dcf", "pilz_prbt_0_1.dcf"])
@@ -578,11 +578,11 @@ def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) 
         ("a.conf", ControllerFormat.YAML),
     ],
 )
-def test_the_name_tells_the_format(name: str, kind: ControllerFormat) -> None:
+def test_the_name_gives_the_format(name: str, kind: ControllerFormat) -> None:
     assert format_of(name) is kind
 
 
-def test_the_configuration_may_tell_the_format_instead() -> None:
+def test_the_configuration_may_give_the_format_instead() -> None:
     kinds: list[ControllerDocument] = [decode(b"<a/>", "a.cfg", ControllerFormat.XML), decode(b"a: 1", "a.cfg")]
     assert [type(kind) for kind in kinds] == [XmlDocument, YamlDocument]
 

@@ -19,7 +19,7 @@ from daq.errors import BackupMissing, CalibrationRefused, ConfigurationInconsist
 from daq.ledger.audit import AuditAction, read, verify
 from daq.writeback.drive_proposal import DriveProposal, propose_to_drives
 from daq.writeback.drive_record import read_record, read_records, record_folder
-from daq.writeback.drive_target import DrivesWritten, apply_to_drives, roll_back_drives, way_back_of_drives
+from daq.writeback.drive_target import DrivesWritten, apply_to_drives, plan_drive_rollback, roll_back_drives
 from daq.writeback.gates.table import Gate
 from daq.writeback.request import Request
 from drivers.canopen.bus import BusAddress
@@ -245,13 +245,13 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
         simulation.nodes[2].nmt = NmtState.OPERATIONAL
         monkeypatch.undo()
         with network_of(cell, address) as network:
-            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
 
 @pytest.mark.parametrize("made", [False, True], ids=["aborted", "answer lost"])
-def test_whichever_transfer_fails_the_old_values_stand_everywhere(
+def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: bool
 ) -> None:
     """Every SDO transfer of the path fails once, before it was made or after; only the whole way changes all."""
@@ -410,8 +410,8 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
     with simulated(address), network_of(cell, address) as network:
         proposal = _propose(cell, network, far, looked_at="0" * 64)
         assert [refusal.gate for refusal in proposal.refusals] == [Gate.BASE, Gate.CHANGE, Gate.NAMEPLATE]
-        looked = _propose(cell, network, looked_at=_propose(cell, network).base_sha256)
-        assert looked.refusals == ()
+        reviewed = _propose(cell, network, looked_at=_propose(cell, network).base_sha256)
+        assert reviewed.refusals == ()
         with pytest.raises(CalibrationRefused, match="3 closed gates"):
             apply_to_drives(proposal, network, NOW, audit=tmp_path / "audit", who="T")
         strange = replace(calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9")))
@@ -434,17 +434,17 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
     ],
 )
 def test_an_object_that_cannot_hold_the_gain_is_refused(
-    address: BusAddress, tmp_path: Path, told: GainObject, says: str
+    address: BusAddress, tmp_path: Path, gain_object: GainObject, says: str
 ) -> None:
     calibration = demo_calibration()
     gains = (replace(calibration.gains[0], value=33.7, std=0.135), *calibration.gains[1:])
-    cell = demo_cell(tmp_path, *(told,) * 6)
+    cell = demo_cell(tmp_path, *(gain_object,) * 6)
     with simulated(address), network_of(cell, address) as network, pytest.raises(ControllerUnfit) as caught:
         _propose(cell, network, replace(calibration, gains=gains))
     assert says in str(caught.value)
 
 
-def test_a_drive_that_somebody_changed_since_the_dry_run_is_refused(address: BusAddress, tmp_path: Path) -> None:
+def test_a_drive_that_someone_changed_since_the_dry_run_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
@@ -468,7 +468,7 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
         for minutes, expected, saved in ((1, IN_DRIVES, IN_DRIVES), (2, NEW, NEW), (2, IN_DRIVES, IN_DRIVES)):
             with network_of(cell, address) as network:
                 roll_back_drives(
-                    way_back_of_drives(cell, network),
+                    plan_drive_rollback(cell, network),
                     network,
                     NOW + timedelta(minutes=minutes),
                     audit=cell.history.audit,
@@ -490,28 +490,28 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
     assert verify(cell.history.audit).open_writes == ()
 
 
-def test_a_way_back_that_would_lose_what_somebody_did_is_refused(address: BusAddress, tmp_path: Path) -> None:
+def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         with pytest.raises(BackupMissing, match="no record"):
-            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         written = _write(cell, address)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
         with pytest.raises(ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"):
-            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
         body = json.loads(written.record.read_text())
         body["drives"][0]["old"] = 99999
         written.record.write_text(json.dumps(body))
         with pytest.raises(ControllerUnfit, match="as it says"):
-            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         assert _gains(simulation) == NEW
         written.record.write_text("{}")
         with pytest.raises(ControllerUnfit, match="the record of a write to drives"):
-            roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
 
 
-def test_a_gain_that_somebody_entered_in_a_drive_is_looked_at_first(address: BusAddress, tmp_path: Path) -> None:
+def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAddress, tmp_path: Path) -> None:
     """The newest record says what drivegain left there: that, or what stood there before, is no surprise."""
     cell = demo_cell(tmp_path)
     entry = ObjectEntry(0x2003, 1, 32, signed=True)
@@ -544,12 +544,12 @@ def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path
     new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
     with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
         with network_of(new, address) as network, pytest.raises(ControllerChanged, match="serial number 1002"):
-            roll_back_drives(way_back_of_drives(new, network), network, NOW)
+            roll_back_drives(plan_drive_rollback(new, network), network, NOW)
         assert _gains(simulation) == NEW
 
 
 @pytest.mark.parametrize("writes", [0, 1, 3, 6, 8])
-def test_after_a_kill_the_record_says_what_stood_there_and_leads_back(tmp_path: Path, writes: int) -> None:
+def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Path, writes: int) -> None:
     """SIGKILL after so many writes, saves among them."""
     cell = demo_cell(tmp_path)
     assert cell.history is not None
@@ -568,10 +568,10 @@ def test_after_a_kill_the_record_says_what_stood_there_and_leads_back(tmp_path: 
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:
             if writes:
-                roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+                roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
             else:
                 with pytest.raises(BackupMissing, match="1 records of what stands there now"):
-                    roll_back_drives(way_back_of_drives(cell, network), network, NOW)
+                    roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 

@@ -143,11 +143,11 @@ def _logs(**changes: object) -> Callable[[Scene], Scene]:
 def _source(index: int, **changes: object) -> Callable[[Scene], Scene]:
     def broken(scene: Scene) -> Scene:
         sources = list(scene.calibration.sources)
-        told = sources[index].recording
+        reported = sources[index].recording
         of_recording = {key: value for key, value in changes.items() if key in _RECORDING}
         rest = {key: value for key, value in changes.items() if key not in _RECORDING}
-        if told is not None and of_recording:
-            rest["recording"] = replace(told, **of_recording)  # type: ignore[arg-type]
+        if reported is not None and of_recording:
+            rest["recording"] = replace(reported, **of_recording)  # type: ignore[arg-type]
         sources[index] = replace(sources[index], **rest)  # type: ignore[arg-type]
         return replace(scene, calibration=replace(scene.calibration, sources=tuple(sources)))
 
@@ -406,9 +406,9 @@ def test_each_gate_closes_alone(
     assert not list(tmp_path.glob("*.bak"))
     (entry,) = read(audit)
     assert (entry.action, entry.who, entry.subject) == (AuditAction.REFUSED, "Ada", str(scene.controller))
-    told = entry.details["refusals"]
-    assert isinstance(told, list)
-    assert [one["gate"] for one in told] == [gate.value] * len(proposal.refusals)
+    reported = entry.details["refusals"]
+    assert isinstance(reported, list)
+    assert [one["gate"] for one in reported] == [gate.value] * len(proposal.refusals)
 
 
 def test_every_gate_has_such_a_test() -> None:
@@ -457,7 +457,7 @@ def test_just_inside_its_bound_a_gate_is_open(scene: Scene, kept: Callable[[Scen
     assert kept(scene).propose().refusals == ()
 
 
-def test_whoever_has_looked_at_a_changed_file_may_go_on(scene: Scene) -> None:
+def test_a_reviewed_change_of_a_changed_file_may_go_on(scene: Scene) -> None:
     scene = _edited(scene)
     (refusal,) = scene.propose().refusals
     digest = sha256(scene.controller.read_bytes())
@@ -510,11 +510,11 @@ def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path:
         load_cell(cell)
 
 
-def test_an_age_below_a_day_is_told_in_hours(scene: Scene) -> None:
+def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
     """2025-01-02 02:00 is an hour and four minutes ago."""
     hour = replace(scene, policy=ApplyPolicy(max_age_days=1 / 24))
-    told = {(one.found, one.expected) for one in hour.propose().refusals}
-    assert told == {("recorded 1.1 hours ago", "recorded within the last 1 hours")}
+    reported = {(one.found, one.expected) for one in hour.propose().refusals}
+    assert reported == {("recorded 1.1 hours ago", "recorded within the last 1 hours")}
     days = _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())(replace(scene, policy=ApplyPolicy()))
     assert [(one.found, one.expected) for one in days.propose().refusals] == [
         ("recorded 30.1 days ago", "recorded within the last 30 days")
@@ -557,7 +557,7 @@ def test_two_signatures_of_others_are_two(scene: Scene) -> None:
     assert replace(two, signed=("Ada", "Bob"), appliers=("the job",)).propose().refusals == ()
 
 
-def test_all_closed_gates_are_told_at_once(scene: Scene) -> None:
+def test_all_failed_checks_are_reported_at_once(scene: Scene) -> None:
     other = replace(scene, policy=ApplyPolicy(max_change_percent=5.0))
     error = refused(_calibration(cell="other")(other).propose())
     assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [True] * 5 + [False]
@@ -565,8 +565,8 @@ def test_all_closed_gates_are_told_at_once(scene: Scene) -> None:
 
 def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
     scene.controller.write_text(scene.controller.read_text().replace("7.68", "0.0"))
-    looked = replace(scene, looked_at=sha256(scene.controller.read_bytes()))
-    assert [(one.gate, one.subject) for one in looked.propose().refusals] == [(Gate.SIGN, "J6")]
+    reviewed = replace(scene, looked_at=sha256(scene.controller.read_bytes()))
+    assert [(one.gate, one.subject) for one in reviewed.propose().refusals] == [(Gate.SIGN, "J6")]
 
 
 def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
@@ -575,7 +575,7 @@ def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
     assert refusal.subject == "effect time-skew on all axes"
 
 
-def test_a_library_that_tells_no_circumstances_is_not_asked_for_them(scene: Scene) -> None:
+def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(scene: Scene) -> None:
     old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
     assert propose(Request(old, NOW), scene.controller, KEYS, cell="demo").refusals == ()
     assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {Gate.SOURCES, Gate.HOLDOUT}

@@ -29,7 +29,7 @@ from tests.daq.killing import killed_at
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n"
 KEYS = {"J1": "drives.J1.gain"}
-FEWEST_CALLS = 50
+MIN_CALLS = 50
 LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
 """What may lie about: the files themselves, whole backups, the lock that nobody holds, and unfinished copies."""
 
@@ -110,7 +110,7 @@ def _deleted(folder: Path) -> Place:
     return place
 
 
-def _told(verdict: AuditVerdict) -> Content:
+def _reported_content(verdict: AuditVerdict) -> Content:
     """Which of the two the audit says the file is, after the one write that was killed."""
     # Before it, nothing or one finished write.
     if verdict.open_writes:
@@ -135,7 +135,7 @@ def _told(verdict: AuditVerdict) -> Content:
         pytest.param(_deleted, Place.to_roll_back, id="rollback of a file that was deleted"),
     ],
 )
-def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_which(
+def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_reports_which(
     tmp_path: Path,
     prepare: Callable[[Path], Place],
     work: Callable[[Place], Callable[[], object]],
@@ -168,9 +168,9 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_tells_
     finally:
         gc.enable()
     with capsys.disabled():
-        told = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
-        print(f"\n  killed at each of {number - 1} system calls: {told}; left behind: {', '.join(sorted(left))}")  # noqa: T201
-    assert number > FEWEST_CALLS
+        reported = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
+        print(f"\n  killed at each of {number - 1} system calls: {reported}; left behind: {', '.join(sorted(left))}")  # noqa: T201
+    assert number > MIN_CALLS
     assert set(outcomes) == {Content.BEFORE, Content.AFTER}
     # Otherwise nobody was killed half-way.
     assert {"lock", "tmp"} <= left
@@ -195,25 +195,25 @@ def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
         assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
     verdict = verify(place.audit)
     assert verdict.holds
-    told = _told(verdict)
-    assert told is (Content.BEFORE if content == before else Content.AFTER)
+    reported = _reported_content(verdict)
+    assert reported is (Content.BEFORE if content == before else Content.AFTER)
     for backup in backups(place.file):
         backup.content()  # each is what its name says
-    return told
+    return reported
 
 
 def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -> None:
     """Whoever comes next is not hindered, and the audit still tells what the killed one has done."""
     was = place.content()
-    told = [one.content for one in verify(place.audit).open_writes]
+    reported = [one.content for one in verify(place.audit).open_writes]
     if was is None:
         assert roll_back(place.file, NOW + timedelta(minutes=2), audit=place.audit).after == after
-        assert [one.content for one in verify(place.audit).open_writes] == told
+        assert [one.content for one in verify(place.audit).open_writes] == reported
         return
     place.apply(31.5, minutes=2)
     assert b"31.5" in place.file.read_bytes()
     verdict = verify(place.audit)
     assert verdict.holds
-    assert [one.content for one in verdict.open_writes] == told
+    assert [one.content for one in verdict.open_writes] == reported
     assert roll_back(place.file, NOW + timedelta(minutes=3), audit=place.audit).after == was
     assert place.file.read_bytes() in {before, after}

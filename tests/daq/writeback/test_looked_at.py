@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from daq.config.cell import Cell
 from daq.errors import CalibrationRefused, UsageError
-from daq.writeback.request import LookedAt, change_of, look, other_change
+from daq.writeback.request import ReviewedChange, change_digest, changed_since_review, parse_base
 from drivers.canopen.bus import BusAddress
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
@@ -22,25 +22,27 @@ from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simu
 
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
 def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
-    looked = look(f" {change_of(before, after).upper()}\n", before)
-    assert looked.base_sha256 == hashlib.sha256(before).hexdigest()
-    assert other_change(looked, "x", before, after) == ()
-    assert bool(other_change(looked, "x", before, another)) == (another != after)
-    assert (look(change_of(another, after), before).base_sha256 == looked.base_sha256) == (another == before)
+    reviewed = parse_base(f" {change_digest(before, after).upper()}\n", before)
+    assert reviewed.base_sha256 == hashlib.sha256(before).hexdigest()
+    assert changed_since_review(reviewed, "x", before, after) == ()
+    assert bool(changed_since_review(reviewed, "x", before, another)) == (another != after)
+    assert (parse_base(change_digest(another, after), before).base_sha256 == reviewed.base_sha256) == (
+        another == before
+    )
 
 
 def test_the_whole_digest_alone_names_no_change() -> None:
     digest = hashlib.sha256(b"old").hexdigest()
-    looked = look(digest, b"old")
-    assert looked == LookedAt(digest, None)
-    assert other_change(looked, "x", b"old", b"whatever") == ()
-    assert look(None, b"old") == LookedAt(None, None)
+    reviewed = parse_base(digest, b"old")
+    assert reviewed == ReviewedChange(digest, None)
+    assert changed_since_review(reviewed, "x", b"old", b"whatever") == ()
+    assert parse_base(None, b"old") == ReviewedChange(None, None)
 
 
 @pytest.mark.parametrize("told", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
 def test_what_is_no_digest_is_refused(told: str) -> None:
     with pytest.raises(UsageError, match="12 digits, a hyphen, 12 digits"):
-        look(told, b"old")
+        parse_base(told, b"old")
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def simulation(cell: Cell) -> Iterator[SimulatedCell]:
         yield running
 
 
-def test_the_drives_get_the_change_that_was_looked_at_and_no_other(
+def test_the_drives_get_the_change_that_was_reviewed_and_no_other(
     cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = demo_calibration()

@@ -57,7 +57,7 @@ LEGACY = (
 )
 
 
-def test_a_pipe_or_a_folder_in_place_of_a_file_keeps_nobody_waiting(tmp_path: Path) -> None:
+def test_a_pipe_or_a_folder_in_place_of_a_file_keeps_no_one_waiting(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
     file.write_bytes(CONTENT)
     secret, public = generate(tmp_path, "Bob")
@@ -120,8 +120,8 @@ def test_a_signature_beside_the_file_is_found(calibration: Path) -> None:
     path = sign(calibration, secret, "anna", at=NOW)
     assert path == signature_path(calibration, "anna")
     assert signers_of(calibration, trusted) == ("anna",)
-    told = minisign.parse_signature(path.read_text()).comment.split("\t")
-    assert told == [
+    reported = minisign.parse_signature(path.read_text()).comment.split("\t")
+    assert reported == [
         "timestamp:1735787045",
         "at:2025-01-02T03:04:05+00:00",
         "file:calibration.yaml",
@@ -130,7 +130,7 @@ def test_a_signature_beside_the_file_is_found(calibration: Path) -> None:
     ]
 
 
-def test_whoever_is_not_trusted_is_not_looked_at(calibration: Path) -> None:
+def test_an_untrusted_signer_is_not_considered(calibration: Path) -> None:
     secret, _ = generate(calibration.parent, "mallory")
     sign(calibration, secret, "mallory", at=NOW)
     signature_path(calibration, "somebody").write_text("nonsense")
@@ -164,7 +164,7 @@ def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int,
 
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=300) | st.binary(max_size=200).map(lambda raw: base64.b64encode(raw).decode()))
-def test_what_is_no_key_and_no_signature_is_told_and_never_trusted(text: str) -> None:
+def test_what_is_no_key_and_no_signature_is_reported_and_never_trusted(text: str) -> None:
     for parse in (minisign.parse_public_key, minisign.parse_secret_key, minisign.parse_signature):
         with pytest.raises(ValueError, match=r".+"):
             parse(text)
@@ -278,7 +278,7 @@ def test_a_name_is_part_of_a_file_name(calibration: Path, name: str) -> None:
         sign(calibration, calibration, name)
 
 
-def test_whatever_is_not_there_or_in_the_way_is_told(calibration: Path) -> None:
+def test_whatever_is_not_there_or_in_the_way_is_reported(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna")
     with pytest.raises(SecretKeyUnfit):
         sign(calibration, calibration.parent / "nobody.key", "anna")

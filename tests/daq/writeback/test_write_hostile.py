@@ -97,7 +97,7 @@ def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controlle
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
-def test_the_link_of_a_stranger_is_not_followed(controller: Path, tmp_path: Path) -> None:
+def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     os.lchown(link, 4711, 4711)
@@ -134,7 +134,7 @@ def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path,
     assert not victim.exists()
 
 
-def test_a_deleted_file_comes_back_through_its_link_and_is_written_down(controller: Path, tmp_path: Path) -> None:
+def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(controller: Path, tmp_path: Path) -> None:
     audit, link = tmp_path / "audit.jsonl", tmp_path / "link.yaml"
     link.symlink_to(controller)
     before = controller.read_bytes()
@@ -148,7 +148,7 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_written_down(controll
     assert {entry.subject for entry in entries} == {str(controller)}
 
 
-def test_what_fails_within_a_write_is_written_down_as_failed(
+def test_what_fails_within_a_write_is_recorded_as_failed(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     audit, before = tmp_path / "audit.jsonl", controller.read_bytes()
@@ -168,7 +168,7 @@ def test_what_fails_within_a_write_is_written_down_as_failed(
     assert failed.details["sha256_found"] == begun.details["sha256_before"]
 
 
-def test_an_end_that_cannot_be_written_down_leaves_the_write_and_a_warning(
+def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     audit = tmp_path / "audit.jsonl"

@@ -64,7 +64,7 @@ def test_a_closed_hub_does_not_look_like_silence() -> None:
     link.close()
 
 
-def test_nobody_listens() -> None:
+def test_no_one_listens() -> None:
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         port = taken.getsockname()[1]
@@ -155,7 +155,7 @@ ENDLESS = {
 
 
 @pytest.mark.parametrize("kind", ENDLESS)
-def test_a_server_that_never_ends_a_message_is_told_and_not_parsed_ever_slower(
+def test_a_server_that_never_ends_a_message_is_reported_and_not_parsed_ever_slower(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours, theirs = socket.socketpair()
@@ -171,7 +171,7 @@ def test_a_server_that_never_ends_a_message_is_told_and_not_parsed_ever_slower(
     end.shutdown()
 
 
-def test_a_handshake_without_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_handshake_without_end_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     theirs.sendall(b"< hi" + b" " * 100_000)
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)
@@ -181,7 +181,7 @@ def test_a_handshake_without_end_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("said", ["< frame 123456789 1.0 00 >", "< frame 123 1.0 000000000000000000 >"])
-def test_a_frame_that_no_bus_carries_is_told(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_no_bus_carries_is_reported(said: str, monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = socket.socketpair()
     theirs.sendall(b"< hi >< ok >< ok >")
     monkeypatch.setattr(socket, "create_connection", lambda *_, **__: ours)

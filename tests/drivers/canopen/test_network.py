@@ -29,7 +29,7 @@ from drivers.stream.sample import EventKind
 from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell
 
 
-def test_scan_tells_who_is_there_and_changes_nothing() -> None:
+def test_scan_reports_who_is_there_and_changes_nothing() -> None:
     network, bus = cell(2)
     bus.nodes[1].nmt = 4  # stopped: answers no SDO, but says so by heartbeat
     bus.nodes[1].store(0x1017, 0, 10)
@@ -44,7 +44,7 @@ def test_scan_tells_who_is_there_and_changes_nothing() -> None:
     assert not [frame for frame in bus.sent if frame.arbitration_id < 0x580]
 
 
-def test_a_node_without_name_and_serial_is_described_as_far_as_it_tells() -> None:
+def test_a_node_without_name_and_serial_is_described_as_far_as_it_reports() -> None:
     network, bus = cell(1)
     for key in ((0x1008, 0), (0x1018, 4), (0x6041, 0)):
         del bus.nodes[0].objects[key]
@@ -91,7 +91,7 @@ def test_a_body_that_fails_still_restores() -> None:
     assert bus.nodes[0].nmt == NmtState.PRE_OPERATIONAL
 
 
-def test_an_axis_that_somebody_enabled_is_without_power_afterwards() -> None:
+def test_an_axis_that_someone_enabled_is_without_power_afterwards() -> None:
     network, bus = cell(1)
     with network:
         network.prepare()
@@ -234,7 +234,7 @@ def test_bus_off_is_an_error_and_other_error_frames_are_not() -> None:
             network.link.pump(0.0)
 
 
-def test_emcy_and_its_end_are_told_in_words() -> None:
+def test_emcy_and_its_end_are_reported_in_words() -> None:
     network, bus = cell(1)
     with network:
         bus.inject(bus.nodes[0].emcy(0x2310))
@@ -282,12 +282,12 @@ def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> 
 @pytest.mark.parametrize("times", [1, 100])
 def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_axes_with_power(times: int) -> None:
     network, bus = cell(2)
-    send, told = bus.send, 0
+    send, reported = bus.send, 0
 
     def fail(msg: can.Message, timeout: float | None = None) -> None:
-        nonlocal told
-        if 0x600 < msg.arbitration_id < 0x680 and told < times:
-            told += 1
+        nonlocal reported
+        if 0x600 < msg.arbitration_id < 0x680 and reported < times:
+            reported += 1
             raise BusError("bus B", "bus-off")  # as a split bus does, once
         send(msg, timeout)
 
@@ -299,7 +299,7 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
     given_up = times > 1
     assert [node.statusword & 0x6F for node in bus.nodes] == [0x27 if given_up else 0x40] * 2
     assert [node.value(0x6060, 0) for node in bus.nodes] == [1 if given_up else 8] * 2
-    assert told == (2 if given_up else 1)
+    assert reported == (2 if given_up else 1)
 
 
 def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
@@ -307,11 +307,11 @@ def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
     inside: list[bool] = []
 
     @contextmanager
-    def undisturbed() -> Iterator[None]:
+    def block_signals() -> Iterator[None]:
         inside.append(True)
         yield
 
-    network.undisturbed = undisturbed
+    network.block_signals = block_signals
     send = bus.send
 
     def cut(msg: can.Message, timeout: float | None = None) -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.motion.move import Move, synchronised, trapezoid_duration_s
-from drivers.motion.watch import FROZEN_S, FrozenData, way_counts
+from drivers.motion.watch import FROZEN_S, FrozenData, travel_counts
 from drivers.stream.sample import Sample
 
 PERIOD_NS = 1_000_000
@@ -25,21 +25,21 @@ def test_the_way_is_that_of_the_trapezoid(distance: float, speed: float, ramp: f
     time_s = part * trapezoid_duration_s(distance, speed, ramp)
     path = synchronised(np.zeros(1), np.array([distance]), np.array([speed]), np.array([ramp]))
     expected = float(path.at(np.array([max(time_s, 0.0)]))[0][0, 0])
-    assert way_counts(distance, speed, ramp, time_s) == pytest.approx(expected, rel=1e-6, abs=1e-6 * distance)
+    assert travel_counts(distance, speed, ramp, time_s) == pytest.approx(expected, rel=1e-6, abs=1e-6 * distance)
 
 
 def alarms(positions: list[int], currents: list[int], missing: list[int] | None = None) -> list[int]:
     data = FrozenData(MOVE, (0, 0), (0,), PERIOD_NS)
-    told = []
+    reported = []
     for cycle, (position, current) in enumerate(zip(positions, currents, strict=True)):
         lost = 0 if missing is None else missing[cycle]
         sample = Sample(cycle, cycle * PERIOD_NS, (position, 0), (current, 0), (0x27, 0x27), lost)
         if data.frozen(sample):
-            told.append(cycle)
-    return told
+            reported.append(cycle)
+    return reported
 
 
-def test_an_axis_that_shows_nothing_new_is_told_in_its_bound() -> None:
+def test_an_axis_that_shows_nothing_new_is_reported_in_its_bound() -> None:
     assert alarms([7] * 100, [3] * 100)[0] == round(FROZEN_S * 1e9 / PERIOD_NS)
 
 

@@ -28,7 +28,7 @@ def give_guard(node: ScriptedNode, entry: int = 0, option: int | None = 1) -> No
 @pytest.mark.parametrize(
     "before", [0, 0x00050000, RECORDER << 16 | 500], ids=["free", "unused", "left by a killed one"]
 )
-def test_an_amplifier_is_told_to_watch_us_and_gets_its_settings_back(before: int) -> None:
+def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: int) -> None:
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node, before)

@@ -98,7 +98,7 @@ def test_a_drive_that_needs_its_controlword_twice_still_moves(moving: Moving) ->
     assert run(moving, FAR)[-1].position_counts == (50_000, -40_000)
 
 
-def test_nothing_is_told_to_an_axis_whose_position_is_unknown(moving: Moving) -> None:
+def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) -> None:
     _, _, bus, _ = moving
     for node in bus.nodes:
         node.position = 30_000.0
@@ -292,7 +292,7 @@ def test_an_axis_that_creeps_does_not_stand_still(moving: Moving) -> None:
     assert len(stop_with(moving, (7.0,))) >= bound_cycles
 
 
-def test_every_axis_that_could_not_be_stopped_is_told(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_axis_that_could_not_be_stopped_is_reported(moving: Moving, monkeypatch: pytest.MonkeyPatch) -> None:
     network, _, bus, _ = moving
     for node in bus.nodes:
         node.quick_stop_stays = True
@@ -350,7 +350,7 @@ def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:
     inside: list[bool] = []
 
     @contextmanager
-    def undisturbed() -> Iterator[None]:
+    def block_signals() -> Iterator[None]:
         assert EventKind.STOP not in [event.kind for event in events]
         inside.append(True)
         yield
@@ -363,12 +363,12 @@ def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:
         if EventKind.STOP in [event.kind for event in events]:
             assert inside
 
-    network.undisturbed = undisturbed
+    network.block_signals = block_signals
     bus.on_cycle = act
     with pytest.raises(DriveFault):
         run(moving, FAR)
     bus.on_cycle = lambda _cycle: None
-    network.undisturbed = nullcontext
+    network.block_signals = nullcontext
 
 
 def test_a_stop_that_is_cut_short_says_so(moving: Moving) -> None:
@@ -388,7 +388,7 @@ def test_a_stop_that_is_cut_short_says_so(moving: Moving) -> None:
     assert isinstance(cut.value.__context__, DriveFault)
 
 
-def test_amplifiers_that_were_not_seen_to_stand_go_on_watching_us(
+def test_amplifiers_that_were_not_seen_to_stop_go_on_watching_us(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network, _, bus, events = moving
@@ -413,18 +413,18 @@ def test_amplifiers_that_were_not_seen_to_stand_go_on_watching_us(
     bus.on_cycle = lambda _cycle: None
 
 
-def test_what_is_stopped_by_sdo_is_told_so_before_one_is_waited_for(
+def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network, _, bus, events = moving
-    disable, told = network.disable, []
+    disable, reported = network.disable, []
 
     def note(axis: Axis) -> None:
-        told.append([node.statusword & 0x6F for node in bus.nodes])
+        reported.append([node.statusword & 0x6F for node in bus.nodes])
         disable(axis)
 
     def deaf(_cycle: int) -> None:
-        if EventKind.STOP in [event.kind for event in events] and not told:
+        if EventKind.STOP in [event.kind for event in events] and not reported:
             for node in bus.nodes:
                 node.statusword = node.statusword & ~0x6F | 0x27
 
@@ -433,7 +433,7 @@ def test_what_is_stopped_by_sdo_is_told_so_before_one_is_waited_for(
     bus.on_cycle = deaf
     monkeypatch.setattr(network, "disable", note)
     run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
-    assert told[0] == [0x07, 0x07]
+    assert reported[0] == [0x07, 0x07]
     assert powerless(bus)
 
 

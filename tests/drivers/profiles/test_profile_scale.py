@@ -34,7 +34,7 @@ def reading(current_a: float | None, torque_nm: float | None) -> ScaleReading:
     return ScaleReading(3, "generic", 0.002, {}, current_a, torque_nm, ())
 
 
-def test_a_drive_tells_its_ampere_and_its_motor() -> None:
+def test_a_drive_reports_its_ampere_and_its_motor() -> None:
     with drive() as (access, node):
         node.objects[0x6076, 0] = (1500, 4)
         found = read_scale(access, RATED)
@@ -114,14 +114,14 @@ RATIO = st.floats(0.01, 100.0)
 def test_name_plates_agree_warn_or_refuse_by_their_ratio(
     current_a: float, torque_nm: float, ratio: float, sign: int
 ) -> None:
-    told = reading(current_a, torque_nm)
+    reported = reading(current_a, torque_nm)
     declared = sign * torque_nm / current_a / ratio
     spread = max(ratio, 1.0 / ratio)
     if spread > GROSS * 1.0001:
         with pytest.raises(ScaleImplausible, match=r"node 3.*nameplate gain"):
-            check_name_plate(told, Amplitude.RMS, declared)
+            check_name_plate(reported, Amplitude.RMS, declared)
     elif spread < GROSS * 0.9999:
-        found = check_name_plate(told, Amplitude.RMS, declared)
+        found = check_name_plate(reported, Amplitude.RMS, declared)
         if not FINE * 0.9999 < spread < FINE * 1.0001:
             assert bool(found) is (spread > FINE)
 
@@ -135,7 +135,7 @@ def test_peak_against_rms_is_recognised(ratio: float) -> None:
     assert "√2" not in other
 
 
-def test_what_a_drive_does_not_tell_is_not_compared() -> None:
+def test_what_a_drive_does_not_report_is_not_compared() -> None:
     assert check_name_plate(reading(2.0, None), Amplitude.RMS, 1e9) == ()
     assert check_name_plate(reading(None, None), Amplitude.RMS, 1e9) == ()
 

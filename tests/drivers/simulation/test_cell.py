@@ -135,7 +135,7 @@ def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(reques
         assert (0x082, bytes(8)) in master.others
 
 
-def test_saturation_is_told_in_bit_11_and_the_reference_stays_at_the_limit(request: pytest.FixtureRequest) -> None:
+def test_saturation_is_reported_in_bit_11_and_the_reference_stays_at_the_limit(request: pytest.FixtureRequest) -> None:
     spec = clean_cell()
     with running(spec, request.node.name) as (_, master):
         master.set_up(SIX)
@@ -207,11 +207,11 @@ def test_noise_of_the_reference_is_as_declared_and_on_nothing_else() -> None:
     spec = clean_cell()
     plant = Plant(spec)
     amplifiers = AmplifierSet(spec, tuned(spec, plant), ())
-    told = []
+    reported = []
     for _ in range(20_000):
         amplifiers.report()
-        told.append(amplifiers.reported_a.copy())
-    noise = np.array(told)
+        reported.append(amplifiers.reported_a.copy())
+    noise = np.array(reported)
     sigma = np.array([axis.current_noise_a for axis in spec.axes])
     np.testing.assert_allclose(noise.std(axis=0), sigma, rtol=0.08)
     lag_one = (noise[1:] * noise[:-1]).mean(axis=0) / noise.var(axis=0)

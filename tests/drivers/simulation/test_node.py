@@ -112,7 +112,7 @@ def test_synchronous_receive_pdos_wait_for_sync_and_event_driven_ones_do_not(mas
     assert master.read(1, 0x6041, 0, "H") & 0x6F == 0x23
 
 
-def test_event_driven_transmit_pdo_tells_a_change_of_state(master: Master) -> None:
+def test_event_driven_transmit_pdo_reports_a_change_of_state(master: Master) -> None:
     master.send(0x000, bytes([1, 4]))
     assert master.receive()[0] == 0x701  # boot-ups first
     for _ in range(5):
@@ -138,7 +138,7 @@ def test_a_stopped_node_is_silent_but_for_its_heartbeat(master: Master) -> None:
     assert len(master.sync(6)) == 6
 
 
-def test_heartbeats_follow_plant_time_and_tell_the_nmt_state(master: Master) -> None:
+def test_heartbeats_follow_plant_time_and_report_the_nmt_state(master: Master) -> None:
     master.set_up(SIX)
     assert master.write(5, 0x1017, 0, "H", 10) == 0
     master.send(0x000, bytes([0x80, 5]))
@@ -181,8 +181,8 @@ def test_reset_brings_back_defaults_or_what_was_saved(master: Master) -> None:
     assert master.read(6, 0x6081, 0, "I") == default
 
 
-def test_no_object_tells_the_true_gain(request: pytest.FixtureRequest) -> None:
-    told = []
+def test_no_object_reports_the_true_gain(request: pytest.FixtureRequest) -> None:
+    reported = []
     for scale in (1.0, 1.3):
         spec = clean_cell()
         axes = tuple(replace(axis, gain_nm_per_a=scale * axis.gain_nm_per_a) for axis in spec.axes)
@@ -190,6 +190,6 @@ def test_no_object_tells_the_true_gain(request: pytest.FixtureRequest) -> None:
             cell = SimulatedCell(replace(spec, axes=axes), far, STOPPED_CLOCK)
             entries = [(i, s) for i in range(0x1000, 0x7000) for s in range(9) if not 0x1400 <= i <= 0x1BFF]
             known = [key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)]
-            told.append([node.read(*key) for node in cell.nodes for key in known])
-    assert len(told[0]) > 200
-    assert told[0] == told[1]
+            reported.append([node.read(*key) for node in cell.nodes for key in known])
+    assert len(reported[0]) > 200
+    assert reported[0] == reported[1]

@@ -13,7 +13,7 @@ from tests.drivers.simulation.cells import clean_cell, running
 GAIN, SAVE, NOT_IN_THIS_STATE = 0x2003, int.from_bytes(b"save", "little"), 0x08000022
 
 
-def test_the_entered_gain_is_told_in_both_objects(request: pytest.FixtureRequest) -> None:
+def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureRequest) -> None:
     spec = clean_cell()
     axes = (replace(spec.axes[0], entered_gain_nm_per_a=-11.52), *spec.axes[1:])
     with running(replace(spec, axes=axes), request.node.name) as (_, master):

@@ -12,7 +12,7 @@ from drivers.simulation.cell import PATIENCE, SyncGate
 BOTH, LEFT = frozenset((0, 1)), frozenset((0,))
 
 
-def test_one_bus_needs_nobody() -> None:
+def test_one_bus_needs_no_node_ids() -> None:
     gate = SyncGate(1)
     assert [gate.arrive(0) for _ in range(3)] == [(LEFT,)] * 3
     assert not gate.open

@@ -24,7 +24,7 @@ def written(bus: ScriptedBus, node_id: int) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize(("cob_id", "period_us"), [(0x80, 0), (0x80, 500), (0x80 | PRODUCES, 1000), (0x85, 0)])
-def test_a_drive_is_told_last_to_produce_and_gets_its_objects_back(cob_id: int, period_us: int) -> None:
+def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us: int) -> None:
     network, bus = cell()
     node = with_sync_objects(bus.nodes[1], cob_id, period_us)
     with network:

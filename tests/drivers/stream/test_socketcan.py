@@ -165,11 +165,11 @@ def test_a_full_backlog_is_counted_to_the_frame() -> None:
                 chunks += parent.recv(1 << 20)
             except BlockingIOError:
                 break
-        told = [Record(*fields) for fields in RECORD.iter_unpack(chunks)]
-        got = sum(record.kind == Kind.FRAME for record in told)
+        reported = [Record(*fields) for fields in RECORD.iter_unpack(chunks)]
+        got = sum(record.kind == Kind.FRAME for record in reported)
         assert got < sent
-        assert got + told[-1].backlog_dropped == sent
-        lost = [record.backlog_dropped for record in told]
+        assert got + reported[-1].backlog_dropped == sent
+        lost = [record.backlog_dropped for record in reported]
         assert lost == sorted(lost)
 
 
@@ -279,7 +279,7 @@ def test_what_the_controller_says_of_itself_is_an_event(frame: bytes, kind: Even
     assert says in event.text
 
 
-def test_a_sync_of_somebody_else_is_foreign_until_we_asked_for_it() -> None:
+def test_a_sync_of_another_client_is_foreign_until_we_asked_for_it() -> None:
     frame = FRAME.pack(SYNC_COB_ID, 0, bytes(8))
     assert _dispatch(frame).foreign == {SYNC_COB_ID: 1}
 

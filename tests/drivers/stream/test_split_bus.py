@@ -205,7 +205,7 @@ def test_buses_with_file_descriptors_are_waited_for_together(name: str) -> None:
             far.shutdown()
 
 
-def test_a_strangers_sync_on_either_bus_is_foreign(pair: Pair) -> None:
+def test_a_foreign_sync_on_either_bus_is_foreign(pair: Pair) -> None:
     for wire in (pair.left, pair.right):
         link = Link(pair.address, SdoPolicy(), pair.clock, lambda _address: pair.bus)
         link.open()
@@ -282,7 +282,7 @@ def test_a_controller_that_went_off_its_bus_is_named(pair: Pair) -> None:
     assert pair.log == [("left", 0x080)]
 
 
-def test_a_node_on_the_other_bus_is_told_of_once_and_not_believed(pair: Pair) -> None:
+def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -> None:
     pair.right.coming.extend(frame(0x181, data=bytes(8)) for _ in range(3))
     pair.left.coming.append(frame(0x181, 1.0, b"mine"))
     with pytest.raises(NodeMisplaced, match=r"node 1 is heard on bus right .* has it on bus left"):

@@ -153,7 +153,7 @@ def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> Non
     assert stream.statistics == StreamStatistics(cycles=2, frames=4, foreign=3)
 
 
-def test_a_frame_that_an_axis_was_not_told_to_send_is_surplus(lockstep: Prepared) -> None:
+def test_a_frame_that_an_axis_was_not_asked_to_send_is_surplus(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     next(stream)
     bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))  # TPDO4 of node 1
@@ -529,12 +529,12 @@ def test_a_bus_that_never_falls_silent_does_not_keep_the_sync_for_ever(timed: Pr
 def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared) -> None:
     stream, bus, _ = timed
     next(stream)
-    told: list[str] = []
+    reported: list[str] = []
     for late_ns in (900_000_000, 1_100_000_000):
         bus.clock.now_ns += late_ns
         stream.advance()
-        told.append("; ".join(faults_of(stream)))  # nobody read the heartbeats either
-    assert ["read 1.1 s late" in each for each in told] == [False, True]
+        reported.append("; ".join(faults_of(stream)))  # nobody read the heartbeats either
+    assert ["read 1.1 s late" in each for each in reported] == [False, True]
 
 
 def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
@@ -568,7 +568,7 @@ def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None
     assert EventKind.FRAMES_DROPPED in [event.kind for event in events]
 
 
-def test_cycles_of_a_producer_that_goes_on_are_nobodys(followed: Followed) -> None:
+def test_cycles_of_a_producer_that_goes_on_are_no_ones(followed: Followed) -> None:
     stream, bus, producer, _ = followed
     next(stream)
     bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))  # doubled, before the next SYNC
@@ -641,7 +641,7 @@ def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise:
     assert abs(phase_ns) < window * 1000 * (1.0 + 5 * abs(noise) * period_us)
 
 
-def test_frames_that_this_machine_lost_are_counted_and_told(lockstep: Prepared) -> None:
+def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: nobody misses those
     next(stream)
@@ -651,11 +651,11 @@ def test_frames_that_this_machine_lost_are_counted_and_told(lockstep: Prepared) 
     assert stream.statistics == StreamStatistics(
         cycles=3, frames=6, kernel_dropped=2, backlog_dropped=1, interface_dropped=4
     )
-    told = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
-    assert [(event.code, event.time_ns) for event in told] == [(count, sample.time_ns) for count in (2, 4, 1)]
+    reported = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
+    assert [(event.code, event.time_ns) for event in reported] == [(count, sample.time_ns) for count in (2, 4, 1)]
 
 
-def test_what_is_to_be_known_of_the_bus_is_told_at_the_start(lockstep: Prepared) -> None:
+def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     bus.remarks = ("a small buffer",)  # type: ignore[attr-defined]
     next(stream)

@@ -34,7 +34,7 @@ def test_derivatives_of_slow_sines_are_the_sines_own() -> None:
     assert np.array_equal(data.motor_moving[1], np.abs(data.velocity_rad_s.sum(axis=0)) >= 0.1)
 
 
-def test_moves_part_where_all_joints_stand() -> None:
+def test_moves_part_where_all_joints_rest() -> None:
     run = _run()
     still = np.repeat(run.position_rad[-1:], 500, axis=0)
     position = np.concatenate((run.position_rad, still, run.position_rad[::-1]))

@@ -96,7 +96,7 @@ def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> N
     assert np.all(error_left_out(folds).left > error_left_out(seen).left)
 
 
-def test_the_effect_helps_its_axis_alone_wherever_it_is_looked_at(told: Account) -> None:
+def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(told: Account) -> None:
     before, after = told.total.before, told.total.after
     pairs = (
         (before.in_sample, after.in_sample),
@@ -119,7 +119,7 @@ def test_a_turn_that_adds_nothing_has_no_before_and_after(told: Account) -> None
     assert first == told.total
 
 
-def test_what_is_taken_out_again_is_told(start: Evidence, after: Evidence) -> None:
+def test_what_is_taken_out_again_is_reported(start: Evidence, after: Evidence) -> None:
     weights = start.estimate.gains
     back = before_after(assess(after, weights), assess(start, weights))
     assert (back.added, back.removed) == ((), (SPRING,))

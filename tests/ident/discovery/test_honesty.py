@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ident.discovery import candidates as inquiries
-from ident.discovery.candidates import Inquiry, Trial, put_to_test
+from ident.discovery.candidates import SearchProblem, Trial, score_candidates
 from ident.discovery.loop import Evidence
 from ident.discovery.search import Gates, find, judge
 from ident.effects.dictionary import EFFECTS
@@ -19,15 +19,15 @@ from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging
 from ident.effects.friction import Stribeck
 from ident.equations.linearisation import Folds, Linearisation, cut, linearise
-from tests.ident.recordings import inquiry_of, with_current
+from tests.ident.recordings import search_problem_of, with_current
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
 
 
 @pytest.fixture(scope="module")
-def inquiry(small: Evidence) -> Inquiry:
-    return inquiry_of(small)
+def search_problem(small: Evidence) -> SearchProblem:
+    return search_problem_of(small)
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +95,8 @@ def _folds_a_move(folds: Folds) -> list[int]:
 def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evidence) -> None:
     rows = small.training.run < 2
     short = replace(small, training=small.training.only(rows), datasets=small.datasets[:2])
-    inquiry = inquiry_of(short)
-    folds = inquiry.folds
+    search_problem = search_problem_of(short)
+    folds = search_problem.folds
     assert folds.moves < folds.problem.moves  # cut into pieces, as there are few
     fold = _fold_of_rows(folds)
     move = short.training.move[folds.problem.source]
@@ -104,23 +104,23 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
 
 
 def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
-    first, second = (find(inquiry_of(small), np.random.default_rng(4), GATES) for _ in range(2))
+    first, second = (find(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2))
     assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == [
         (f.effect, f.axis, f.probability, f.held_out_fall) for f in second
     ]
 
 
-def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(inquiry: Inquiry) -> None:
+def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(search_problem: SearchProblem) -> None:
     """A family is scored on each fold with the setting that the others chose, best on it or not."""
-    (tested,) = inquiry.test([tuple(Cogging(order) for order in range(1, 13))], 0)
+    (tested,) = search_problem.test([tuple(Cogging(order) for order in range(1, 13))], 0)
     scored = tested.nested()
     trials = [trial for _, trial in tested.members]
     left_out = np.stack([trial.held_out.sum(axis=1) for trial in trials])
-    for fold in range(inquiry.folds.count):
+    for fold in range(search_problem.folds.count):
         chosen = max(range(len(trials)), key=lambda index: trials[index].training_fall[fold])
         assert np.array_equal(scored[fold], trials[chosen].held_out[fold])
     # Among twelve settings that mean nothing, the best of each fold looks like an effect.
-    before = inquiry.folds.square_sum(inquiry.folds.residual).sum()
+    before = search_problem.folds.square_sum(search_problem.folds.residual).sum()
     assert left_out.min(axis=0).sum() < before
     assert scored.sum() > left_out.min(axis=0).sum()
 
@@ -132,7 +132,7 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
     changed = cut(replace(folds.problem, residual=folds.problem.residual + 5.0 * own * columns[:, 0]))
-    before, after = (put_to_test(one, columns, [slice(i, i + 1) for i in range(3)]) for one in (folds, changed))
+    before, after = (score_candidates(one, columns, [slice(i, i + 1) for i in range(3)]) for one in (folds, changed))
     for one, other in zip(before, after, strict=True):
         assert one is not None
         assert other is not None
@@ -153,7 +153,7 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     for _ in range(20):
         sign = rng.choice((-1.0, 1.0), size=(3, int(observed.move.max()) + 1))[:, observed.move]
         shuffled = with_current(small, (sign - 1.0) * noise)
-        findings = find(inquiry_of(shuffled, cache), rng, GATES, families)
+        findings = find(search_problem_of(shuffled, cache), rng, GATES, families)
         false += any(finding.passed for finding in findings)
     assert false <= 1
 
@@ -180,12 +180,14 @@ def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int =
 # of different loudness the bootstrap is a little too sure (6 to 9 % in 1500 draws): a tenth is the most allowed.
 @pytest.mark.parametrize("columns", [1, 2])
 @pytest.mark.parametrize(("moves", "least", "most"), [(12, 7, 40), (60, 7, 33)])
-def test_the_bootstrap_keeps_its_size(inquiry: Inquiry, moves: int, columns: int, least: int, most: int) -> None:
+def test_the_bootstrap_keeps_its_size(
+    search_problem: SearchProblem, moves: int, columns: int, least: int, most: int
+) -> None:
     rng = np.random.default_rng(100 * moves + columns)
     effect = Stribeck(0.1)
     false = 0
     for _ in range(400):
         trial = replace(_noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3))
-        (finding,) = judge(inquiry, [inquiries.Tested(0, ((effect, trial),))], rng, GATES)
+        (finding,) = judge(search_problem, [inquiries.TestedFamily(0, ((effect, trial),))], rng, GATES)
         false += finding.probability <= 0.05
     assert least <= false <= most

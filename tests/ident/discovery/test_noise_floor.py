@@ -77,10 +77,10 @@ def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
     drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
     relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(resting[0])
-    told = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
+    reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
     # 120 estimates: their mean is known to told/√120, their scatter to 1/√240 of itself; three of those.
-    assert relative.mean() == pytest.approx(1.0, abs=3.0 * told / np.sqrt(relative.size) + 0.01)
-    assert relative.std() == pytest.approx(told, rel=0.25)
+    assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
+    assert relative.std() == pytest.approx(reported, rel=0.25)
 
 
 def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ...]) -> None:
@@ -106,7 +106,7 @@ def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> No
     assert noise_floors(unseen, CONDITIONING) == (None,) * 6
 
 
-def test_too_few_dwells_and_a_drive_that_tells_a_constant_tell_nothing(resting: tuple[Dataset, ...]) -> None:
+def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resting: tuple[Dataset, ...]) -> None:
     (first, *_) = _noisy(resting)
     short = slice(0, 6000)
     cut = replace(

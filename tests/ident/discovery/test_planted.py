@@ -30,7 +30,7 @@ from tests.ident.recordings import (
     acting_on,
     bent,
     gathered,
-    inquiry_of,
+    search_problem_of,
     with_current,
 )
 
@@ -264,7 +264,7 @@ def test_so_it_is_on_a_smaller_arm(
 
 
 def _is_named(start: Evidence, planted: Planted, cache: ColumnCache) -> None:
-    findings = find(inquiry_of(start, cache), np.random.default_rng(0), GATES)
+    findings = find(search_problem_of(start, cache), np.random.default_rng(0), GATES)
     best = findings[0]
     assert best.passed
     names = [(placed.effect.name, placed.axis) for placed in (PlacedEffect(best.effect, best.axis), *best.ambiguity)]
@@ -290,9 +290,9 @@ def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth
     )
     turned = replace(start, model=Model(truth.model.robot, train), training=training, estimate=ml(training.system()))
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
-    findings = find(inquiry_of(turned), np.random.default_rng(0), GATES, families)
+    findings = find(search_problem_of(turned), np.random.default_rng(0), GATES, families)
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
-    same = find(inquiry_of(start, cache), np.random.default_rng(0), GATES, families)
+    same = find(search_problem_of(start, cache), np.random.default_rng(0), GATES, families)
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
 
 

@@ -37,7 +37,7 @@ def test_clean_data_get_no_effect(truth: Truth, noisy_runs: tuple[Run, ...]) -> 
 
 
 # Made by other formulas than the dictionary's: a Gaussian Stribeck bump, friction of the measured load.
-def test_low_speed_friction_is_named_and_the_unused_run_gets_better(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     runs = []
     for run in noisy_runs:
         v = _speed(run, 1)
@@ -52,7 +52,7 @@ def test_low_speed_friction_is_named_and_the_unused_run_gets_better(truth: Truth
     assert np.max(np.abs(steps[-1].after.estimate.gains / GAINS - 1.0)) < 0.02
 
 
-def test_a_spring_is_told_from_gravity(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
+def test_a_spring_is_distinguished_from_gravity(small_truth: Truth, small_runs: tuple[Run, ...]) -> None:
     """And from a hinge that begins where the joint hardly comes: that says the same with two settings more."""
     torque = [4.0 * run.position_rad[:, 2] / small_truth.gains[2] for run in small_runs]
     runs = tuple(

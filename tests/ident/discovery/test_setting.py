@@ -16,7 +16,7 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.friction import AsymmetricViscous, Stribeck, WarmUp
 from ident.effects.position import Hinge, Spring
-from tests.ident.recordings import Truth, acting_on, bent, inquiry_of
+from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
 
 FloatArray = NDArray[np.float64]
 GATES = Gates(draws=199)
@@ -32,10 +32,10 @@ def _low_speed(data: Dataset, speed_rad_s: float = 0.17) -> FloatArray:
 
 
 def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small_truth: Truth) -> None:
-    inquiry = inquiry_of(_needing(small, small_truth, _low_speed))
+    search_problem = search_problem_of(_needing(small, small_truth, _low_speed))
     families = (EFFECTS[0],)
-    best = find(inquiry, np.random.default_rng(0), GATES, families)[0]
-    effect = refined(inquiry, best.effect, best.axis, families)
+    best = find(search_problem, np.random.default_rng(0), GATES, families)[0]
+    effect = refined(search_problem, best.effect, best.axis, families)
     assert isinstance(effect, Stribeck)
     assert best.axis == 1
     assert effect.speed_rad_s == pytest.approx(0.17, rel=0.1)
@@ -46,7 +46,7 @@ def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small
     "effect", [Spring(), Cogging(3), Hinge(0.5, 1), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)]
 )
 def test_a_whole_signed_or_outermost_setting_stays(small: Evidence, effect: Effect) -> None:
-    assert refined(inquiry_of(small), effect, 1, EFFECTS) == effect
+    assert refined(search_problem_of(small), effect, 1, EFFECTS) == effect
 
 
 def test_an_effect_that_a_later_one_makes_idle_is_taken_out(small: Evidence, small_truth: Truth) -> None:

@@ -17,7 +17,7 @@ from ident.discovery.structure import detection_limits_nm
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Abscissa, Effect
 from ident.effects.unnamed import Smooth
-from tests.ident.recordings import Truth, acting_on, bent, inquiry_of
+from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
 
 FloatArray = NDArray[np.float64]
 Torque = Callable[[Dataset], FloatArray]
@@ -94,17 +94,17 @@ def test_no_variable_is_lost_because_a_part_of_its_term_is_declared(
     small: Evidence, variable: Abscissa, signed: int
 ) -> None:
     """Offset and dry friction are a constant times one and times sign(q̇): the rest of the term must still be tried."""
-    inquiry = inquiry_of(small)
+    search_problem = search_problem_of(small)
     limits = {Abscissa.VELOCITY: (0.0, 3.0), Abscissa.TIME: (0.0, 20.0)}.get(variable, (-1.0, 1.0))
     for at_rows in (False, True):
-        assert inquiry.test([(Smooth(variable, *limits, signed),)], 1, at_rows=at_rows)
+        assert search_problem.test([(Smooth(variable, *limits, signed),)], 1, at_rows=at_rows)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_detection_limit_parts_what_is_found_from_what_is_not(
     small: Evidence, small_truth: Truth, axis: int
 ) -> None:
-    limit = detection_limits_nm(inquiry_of(small), GATES)[axis]
+    limit = detection_limits_nm(search_problem_of(small), GATES)[axis]
     families = tuple(family for family in EFFECTS if family[0].name in {"cogging", "stribeck", "spring"})
 
     def found(times: float) -> tuple[str, int] | None:
@@ -113,7 +113,7 @@ def test_the_detection_limit_parts_what_is_found_from_what_is_not(
             small, small_truth, axis,
             lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[axis]),
         )  # fmt: skip
-        best = choose(find(inquiry_of(start), np.random.default_rng(0), GATES, families))
+        best = choose(find(search_problem_of(start), np.random.default_rng(0), GATES, families))
         return None if best is None else (best.effect.name, best.axis)
 
     assert found(3.0) == ("cogging", axis)

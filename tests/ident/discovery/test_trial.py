@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.discovery.candidates import Trial, put_to_test
+from ident.discovery.candidates import Trial, score_candidates
 from ident.equations.linearisation import Linearisation, cut
 
 FloatArray = NDArray[np.float64]
@@ -93,7 +93,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
     columns += 0.4 * problem.jacobian[:, :1] + 0.2 * problem.residual[:, None]
     ends = np.cumsum(widths)
     slices = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
-    for trial, chosen in zip(put_to_test(folds, columns, slices), slices, strict=True):
+    for trial, chosen in zip(score_candidates(folds, columns, slices), slices, strict=True):
         _agree(trial, _written_out(problem, columns[:, chosen]))
 
 
@@ -105,7 +105,7 @@ def test_what_the_model_says_already_is_no_candidate() -> None:
     said = j @ rng.normal(size=WIDTH)
     columns = np.stack((said, own, said + own, own, 2.0 * own, said + 1e-2 * own), axis=1)
     slices = [slice(0, 1), slice(1, 2), slice(1, 3), slice(3, 5), slice(5, 6)]
-    absorbed, good, twin, double, nearly = put_to_test(folds, columns, slices)
+    absorbed, good, twin, double, nearly = score_candidates(folds, columns, slices)
     assert absorbed is None
     assert twin is None
     assert double is None
@@ -118,7 +118,7 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     folds = cut(_problem(rng))
     problem = folds.problem
     seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
-    (trial,) = put_to_test(folds, seen, [slice(0, 1)])
+    (trial,) = score_candidates(folds, seen, [slice(0, 1)])
     assert trial is not None
     expected = _written_out(problem, seen)  # of the least size, where the others do not say: zero
     assert trial.training_fall[3] == pytest.approx(0.0, abs=1e-9)
@@ -133,7 +133,7 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
     whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
     seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
     pair = np.stack((whole, seen), axis=1)
-    (trial,) = put_to_test(folds, pair, [slice(0, 2)])
+    (trial,) = score_candidates(folds, pair, [slice(0, 2)])
     assert trial is not None
     assert trial.held_out == pytest.approx(_written_out(problem, pair).held_out, rel=1e-6)
 
@@ -142,8 +142,8 @@ def test_the_unit_of_a_candidate_does_not_matter() -> None:
     rng = np.random.default_rng(4)
     folds = cut(_problem(rng))
     columns = rng.normal(size=(len(folds.problem.motor), 2))
-    (one,) = put_to_test(folds, columns, [slice(0, 2)])
-    (other,) = put_to_test(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
+    (one,) = score_candidates(folds, columns, [slice(0, 2)])
+    (other,) = score_candidates(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])
     assert one is not None
     assert other is not None
     _agree(replace(other, score=one.score, scatter=one.scatter, gram=one.gram,

@@ -172,7 +172,7 @@ def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
     assert np.abs(correlation - np.eye(CHART.baseline - 1)).max() < 0.03
 
 
-def test_a_step_is_told_with_its_size_its_time_and_its_side() -> None:
+def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
     values = np.r_[np.full(14, -10.0), np.full(6, -9.4)]
     found = cusum(values, np.full(20, 0.04))
     assert found.alarmed
@@ -215,7 +215,7 @@ def test_one_calibration_far_off_is_a_jump() -> None:
     assert (found.alarm, calm.alarm) == (found.alarms[0], None)
 
 
-def test_an_alarm_that_has_passed_changes_nothing_of_what_is_told() -> None:
+def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
     """After a jump on the fourth day: twelve calibrations are the baseline again, that one among them."""
     values = np.full(20, 10.0)
     values[3] = 10.0 + 0.04 * DISPERSION * 6.5
@@ -228,7 +228,7 @@ def test_an_alarm_that_has_passed_changes_nothing_of_what_is_told() -> None:
     assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
 
 
-def test_a_slope_that_has_ended_is_not_told_along_its_line() -> None:
+def test_a_slope_that_has_ended_is_not_reported_along_its_line() -> None:
     """It rises by 0.7 σ a calibration for eight of them, and is back where it was."""
     values = 10.0 * (1.0 + 0.0028 * np.r_[np.arange(8), np.zeros(8)])
     assert cusum(values[:8], np.full(8, 0.04)).steady
@@ -241,7 +241,7 @@ def test_a_slope_that_has_ended_is_not_told_along_its_line() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from([10.0, 10.0, 10.05, 9.95, 10.6, 9.4]), min_size=2, max_size=30))
-def test_an_onset_is_told_in_alarm_only(values: list[float]) -> None:
+def test_an_onset_is_reported_in_alarm_only(values: list[float]) -> None:
     found = cusum(values, np.full(len(values), 0.04))
     assert found.alarmed == (found.onset is not None) == (found.alarm is not None)
     if not found.alarmed:
@@ -313,7 +313,7 @@ def test_a_drift_does_not_depend_on_unit_nor_sign(
     assert other.change_percent == pytest.approx(one.change_percent, abs=1e-6)
 
 
-def test_a_slope_is_told_along_its_line() -> None:
+def test_a_slope_is_reported_along_its_line() -> None:
     """0.7 σ a calibration from the first one on: the CUSUM's baseline goes with it, the line does not."""
     values = -10.0 * (1.0 - 0.0028 * np.arange(8))
     found = cusum(values, np.full(8, 0.04))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from ident.effects.effect import STICKING_RAD_S, curvature, way_since_reversal
+from ident.effects.effect import STICKING_RAD_S, curvature, distance_since_reversal
 from ident.effects.friction import Presliding
 from ident.effects.unnamed import INTERVALS, cubic_basis
 from tests.ident.effects.test_effects import random_signals
@@ -48,7 +48,7 @@ def test_splines_hold_every_cubic(coefficients: FloatArray) -> None:
 @given(velocity=_speeds)
 @settings(deadline=None)
 def test_the_way_grows_until_the_motion_turns(velocity: FloatArray) -> None:
-    direction, way = way_since_reversal(velocity, 100.0)
+    direction, way = distance_since_reversal(velocity, 100.0)
     turned = np.diff(direction) != 0
     assert np.all(way >= 0.0)
     assert np.all(np.diff(way)[~turned] >= -1e-12)
@@ -63,8 +63,8 @@ def test_the_way_grows_until_the_motion_turns(velocity: FloatArray) -> None:
 @given(velocity=_speeds)
 @settings(deadline=None)
 def test_the_way_is_the_same_in_the_other_direction(velocity: FloatArray) -> None:
-    direction, way = way_since_reversal(velocity, 100.0)
-    turned_direction, turned_way = way_since_reversal(-velocity, 100.0)
+    direction, way = distance_since_reversal(velocity, 100.0)
+    turned_direction, turned_way = distance_since_reversal(-velocity, 100.0)
     assert turned_way == pytest.approx(way)
     assert np.array_equal(turned_direction, -direction)
 
@@ -76,7 +76,7 @@ def test_a_bristle_lags_at_most_from_one_side_to_the_other(velocity: FloatArray,
     assume(bool(np.any(np.abs(velocity) > STICKING_RAD_S)))
     signals = replace(random_signals(0), velocity_rad_s=velocity[None])
     (lag,) = Presliding(distance_rad).columns(signals, 0)
-    direction, way = way_since_reversal(velocity, signals.rate_hz)
+    direction, way = distance_since_reversal(velocity, signals.rate_hz)
     assert np.all(lag * direction <= 1e-12)
     assert np.all(np.abs(lag) <= 2.0 * np.exp(-way / distance_rad) + 1e-12)
 

@@ -52,7 +52,7 @@ def test_results_do_not_depend_on_the_chunk(
 def test_many_moves_are_joined_and_say_the_same(
     truth: Truth, noisy_runs: tuple[Run, ...], whole: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reduction_module, "MOST_CLUSTERS", 20)
+    monkeypatch.setattr(reduction_module, "MAX_CLUSTERS", 20)
     joined = _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
     assert len(joined.moves) < len(whole.moves)
     assert ml(joined).gains == pytest.approx(ml(whole).gains, rel=1e-9)

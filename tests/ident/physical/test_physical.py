@@ -116,7 +116,7 @@ def test_a_possible_robot_keeps_its_torque(arm: Arm, seed: int, gravity: tuple[f
 @settings(deadline=None, max_examples=4, derandomize=True)
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
-def test_noise_is_projected_and_the_distance_told(arm: Arm, seed: int) -> None:
+def test_noise_is_projected_and_the_distance_reported(arm: Arm, seed: int) -> None:
     model = _model(arm)
     truth = _truth(model, seed)
     columns = model.regressor(_motion(model, 1))
