@@ -302,8 +302,8 @@ def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
     logs = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
     _fitted(few, tmp_path / "out")
     opened, closed = (open_cache(tmp_path / "out", loop) for loop in (Loop.OPEN, Loop.CLOSED))
-    assert all(opened.standing(cell) is not None for cell in logs)
-    assert all(closed.standing(cell) is None for cell in logs)
+    assert all(opened.cached(cell) is not None for cell in logs)
+    assert all(closed.cached(cell) is None for cell in logs)
 
 
 KILLED = """
