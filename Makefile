@@ -9,26 +9,28 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Linear algebra on all cores at once is slower for matrices of this size, and makes timings wander.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help setup demo test test-vcan vcan-tools check bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study effects-study tx40-study words wheel lock clean
+.PHONY: help setup demo test test-vcan vcan-tools check docs screenshots bench bench-stream ident-study gain-study paper planning-study robot-study crash-study drift-study holdout-study effects-study tx40-study words wheel lock clean
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
+	@echo "make docs    build the documentation site into out/docs, offline, warnings as errors"
+	@echo "make screenshots  refresh the pictures of the documentation from real commands; minutes"
 	@echo "make setup   make .venv alone"
 	@echo "make check   lint, types, import contracts"
 	@echo "make bench   speed and memory: against figaroh 1.0.2, growth to 4 million samples, a whole fit; minutes"
-	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/stream.md); minutes"
-	@echo "make ident-study  errors by estimator and noise floor, and whether error bars are true (docs/estimators.md); 40 min"
+	@echo "make bench-stream  six axes at 1 kHz through the stream on SocketCAN, with a busy thread beside (docs/evidence/stream.md); minutes"
+	@echo "make ident-study  errors by estimator and noise floor, and whether error bars are true (docs/evidence/estimators.md); 40 min"
 	@echo "make gain-study  the demonstration on several clean cells; minutes"
-	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/paper.md); minutes"
-	@echo "make planning-study  planned against random moves (docs/planning.md); minutes"
+	@echo "make paper   the paper's Tables 1 to 8 on the simulated cell (docs/evidence/paper.md); minutes"
+	@echo "make planning-study  planned against random moves (docs/evidence/planning.md); minutes"
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
-	@echo "make drift-study  how soon a drifting gain is told, and how often falsely (docs/history.md); a minute"
-	@echo "make holdout-study  what the hold-out gate sees of wrong gains (docs/write-back.md); a minute"
-	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/robots.md); minutes"
-	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/effects.md); two hours"
-	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/tx40.md); minutes"
+	@echo "make drift-study  how soon a drifting gain is told, and how often falsely (docs/evidence/drift.md); a minute"
+	@echo "make holdout-study  what the hold-out gate sees of wrong gains (docs/evidence/hold-out.md); a minute"
+	@echo "make robot-study  gains of a 7-axis arm and a gantry (docs/evidence/robots.md); minutes"
+	@echo "make effects-study  undeclared effects of every family: named, error before and after (docs/evidence/effects-study.md); two hours"
+	@echo "make tx40-study  the loop closed on a real robot, scored on blocks that were left out (docs/evidence/tx40.md); minutes"
 	@echo "make words   how much of the old house language is left in code, tests and docs; seconds"
 	@echo "make wheel   build dist/*.whl"
 	@echo "make lock    resolve the dependencies anew into requirements.lock"
@@ -75,6 +77,13 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: setup
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -d out/docs-doctrees docs out/docs
+
+# The pictures are committed: a build of the site runs no robot.
+screenshots: demo
+	$(BIN)/python docs/screenshots.py --demo out/demo
 
 bench: setup
 	$(BIN)/python -m tests.bench
@@ -125,7 +134,7 @@ lock:
 	@rm -rf out/lock-venv
 	@$(PYTHON) -m venv out/lock-venv
 	@out/lock-venv/bin/python -m pip install -qq uv
-	out/lock-venv/bin/uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url \
+	out/lock-venv/bin/uv pip compile pyproject.toml --group dev --group docs --universal --generate-hashes --no-emit-index-url \
 		--no-annotate --no-header --python-version 3.11 --output-file requirements.lock
 	@rm -rf out/lock-venv
 

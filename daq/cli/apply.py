@@ -192,7 +192,7 @@ def apply_verb(
 ) -> None:
     """Write identified gains into the controller file: dry run and diff first, --yes to write, with a backup.
 
-    The gates are those of the cell's `policy: {apply: ...}`; see docs/write-back.md.
+    The gates are those of the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
     declared, actor = load_cell(cell), applier(by)
     content = read(calibration)

@@ -227,7 +227,8 @@ def history_verb(
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
 
     An alarm means that a gain has changed by more than noise: a drift that adds up (CUSUM), a steady trend, or one
-    calibration far off. What it may come from is asked, not claimed. docs/history.md says how often an alarm is false.
+    calibration far off. What it may come from is asked, not claimed. docs/evidence/drift.md says how often an alarm is
+    false.
     """
     declared = load_cell(cell)
     place = _place(declared, cell)

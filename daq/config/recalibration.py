@@ -180,7 +180,7 @@ class RunModel(StrictModel):
 
 
 class RecalibrationModel(StrictModel):
-    """`recalibration`; names of files are relative to the cell file (docs/recalibration.md has an example)."""
+    """`recalibration`; paths are relative to the cell file (docs/how-to/schedule-recalibration.md has an example)."""
 
     folder: FileName | None = None
     runs: Annotated[tuple[RunModel, ...], Field(min_length=3, max_length=100)]

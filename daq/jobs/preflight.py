@@ -51,7 +51,7 @@ def section_of(cell: Cell) -> Recalibration:
             f"cell {cell.name!r}",
             found="no `recalibration`",
             expected="its runs, its interlock and how payloads are mounted",
-            remedy="complete the cell file, as in docs/recalibration.md",
+            remedy="complete the cell file, as in docs/how-to/schedule-recalibration.md",
         )
     payloads = {payload.name: payload for payload in cell.payloads}
     for index, run in enumerate(cell.recalibration.runs):

@@ -49,7 +49,7 @@ class AuditEntry:
         who: the person or the job.
         action: what happened.
         subject: what it happened to: for a write, the controller file with symbolic links followed.
-        details: plain JSON; see docs/write-back.md for what each action says.
+        details: plain JSON; see docs/reference/audit-and-history.md.
         previous: `sha256` of the entry before, `FIRST` for the first.
         sha256: of the canonical JSON of all of the above, hexadecimal.
     """

@@ -1,4 +1,4 @@
-"""`residual.json`: everything that `drivegain residual` found, by stable names (docs/residual.md)."""
+"""`residual.json`: everything that `drivegain residual` found, by stable names (docs/reference/residual-json.md)."""
 
 from __future__ import annotations
 

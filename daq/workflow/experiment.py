@@ -139,7 +139,7 @@ BoolArray = NDArray[np.bool_]
 
 NOISE_SHARE = 0.006
 """Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
-current of a lively plan, which is what a good fit leaves (docs/estimators.md)."""
+current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
 LAG_ONE = 0.67
 """Correlation of the residual from row to row, as measured on real recordings."""
 RUNS: tuple[int | None, ...] = (None, 0)

@@ -132,7 +132,7 @@ def _objects(declared: Cell) -> tuple[GainObject, ...]:
             found="no objects in the drives",
             expected="the object of each axis's gain",
             remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: ...}, ...]}` to the "
-            "cell file, one for each axis (docs/targets.md)",
+            "cell file, one for each axis (docs/how-to/write-gains.md)",
         )
     return objects
 

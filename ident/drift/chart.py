@@ -111,7 +111,7 @@ _APART = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """What raises an alarm; the defaults come of `python -m tests.studies.drift_study`, docs/history.md has its table.
+    """What raises an alarm; the defaults come from `make drift-study`, docs/evidence/drift.md has its table.
 
     Attributes:
         reference: k [σ]: half the shift that is to be found soonest.

@@ -84,7 +84,7 @@ def singular_values(matrix: FloatArray) -> FloatArray:
 # step is Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a backward
 # error
 # of some ε ‖column‖ in every column, whatever the condition number. The Gram matrix is twice as fast and squares the
-# condition number: singular values below √ε ‖W‖ are lost in it (docs/bench.md has both, measured).
+# condition number: singular values below √ε ‖W‖ are lost in it (docs/evidence/speed.md has both, measured).
 #
 # R is unique up to the sign of its rows; ‖R x‖ = ‖W x‖ for every x.
 

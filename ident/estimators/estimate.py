@@ -112,7 +112,7 @@ class Estimate:
         return of_squares(system.joints.square_sum(np.concatenate((self.gains, rest, [0.0]))), left)
 
 
-# Error bars of an autocorrelated residual: leave out one move at a time (how true they are: docs/estimators.md).
+# Error bars of an autocorrelated residual: leave out one move at a time (measured in docs/evidence/estimators.md).
 #
 # The residual of a geared robot is correlated over a move (lag one about 0.67), so rows are not independent, moves
 # nearly

@@ -1,4 +1,4 @@
-"""Prints the tables of docs/faults.md: ``python -m tests.faults``."""
+"""Prints the tables of docs/reference/faults.md: ``python -m tests.faults``."""
 
 from __future__ import annotations
 

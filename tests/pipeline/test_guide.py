@@ -1,4 +1,4 @@
-"""docs/guide.md, followed to the letter by somebody with two terminals."""
+"""docs/tutorial/guide.md, followed to the letter by somebody with two terminals."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_guide_is_followed_to_the_letter(checkout: Path, tmp_path: Path) -> 
     with socket.socket() as probe:
         if probe.connect_ex(("127.0.0.1", PORT)) == 0:
             pytest.skip(f"somebody uses port {PORT} of this machine: a simulated cell in another terminal?")
-    commands = commands_of((checkout / "docs" / "guide.md").read_text(encoding="utf-8"))
+    commands = commands_of((checkout / "docs" / "tutorial" / "guide.md").read_text(encoding="utf-8"))
     assert len(commands) > 25
     environment = os.environ | {
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
@@ -83,7 +83,7 @@ def walk(commands: list[Command], folder: Path, environment: dict[str, str], sta
             check=False,
         )
         status = done.returncode
-        where = f"docs/guide.md, line {command.line}: $ {command.text}\n{done.stdout}"
+        where = f"docs/tutorial/guide.md, line {command.line}: $ {command.text}\n{done.stdout}"
         assert "Traceback" not in done.stdout, where
         missing = shows(command.seen, done.stdout)
         assert missing is None, f"{where}\n--- the page also shows: {missing}"

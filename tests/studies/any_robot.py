@@ -2,7 +2,7 @@
 
     python -m tests.studies.any_robot
 
-writes out/any-robot.json and prints the table of docs/robots.md; some minutes on one core.
+writes out/any-robot.json and prints the table of docs/evidence/robots.md; some minutes on one core.
 """
 
 from __future__ import annotations

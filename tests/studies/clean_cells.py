@@ -1,6 +1,6 @@
 """Clean simulated cells, several seeds: how far the gains are off, and whether an effect is seen that is not there.
 
-Run by `make gain-study`; writes out/gain-study.json and prints the table of docs/estimators.md.
+Run by `make gain-study`; writes out/gain-study.json and prints the table of docs/evidence/estimators.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How often a drift of a gain is found, how soon, and how often one is found that is not there.
 
-`python -m tests.studies.drift_study` prints the tables of docs/history.md. Histories are drawn, not simulated: gains
-with normal errors whose σ is known as well as a fit of thirty moves knows it, and scatter more than that σ by a factor.
+`make drift-study` prints the tables of docs/evidence/drift.md. Histories are drawn, not simulated: gains with normal
+errors whose σ is known as well as a fit of thirty moves knows it, and scatter more than that σ by a factor.
 Every recalibration is judged as it is at the cell, from the calibrations up to that day, dispersion included.
 """
 

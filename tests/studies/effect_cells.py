@@ -13,7 +13,7 @@ from drivers.simulation.spec import CellSpec, UndeclaredEffect
 from tests.studies.study_cells import spec_of, study_cell
 
 NOISE_FACTOR = 1.59
-"""Of the clean cell's current noise: a relative error of 3.5 % without any effect (docs/estimators.md)."""
+"""Of the clean cell's current noise: a relative error of 3.5 % without any effect (docs/evidence/estimators.md)."""
 SMALL = 0.4
 
 

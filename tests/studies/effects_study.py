@@ -1,7 +1,7 @@
 """Which effects are named, how far the error falls, and what happens to the gains: cells with undeclared effects.
 
 Run by `make effects-study`; simulates what is missing (effect_runs.py), writes out/effects-study.json, and prints the
-tables of docs/effects.md. `--only single clean` takes these parts alone, from what was simulated before.
+tables of docs/evidence/effects-study.md. `--only single clean` takes these parts alone, from what was simulated before.
 
 A row is scored with what no search has seen: the two runs that were held out, and the truth of the cell.
 """
@@ -27,6 +27,7 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.identify import identify
 from tests.studies.coverage_runs import CELL
+from tests.studies.data_file import as_csv
 from tests.studies.effect_cells import APART, CLEAN, SINGLES, SMALLS, TOGETHER, EffectCase
 from tests.studies.effect_runs import OUT, load_runs, make_runs
 from tests.studies.side_by_side import side_by_side
@@ -254,7 +255,7 @@ def _is_structure_of(row: Row) -> bool:
 
 
 def table(rows: Iterable[Row]) -> str:
-    """For docs/effects.md."""
+    """For docs/evidence/effects-study.md."""
     lines = [
         "| case | named | error before → after (clean) % | worst gain before → after % |",
         "|---|---|---|---|",
@@ -292,6 +293,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     REPORT.write_text(json.dumps({"rows": [*kept, *(asdict(row) for row in rows)]}, indent=1) + "\n")
     _print_line(table(rows))
+    REPORT.with_suffix(".csv").write_text(as_csv(table(rows)), encoding="utf-8")
     for line in verdicts(rows):
         _print_line(line)
     return 0

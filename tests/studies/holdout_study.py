@@ -1,6 +1,6 @@
 """What the hold-out tells of the gains beside an effect: of right ones, and of one that is wrong among them.
 
-`python -m tests.studies.holdout_study` prints the figures of docs/write-back.md. Sessions obey the declared model and a
+`make holdout-study` prints the figures of docs/evidence/hold-out.md. Sessions obey the declared model and a
 low-speed friction that it lacks; the loop finds it. Each session is fitted twice: for a cell whose nameplate is 2 to
 20 % off, and for one whose nameplate is true. Then one gain is made wrong, and all the rest is refitted to it.
 """

@@ -1,7 +1,7 @@
 """How far the gains are off, by estimator and noise floor, and whether the error bars are true.
 
 Run by `make ident-study`; records what is missing (record_study.py, over the real driver path; coverage_runs.py, the
-plant alone), writes out/ident-study.json and prints the tables of docs/estimators.md.
+plant alone), writes out/ident-study.json and prints the tables of docs/evidence/estimators.md.
 """
 
 from __future__ import annotations

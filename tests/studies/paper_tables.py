@@ -2,7 +2,7 @@
 
 `python -m tests.studies.paper_tables --seeds 1 2 3` records what is missing, fits every case, validates all of them on
 runs that no fit has seen, and puts the tables of the first seed and the order of merit over all of them into
-docs/paper.md, between its two marks. Everything goes through the command line, as a technician would do it.
+docs/evidence/paper.md, between its two marks. Everything goes through the command line, as a technician would do it.
 """
 
 from __future__ import annotations
@@ -29,13 +29,16 @@ from daq.workflow.record import record
 from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Body
+from tests.studies.data_file import as_csv
 from tests.studies.fingerprint import digest, finish, is_finished
 from tests.studies.paper_figures import paper_table
 from tests.studies.record_study import CELL, FLOORS, OUT, PROCESSES, StudyLogs, record_study
 from tests.studies.study_cells import declared_payload, spec_of, study_cell, study_masses
 
 FOLDER = Path("out/paper")
-PAGE = Path("docs/paper.md")
+PAGE = Path("docs/evidence/paper.md")
+DATA = Path("docs/evidence/data")
+"""Folder of the tables, a CSV file each."""
 MARKS = ("<!-- made by `make paper`: begin -->", "<!-- made by `make paper`: end -->")
 FLOOR = "3.5"
 RATIO = 20
@@ -186,16 +189,16 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
     )
 
 
-def page_of(folder: Path, merits: dict[int, dict[str, Merit]]) -> str:
-    """The made part of docs/paper.md: each table of a cell, the paper's beneath it."""
-    sections = []
+def write_tables(folder: Path, data: Path) -> None:
+    """Write each table of a cell as CSV, and the paper's own beside it."""
+    tables = []
     for file in (folder / "cases" / "tables.md", folder / "tables.md"):
-        _, *tables = file.read_text(encoding="utf-8").split("\n## ")
-        sections += [f"## {table.strip()}\n" for table in tables]
-    parts = [merit_table(merits).markdown()]
-    for number, section in enumerate(sections, start=1):
-        parts += [section, paper_table(number).markdown().replace("## the", "### The", 1)]
-    return "\n".join(parts)
+        tables += file.read_text(encoding="utf-8").split("\n## ")[1:]
+    data.mkdir(exist_ok=True)
+    for number, table in enumerate(tables, start=1):
+        (data / f"paper-{number}.csv").write_text(as_csv(table), encoding="utf-8")
+        published = as_csv(paper_table(number).markdown())
+        (data / f"paper-{number}-published.csv").write_text(published, encoding="utf-8")
 
 
 def _print_line(line: str) -> None:
@@ -213,10 +216,11 @@ def main(arguments: list[str] | None = None) -> int:
     logs = record_study(options.seeds, (options.floor,), processes=options.processes, report_line=_print_line)
     merits = {cell.seed: one(cell) for cell in logs}
     before, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
-    made = page_of(FOLDER / str(options.seeds[0]), merits)
+    made = merit_table(merits).markdown()
     after = rest.split(MARKS[1])[1]
     PAGE.write_text(f"{before}{MARKS[0]}\n\n{made}\n{MARKS[1]}{after}", encoding="utf-8")
-    _print_line(merit_table(merits).markdown())
+    write_tables(FOLDER / str(options.seeds[0]), DATA)
+    _print_line(made)
     return 0
 
 

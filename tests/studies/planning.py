@@ -1,4 +1,4 @@
-"""How much better planned moves are than random ones: the table of docs/planning.md.
+"""How much better planned moves are than random ones: the table of docs/evidence/planning.md.
 
     python -m tests.studies.planning
 

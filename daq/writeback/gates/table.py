@@ -2,7 +2,7 @@
 
 The gates of a gain are in `gain_gates` and `axis_gates`, of the fit in `fit_gates`, of the logs in `source_gates` and
 `role_gates`, of the controller's file and of who stands for the calibration in `base_gate` and `signature_gate`.
-docs/write-back.md has them in a table.
+docs/reference/gates.md has them in a table.
 """
 
 from __future__ import annotations

@@ -89,9 +89,8 @@ def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> No
 @pytest.mark.parametrize("name", NAMES)
 def test_the_page_of_the_drives_names_every_profile(name: str, checkout: Path) -> None:
     profile = profile_of(name)
-    row = next(
-        line for line in (checkout / "docs/drives.md").read_text(encoding="utf-8").splitlines() if f"`{name}`" in line
-    )
+    page = (checkout / "docs/reference/drive-profiles.md").read_text(encoding="utf-8")
+    row = next(line for line in page.splitlines() if f"`{name}`" in line)
     for reported in (str(profile.current), profile.amplitude.value, profile.current_scale.form.value):
         assert reported in row
     assert ("ACTUAL" in row) is (profile.tap is TapPoint.ACTUAL)

@@ -18,7 +18,7 @@ from daq.errors import SchemaMismatch
 from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, resumable_session, save, sessions
 from tests.daq.jobs.rig import BEGAN, make_rig
 
-DOCUMENT = Path(__file__).parents[3] / "docs" / "recalibration.md"
+DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "schedule-recalibration.md"
 
 
 def changed(tmp_path: Path, **section: Any) -> Path:

@@ -241,7 +241,7 @@ def test_the_document_has_the_numbers_of_the_rows(closed: Closed) -> None:
 def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) -> None:
     document = closed.document()
     finding, turn = document["turns"][0]["findings"][0], document["turns"][0]
-    described = (checkout / "docs" / "residual.md").read_text(encoding="utf-8")
+    described = (checkout / "docs" / "reference" / "residual-json.md").read_text(encoding="utf-8")
     named = (document, turn, finding, document["before"], document["gain_changes"][0], document["noise_floor"])
     for key in {key for part in named for key in part}:
         assert f"`{key}`" in described, key

@@ -1,0 +1,279 @@
+"""Sphinx extension that fills the reference pages from the code, so that they cannot disagree with it.
+
+A page asks for a part with a line of its own, ``<!-- generated: NAME -->``; `PARTS` maps each name to a function that
+returns Markdown. The JSON schemas of the file formats are written beside the pages, into ``schemas/``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+from pydantic import BaseModel, TypeAdapter
+from sphinx.application import Sphinx
+
+from daq.cli.app import build_app
+from daq.config.cell_schema import CellModel
+from daq.config.drive import DriveModel
+from daq.config.import_description import ImportModel
+from daq.errors import DaqError, exit_code
+from daq.simulation.simulation_file import SimulationModel
+from daq.workflow.calibration_file import CalibrationDocument
+from drivers.errors import DriverError
+from ident.errors import IdentificationError
+
+SCHEMAS: dict[str, tuple[str, type[BaseModel]]] = {
+    "cell": ("Cell file", CellModel),
+    "drive-profile": ("Drive profile", DriveModel),
+    "calibration": ("Calibration", CalibrationDocument),
+    "import": ("Import description", ImportModel),
+    "simulation": ("Simulation file", SimulationModel),
+}
+"""File formats by the name of their schema: title and model."""
+FRONT_DOORS = ("ident", "daq", "drivers")
+MARK = re.compile(r"^<!-- generated: ([a-z ]+) -->$", re.MULTILINE)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the hooks."""
+    app.connect("source-read", _fill)
+    app.connect("build-finished", _write_schemas)
+    # Before napoleon (priority 500), which adds markup of its own.
+    app.connect("autodoc-process-docstring", _escape_docstring, priority=400)
+    app.connect("autodoc-process-signature", _shorten_types)
+    return {"parallel_read_safe": True}
+
+
+def _fill(_app: Sphinx, _name: str, source: list[str]) -> None:
+    source[0] = MARK.sub(lambda mark: PARTS[mark[1]](), source[0])
+
+
+def _write_schemas(app: Sphinx, error: Exception | None) -> None:
+    if error is not None or app.builder.format != "html":
+        return
+    folder = Path(app.outdir) / "schemas"
+    folder.mkdir(exist_ok=True)
+    for name, (title, model) in SCHEMAS.items():
+        schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **_schema(model), "title": title}
+        (folder / f"{name}.json").write_text(json.dumps(schema, indent=2) + "\n", encoding="utf-8")
+
+
+def _escape_docstring(_app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
+    """Take `|x|`, `a*b` and `name_` in a docstring for text, not for reStructuredText."""
+    for number, line in enumerate(lines):
+        parts = re.split(r"(``.+?``|`[^`]+`)", line)
+        parts[::2] = [re.sub(r"(?<!\w)\*(?=\w)|(?<=\w)_(?!\w)|[|]|(?<=\w)\*", r"\\\g<0>", part) for part in parts[::2]]
+        parts[1::2] = [part if part.startswith("``") else f"`{part}`" for part in parts[1::2]]
+        lines[number] = "".join(parts)
+
+
+def _shorten_types(
+    _app: Sphinx, _kind: str, _name: str, _object: Any, _options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Write `FloatArray` and `NDArray[int64]` for the types that they are short for."""
+
+    def short(text: str | None) -> str | None:
+        if text is None:
+            return None
+        text = re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text)
+        return re.sub(
+            r"(?:~?numpy\.)?ndarray\[tuple\[.*?\], (?:~?numpy\.)?dtype\[(?:~?numpy\.)?(\w+)\]\]", r"NDArray[\1]", text
+        )
+
+    return short(signature), short(returned)
+
+
+# --- the command line
+
+
+def command_line() -> str:
+    """Every verb with its help, usage, arguments and options."""
+    group: Any = typer.main.get_command(build_app())
+    context = typer.Context(group, info_name="drivegain")
+    verbs = [(name, group.resolve_command(context, [name])[1]) for name in group.list_commands(context)]
+    return "\n\n".join(_command(verb, f"drivegain {name}", context, level=2) for name, verb in verbs)
+
+
+# typer brings a click of its own, whose classes have no public name; hence Any.
+def _command(command: Any, name: str, parent: typer.Context, level: int) -> str:
+    context = typer.Context(command, info_name=name.rpartition(" ")[2], parent=parent)
+    usage = " ".join(command.collect_usage_pieces(context))
+    parts = [f"{'#' * level} {name}", _paragraphs(command.help or ""), f"```text\n{name} {usage}\n```"]
+    records = [record for record in (one.get_help_record(context) for one in command.get_params(context)) if record]
+    parts += [f"`{term.strip()}`\n: {_escaped(' '.join(text.split())) or '—'}" for term, text in records]
+    if command.epilog and "Example:" in command.epilog:
+        example = command.epilog.partition("Example:")[2].strip()
+        parts.append(f"Example:\n\n```console\n$ {example}\n```")
+    kinds = getattr(command, "commands", {})
+    parts += [_command(kind, f"{name} {kind_name}", context, level + 1) for kind_name, kind in kinds.items()]
+    return "\n\n".join(part for part in parts if part)
+
+
+def _paragraphs(text: str) -> str:
+    return "\n\n".join(_escaped(" ".join(part.split())) for part in inspect.cleandoc(text).split("\n\n"))
+
+
+def _escaped(text: str) -> str:
+    """Plain text as Markdown that shows exactly it."""
+    return re.sub(r"([\\`*_{}\[\]<>#|$])", r"\\\1", text.replace("\b", ""))
+
+
+# --- files
+
+
+def cell_file() -> str:
+    """Every section of a cell file: keys, types and defaults."""
+    return _sections(_schema(CellModel))
+
+
+def schema_list() -> str:
+    """Links to the JSON schemas."""
+    return "\n".join(
+        f'- <a href="../schemas/{name}.json">{name}.json</a>: {title.lower()}' for name, (title, _) in SCHEMAS.items()
+    )
+
+
+def _schema(model: type[BaseModel]) -> dict[str, Any]:
+    return TypeAdapter(model).json_schema()
+
+
+def _sections(schema: dict[str, Any]) -> str:
+    definitions: dict[str, Any] = schema.get("$defs", {})
+    sections: list[tuple[str, str, dict[str, Any]]] = []
+    seen: set[str] = set()
+
+    def visit(path: str, reference: str | None, node: dict[str, Any]) -> None:
+        if reference in seen:
+            return
+        if reference is not None:
+            seen.add(reference)
+        if "properties" in node:
+            sections.append((path, reference or "", node))
+        for key, child in node.get("properties", {}).items():
+            inner = f"{path}.{key}" if path else key
+            for name, many in _references(child):
+                visit(inner + ("[]" if many else ""), name, definitions[name])
+
+    visit("", None, schema)
+    anchors = {reference: path for path, reference, _ in sections}
+    return "\n\n".join(_section(path, node, anchors, definitions) for path, _, node in sections)
+
+
+def _section(path: str, node: dict[str, Any], anchors: dict[str, str], definitions: dict[str, Any]) -> str:
+    lines = [f"## {f'`{path}`' if path else 'The whole file'}", _paragraphs(_first(node.get("description", "")))]
+    rows = ["| key | value | default |", "| --- | --- | --- |"]
+    required = set(node.get("required", ()))
+    for key, child in node["properties"].items():
+        default = "*required*" if key in required else _default(child.get("default"))
+        meaning = _escaped(child["description"]) + " " if "description" in child else ""
+        rows.append(f"| `{key}` | {meaning}{_value(child, anchors, definitions)} | {default} |")
+    return "\n\n".join([*filter(None, lines), "\n".join(rows)])
+
+
+def _first(description: str) -> str:
+    """The paragraphs before the list of attributes."""
+    return re.split(r"\n\s*Attributes:", inspect.cleandoc(description))[0]
+
+
+def _references(node: Any, many: bool = False) -> Iterator[tuple[str, bool]]:
+    if not isinstance(node, dict):
+        return
+    if "$ref" in node:
+        yield node["$ref"].rpartition("/")[2], many
+    for key in ("anyOf", "oneOf", "allOf", "prefixItems"):
+        for child in node.get(key, ()):
+            yield from _references(child, many)
+    for key in ("items", "additionalProperties"):
+        yield from _references(node.get(key), True)
+
+
+def _value(node: dict[str, Any], anchors: dict[str, str], definitions: dict[str, Any]) -> str:
+    """A schema in words."""
+    if "$ref" in node:
+        name = node["$ref"].rpartition("/")[2]
+        return f"section `{anchors[name]}`" if name in anchors else _value(definitions[name], anchors, definitions)
+    for key in ("anyOf", "oneOf", "allOf"):
+        if key in node:
+            kinds = [_value(one, anchors, definitions) for one in node[key] if one.get("type") != "null"]
+            return " or ".join(dict.fromkeys(kinds))
+    if "enum" in node or "const" in node:
+        return ", ".join(f"`{one}`" for one in node.get("enum", [node.get("const")]))
+    if node.get("type") in ("array", "object"):
+        parts = node.get("prefixItems") or [node.get("items") or node.get("additionalProperties") or {}]
+        inner = ", ".join(dict.fromkeys(_value(one, anchors, definitions) for one in parts))
+        size = f"{len(parts)} ×" if "prefixItems" in node else "list of" if node["type"] == "array" else "mapping to"
+        return f"{size} {inner}"
+    words = {"string": "text", "boolean": "`true` or `false`", "number": "number", "integer": "whole number"}
+    bounds = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    limits = [f"{sign} {node[key]}" for key, sign in bounds.items() if key in node]
+    kind = node.get("type")
+    return ", ".join([words.get(kind, "anything") if isinstance(kind, str) else "anything", *limits])
+
+
+def _default(value: Any) -> str:
+    if value is None or value in ({}, []):
+        return "none"
+    if isinstance(value, dict):
+        return "the section's defaults"
+    return f"`{json.dumps(value)}`"
+
+
+# --- errors and the library
+
+
+def errors() -> str:
+    """Every error class under its exit code."""
+    found: dict[int, list[type[BaseException]]] = {}
+    for root in (DaqError, DriverError, IdentificationError):
+        for one in _subclasses(root):
+            found.setdefault(int(exit_code(one) or 1), []).append(one)
+    parts = []
+    for code, classes in sorted(found.items()):
+        rows = [f"- `{one.__name__}`: {_escaped(_summary(one))}" for one in sorted(classes, key=lambda c: c.__name__)]
+        parts.append(f"### Exit code {code}\n\n" + "\n".join(rows))
+    return "\n\n".join(parts)
+
+
+def _subclasses(root: type[BaseException]) -> Iterator[type[BaseException]]:
+    for child in root.__subclasses__():
+        yield child
+        yield from _subclasses(child)
+
+
+def _summary(thing: Any) -> str:
+    return (inspect.getdoc(thing) or "").partition("\n")[0].rstrip(".")
+
+
+def api() -> str:
+    """The front doors: everything that `__all__` of each package exports."""
+    parts = []
+    for name in FRONT_DOORS:
+        package = importlib.import_module(name)
+        exported = getattr(package, "__all__", ())
+        members = "\n   :members:\n   :imported-members:" if exported else ""
+        parts.append(f"## `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```")
+    return "\n\n".join(parts)
+
+
+def glossary() -> str:
+    """The glossary's place in the navigation, once there is one."""
+    if not (Path(__file__).parent / "glossary.md").exists():
+        return ""
+    return "```{toctree}\n:hidden:\n\nglossary\n```"
+
+
+PARTS: dict[str, Callable[[], str]] = {
+    "command line": command_line,
+    "cell file": cell_file,
+    "schemas": schema_list,
+    "errors": errors,
+    "api": api,
+    "glossary": glossary,
+}
+"""What a page can ask for."""

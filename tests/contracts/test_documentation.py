@@ -1,0 +1,68 @@
+"""The documentation: its size, and that files and messages name pages that exist."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+LARGEST_WORDS = 30_000
+LARGEST_PICTURE_BYTES = 150_000
+COMING = {"docs/glossary.md"}
+"""Written at this moment; to be taken out when it is there."""
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+
+
+def test_the_documentation_stays_short() -> None:
+    """Words as `wc -w` counts them, decisions and evidence included."""
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= LARGEST_WORDS
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_pages_named_in_code_and_messages_exist() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split(
+        "\n"
+    )
+    places = [name for name in listed if re.search(r"\.(py|md|yaml|toml|svg)$|^Makefile$", name)]
+    named = 0
+    for place in places:
+        text = (ROOT / place).read_text(encoding="utf-8") if (ROOT / place).exists() else ""
+        for found in re.findall(r"\bdocs/[\w./-]+", text):
+            page = found.rstrip(".")
+            # A decision may be named by its number alone.
+            exists = page in COMING or (ROOT / page).exists() or any(ROOT.glob(f"{page}-*.md"))
+            assert exists, f"{place} names {page}"
+            named += 1
+    assert named > 20
+
+
+def test_files_named_in_the_documentation_exist() -> None:
+    named = 0
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
+        text = page.read_text(encoding="utf-8")
+        for name in re.findall(r"`((?:daq|ident|drivers|tests|configs)/[\w./-]+)`", text):
+            # NAME is for the reader to fill in.
+            assert "NAME" in name or (ROOT / name).exists(), f"{page.relative_to(ROOT)} names {name}"
+            named += 1
+    assert named > 20
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    toctrees = "\n".join(
+        block for page in PAGES for block in re.findall(r"```\{toctree\}(.*?)```", page.read_text(), re.DOTALL)
+    )
+    reached = {line.strip().rpartition("/")[2] for line in toctrees.splitlines()}
+    for page in PAGES:
+        if page.parent.name != "decisions" and page.stem not in ("index", "glossary"):
+            assert page.stem in reached, page
+
+
+def test_pictures_are_small_and_load_nothing() -> None:
+    pictures = [one for one in (ROOT / "docs" / "pictures").iterdir() if one.is_file()]
+    assert pictures
+    for picture in pictures:
+        assert picture.stat().st_size < LARGEST_PICTURE_BYTES, picture
+        if picture.suffix == ".svg":
+            addresses = re.findall(r"https?://[^\"')\s]+", picture.read_text(encoding="utf-8"))
+            assert set(addresses) <= {"http://www.w3.org/2000/svg"}, picture
