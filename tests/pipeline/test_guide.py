@@ -1,4 +1,4 @@
-"""docs/tutorial/guide.md, followed to the letter by somebody with two terminals."""
+"""docs/tutorial/guide.md, followed to the letter, in two terminals."""
 
 from __future__ import annotations
 
