@@ -1,10 +1,13 @@
-"""The counter behind `make words`: identifiers, broken lines and docstrings count, technical words do not."""
+"""The counter behind `make words`: identifiers, broken lines and docstrings count,
+technical words do not. The glossary is true."""
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from tests.words import BASELINE, DOCSTRING, PHRASES, Source, count, working_tree
+from tests.words import BASELINE, DOCSTRING, PHRASES, ROOT, Source, count, working_tree
 
 
 @pytest.mark.parametrize(
@@ -52,3 +55,12 @@ def test_the_working_tree_is_read() -> None:
     paths = {source.path for source in working_tree()}
     assert {"README.md", "Makefile", "daq/__init__.py", "tests/conftest.py"} <= paths
     assert not {"LICENSE", "tests/words.py"} & paths
+
+
+def test_every_identifier_of_the_glossary_is_in_the_code() -> None:
+    files = (file for folder in ("daq", "ident", "drivers") for file in (ROOT / folder).rglob("*.py"))
+    code = {name for file in files for name in re.findall(r"\w+", file.read_text())} | {"daq", "drivers"}
+    rows = re.findall(r"^\|.*\| (`.*`) \|$", (ROOT / "docs" / "glossary.md").read_text(), re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+    assert len(named) > 100
+    assert sorted(name for name in named if not set(name.split(".")) <= code) == []
