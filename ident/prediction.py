@@ -29,7 +29,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         data: the motion, and what is mounted.
 
     Returns:
-        joint torque [Nm; N for a prismatic joint] at full rate, shape (n, k).
+        joint torque [Nm; N for a prismatic joint] at full rate, shape (k, n).
 
     Raises:
         ModelError: the calibration speaks of another robot.
@@ -46,7 +46,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         columns = placed.effect.columns(run, placed.axis)
         at_all = at_joints(placed.effect, placed.axis, columns, model.drive_train)
         torque += np.einsum("p,npk->nk", coefficients, at_all)
-    return torque
+    return np.asarray(torque.T)
 
 
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
@@ -55,19 +55,19 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     Args and errors as of `predict_torque`.
 
     Returns:
-        current references [A] at full rate, shape (n, k).
+        current references [A] at full rate, shape (k, n).
     """
     torque = predict_torque(calibration, model, data)
-    return np.asarray(model.drive_train.to_motor @ torque / _gains(calibration, model)[:, None])
+    return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
 def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
-    """Y = V g (eq. 4 through R): joint torque [Nm] from current references [A], both of shape (n, k).
+    """Y = V g (eq. 4 through R): joint torque [Nm] from current references [A], both of shape (k, n).
 
     Raises:
         ModelError: the calibration has another number of gains.
     """
-    return np.asarray(model.drive_train.direction.T @ (_gains(calibration, model)[:, None] * current_a))
+    return np.asarray((_gains(calibration, model) * current_a) @ model.drive_train.direction)
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:

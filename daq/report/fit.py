@@ -144,7 +144,7 @@ def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: Pl
     along = values(placed.effect.abscissa, seen, placed.axis, other_axis(placed.effect))
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along, data.velocity_rad_s[placed.axis])
+        for column in (along, data.velocity_rad_s[:, placed.axis])
     )
     use = rows_after.use[placed.axis, chosen]
     residuals = (

@@ -178,7 +178,7 @@ class Experiment:
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
-        motion = Motion(*(np.concatenate([part[kind] for part in parts]).T for kind in range(3)))
+        motion = Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
         use = np.concatenate([self._use(path, time) for path, time in zip(paths, times, strict=True)], axis=1)
         ends = np.cumsum([len(time) for time in times])
         slices = tuple(slice(end - len(time), end) for end, time in zip(ends.tolist(), times, strict=True))
@@ -267,7 +267,7 @@ def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> 
     for start, end in pairwise(targets):
         path = synchronised(start, end, velocity, acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
-    return Motion(*(np.concatenate([part[kind] for part in parts]).T for kind in range(3)))
+    return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
 
 
 def _rows(cell: Cell) -> tuple[float, float]:

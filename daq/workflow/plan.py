@@ -177,7 +177,7 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
 def _levers(experiment: Experiment, postures: FloatArray, axis: int) -> FloatArray:
     """Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m]."""
     robot = experiment.design.expectation.model.robot
-    at = poses(robot, postures.T)
+    at = poses(robot, postures)
     way = at.origin_m[-1] - at.origin_m[axis + 1]
     if robot.joints[axis].kind is JointKind.PRISMATIC:
         return np.asarray(np.linalg.norm(way, axis=1))

@@ -198,8 +198,8 @@ def predicted(
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
-        measured_nm=filter_(measured_torque(calibration, model, data.current_a)),
-        predicted_nm=filter_(predict_torque(calibration, model, data)),
+        measured_nm=filter_(measured_torque(calibration, model, data.current_a).T),
+        predicted_nm=filter_(predict_torque(calibration, model, data).T),
         use=use,
     )
 

@@ -24,7 +24,7 @@ LONGEST_MOVE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A differentiated run; arrays are joint-first, shape (n, k), contiguous in time.
+    """A run with derivatives; arrays have the shape (k, n), and each axis is contiguous in memory.
 
     Attributes:
         name: of the run.
@@ -55,8 +55,8 @@ class Dataset:
     started_s: float | None = None
 
     def motion(self, part: slice = slice(None)) -> Motion:
-        """Of some of the samples."""
-        return Motion(self.position_rad[:, part], self.velocity_rad_s[:, part], self.acceleration_rad_s2[:, part])
+        """Motion of the joints over some of the samples."""
+        return Motion(self.position_rad[part], self.velocity_rad_s[part], self.acceleration_rad_s2[part])
 
 
 def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
@@ -81,7 +81,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     moving = np.abs(velocity) >= speed_limit
     # A motor's speed is told as that of its joint, which need not have its number.
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
-    valid = np.ones_like(moving) if run.valid is None else np.ascontiguousarray(run.valid.T[:, 1:-1])
+    valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
     # One move holds all joints: without a log of moves, they part where every joint stands still.
     move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
     move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
@@ -89,12 +89,12 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         name=run.name,
         rate_hz=rate,
         time_s=run.time_s[1:-1],
-        position_rad=np.ascontiguousarray(position),
-        velocity_rad_s=velocity,
-        acceleration_rad_s2=acceleration,
-        current_a=np.ascontiguousarray(run.current_a.T[:, 1:-1], dtype=np.float64),
-        moving=moving,
-        motor_moving=motor_moving,
+        position_rad=np.ascontiguousarray(position).T,
+        velocity_rad_s=velocity.T,
+        acceleration_rad_s2=acceleration.T,
+        current_a=np.asfortranarray(run.current_a[1:-1], dtype=np.float64),
+        moving=moving.T,
+        motor_moving=motor_moving.T,
         valid=valid,
         move=move,
         payload=run.payload,
@@ -106,24 +106,24 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     """A motion that nobody has recorded, for `ident.prediction`: joints, speeds and accelerations as they are given.
 
     Args:
-        motion: q, q̇ and q̈ of n joints over k samples, shape (n, k) each.
+        motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each.
         rate_hz: sampling rate.
         payload: what is mounted, None without load.
     """
-    count, samples = motion.position_rad.shape
-    everywhere = np.ones((count, samples), dtype=np.bool_)
+    shape = motion.position_rad.shape
+    everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
         name="planned motion",
         rate_hz=rate_hz,
-        time_s=np.arange(samples) / rate_hz,
+        time_s=np.arange(shape[0]) / rate_hz,
         position_rad=motion.position_rad,
         velocity_rad_s=motion.velocity_rad_s,
         acceleration_rad_s2=motion.acceleration_rad_s2,
-        current_a=np.zeros((count, samples)),
+        current_a=np.zeros(shape),
         moving=everywhere,
         motor_moving=everywhere,
         valid=everywhere,
-        move=np.zeros(samples, dtype=np.int64),
+        move=np.zeros(shape[0], dtype=np.int64),
         payload=payload,
     )
 

@@ -74,16 +74,16 @@ def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tup
     Raises:
         DataUnfit: a run is too short for the filter.
     """
-    return tuple(_floor(datasets, conditioning, motor) for motor in range(len(datasets[0].current_a)))
+    return tuple(_floor(datasets, conditioning, motor) for motor in range(datasets[0].current_a.shape[1]))
 
 
 def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> NoiseFloor | None:
     dwells = [
-        _variance(row_filter(data, conditioning), data.current_a[motor, part])
+        _variance(row_filter(data, conditioning), data.current_a[part, motor])
         for data in datasets
-        for part in _standstills(~data.motor_moving[motor] & data.valid[motor])
+        for part in _standstills(~data.motor_moving[:, motor] & data.valid[:, motor])
         if row_filter(data, conditioning).rows(part.stop - part.start) > _TREND
-        and np.ptp(data.current_a[motor, part]) > 0.0
+        and np.ptp(data.current_a[part, motor]) > 0.0
     ]
     if len(dwells) < MIN_DWELLS:
         return None

@@ -105,10 +105,10 @@ def declared_signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
         session_s=data.time_s - data.time_s[0] + _into_the_session_s(data, session_began_s),
-        position_rad=data.position_rad,
-        velocity_rad_s=data.velocity_rad_s,
-        acceleration_rad_s2=data.acceleration_rad_s2,
-        motor_position_rad=model.drive_train.ratio @ data.position_rad,
+        position_rad=data.position_rad.T,
+        velocity_rad_s=data.velocity_rad_s.T,
+        acceleration_rad_s2=data.acceleration_rad_s2.T,
+        motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
         inertia_kg_m2=_inertia_of_joints(model, data, standard * inertial),
         load_torque_nm=np.concatenate(load, axis=1),
         geared_torque_nm=np.concatenate(geared, axis=1),
@@ -132,14 +132,14 @@ def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:
 
 def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
     """Mass matrix of links and payload, shape (n, n, k), drawn between few postures because it changes slowly."""
-    samples, count = len(data.time_s), len(data.position_rad)
+    samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
-    position = np.ascontiguousarray(data.position_rad[:, postures])
+    position = data.position_rad[postures]
     still = np.zeros_like(position)
     weight = load @ model.regressor(Motion(position, still, still))
     mass = np.empty((count, count, samples))
     for joint, unit in enumerate(np.eye(count)):
-        moved = Motion(position, still, np.repeat(unit[:, None], len(postures), axis=1))
+        moved = Motion(position, still, np.repeat(unit[None], len(postures), axis=0))
         column = load @ model.regressor(moved) - weight
         for row, along in enumerate(column):
             mass[row, joint] = np.interp(np.arange(samples), postures, along)

@@ -48,8 +48,8 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
     # A row's share of standstill is weighted as the filter weights its samples.
     window = Decimator(np.abs(filter_.taps) / np.abs(filter_.taps).sum(), filter_.factor)
     share = conditioning.standstill_share
-    use = (window((~data.moving).astype(np.float64)) <= share) & (window((~data.valid).astype(np.float64)) == 0.0)
-    motor_still = window((~data.motor_moving).astype(np.float64)) > share
+    use = (window((~data.moving.T).astype(np.float64)) <= share) & (window((~data.valid.T).astype(np.float64)) == 0.0)
+    motor_still = window((~data.motor_moving.T).astype(np.float64)) > share
     # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
     needed = np.abs(drive_train.to_motor) > 0
     turned = np.abs(drive_train.direction) > 0
@@ -115,7 +115,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         piece = slice(first, first + standard.shape[2])
         first = piece.stop
         yield Rows(
-            current=filter_(data.current_a[:, part]),
+            current=filter_(data.current_a[part].T),
             standard=standard,
             use=use[:, piece],
             motor_use=motor_use[:, piece],

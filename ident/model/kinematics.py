@@ -25,14 +25,14 @@ class Poses:
     origin_m: FloatArray
 
 
-def poses(robot: Robot, position: FloatArray) -> Poses:
+def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     """Forward kinematics.
 
     Args:
         robot: n joints.
-        position: of the joints [rad or m], shape (n, k).
+        position_rad: of the joints [rad; m for a prismatic joint], shape (k, n).
     """
-    count, samples = position.shape
+    samples, count = position_rad.shape
     rotation = np.empty((count + 1, samples, 3, 3))
     origin = np.empty((count + 1, samples, 3))
     rotation[0], origin[0] = np.eye(3), 0.0
@@ -41,9 +41,9 @@ def poses(robot: Robot, position: FloatArray) -> Poses:
         offset = np.broadcast_to(joint.translation_m, (samples, 3))
         turn = np.broadcast_to(joint.rotation, (samples, 3, 3))
         if joint.kind is JointKind.PRISMATIC:
-            offset = offset + position[index][:, None] * (joint.rotation @ joint.axis)
+            offset = offset + position_rad[:, index, None] * (joint.rotation @ joint.axis)
         else:
-            turn = joint.rotation @ _turns(joint.axis, position[index])
+            turn = joint.rotation @ _turns(joint.axis, position_rad[:, index])
         origin[index + 1] = origin[joint.parent + 1] + np.einsum("kij,kj->ki", parent, offset)
         rotation[index + 1] = parent @ turn
     return Poses(rotation, origin)
@@ -63,7 +63,7 @@ def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A piece of motion of n joints over k samples, joint-first, shape (n, k) [rad, or m for a prismatic joint].
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
 
     Attributes:
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.

@@ -139,7 +139,10 @@ class Model:
         Returns:
             shape (n, c, k) [Nm or N per unit], time last.
         """
-        position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        position, velocity, acceleration = (
+            np.ascontiguousarray(samples.T)
+            for samples in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+        )
         count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))

@@ -30,8 +30,8 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
         samples: k.
         seed: the same seed gives the same states.
     """
-    draw = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, limits.shape[1], samples))
-    middle, *sizes = (row[:, None] for row in limits)
+    draw = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, limits.shape[1], samples)).transpose(0, 2, 1)
+    middle, *sizes = limits
     position, velocity, acceleration = (size * part for size, part in zip(sizes, draw, strict=True))
     return Motion(middle + position, velocity, acceleration)
 

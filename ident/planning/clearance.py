@@ -250,7 +250,7 @@ class Checker:
 
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Of each question, shape (questions, k); where spheres around both are farther apart than needed, theirs."""
-        at = poses(self.robot, position)
+        at = poses(self.robot, position.T)
         samples, capsules, boxes = position.shape[1], self.scene.capsules, len(self.scene.boxes)
         start = np.empty((len(capsules) + boxes, samples, 3))
         end = np.empty_like(start)

@@ -90,9 +90,7 @@ class Excitation:
 def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
     """The rows of a recorded run: its motion where they are centred, and which of them the fit uses."""
     centres = row_filter(data, conditioning).centres(len(data.time_s))
-    motion = Motion(
-        data.position_rad[:, centres], data.velocity_rad_s[:, centres], data.acceleration_rad_s2[:, centres]
-    )
+    motion = Motion(data.position_rad[centres], data.velocity_rad_s[centres], data.acceleration_rad_s2[centres])
     return Excitation(motion, row_masks(drive_train, data, conditioning)[1])
 
 
@@ -119,7 +117,7 @@ def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> Floa
     """
     columns = model.regressor(motion) / noise_nm[:, None, None]
     # A joint at rest says nothing that can be used: its dry friction is undetermined (see the standstill mask).
-    columns *= (motion.velocity_rad_s != 0.0)[:, None, :]
+    columns *= (motion.velocity_rad_s.T != 0.0)[:, None, :]
     return np.asarray(columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
 
 

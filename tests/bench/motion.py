@@ -29,9 +29,9 @@ class Sinusoids:
         sine, cosine = np.sin(phase), np.cos(phase)
         rate = self.amplitude_rad * self.frequency_rad_s
         return Motion(
-            np.einsum("jh,jhk->jk", self.amplitude_rad, sine),
-            np.einsum("jh,jhk->jk", rate, cosine),
-            np.einsum("jh,jhk->jk", -rate * self.frequency_rad_s, sine),
+            np.einsum("jh,jhk->kj", self.amplitude_rad, sine),
+            np.einsum("jh,jhk->kj", rate, cosine),
+            np.einsum("jh,jhk->kj", -rate * self.frequency_rad_s, sine),
         )
 
     def pieces(self, samples: int, piece: int) -> Iterator[Motion]:

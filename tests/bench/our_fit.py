@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 def _pieces(data: dict[str, FloatArray]) -> Iterator[tuple[Motion, FloatArray]]:
     for first in range(0, data["q"].shape[1], PIECE_SAMPLES):
         part = slice(first, first + PIECE_SAMPLES)
-        yield Motion(data["q"][:, part], data["v"][:, part], data["a"][:, part]), data["torque"][:, part]
+        yield Motion(data["q"][:, part].T, data["v"][:, part].T, data["a"][:, part].T), data["torque"][:, part]
 
 
 def main(data_path: str, urdf: str, predicted_path: str, repeats: str) -> None:

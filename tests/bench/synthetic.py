@@ -28,7 +28,7 @@ def measurements(robot: Robot, samples: int) -> Iterator[tuple[Motion, FloatArra
     rng = np.random.default_rng(SEED)
     parameters = rng.uniform(0.1, 1.0, WIDTH * robot.joint_count)
     for motion in sinusoids(robot.joint_count, SEED).pieces(samples, PIECE_SAMPLES):
-        rows = standard_rows(robot, motion.position_rad.shape[1])
+        rows = standard_rows(robot, len(motion.position_rad))
         fill_rows(robot, motion, rows)
         torque = np.einsum("jck,c->jk", rows, parameters)
         yield motion, torque + NOISE_NM * rng.standard_normal(torque.shape)
@@ -37,7 +37,7 @@ def measurements(robot: Robot, samples: int) -> Iterator[tuple[Motion, FloatArra
 def main(urdf: str, samples: str, path: str) -> None:
     """Write them: q, v, a and torque, each of shape (n, k)."""
     pieces = [
-        (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2, torque)
+        (motion.position_rad.T, motion.velocity_rad_s.T, motion.acceleration_rad_s2.T, torque)
         for motion, torque in measurements(robot_from_urdf(Path(urdf).read_text()), int(samples))
     ]
     whole = [np.concatenate(parts, axis=1) for parts in zip(*pieces, strict=True)]

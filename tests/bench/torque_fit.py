@@ -59,8 +59,11 @@ def standard_rows(robot: Robot, samples: int) -> FloatArray:
 
 def fill_rows(robot: Robot, motion: Motion, out: FloatArray) -> None:
     """Write the rows of a piece of motion into ``standard_rows`` of its length."""
-    count, samples = motion.position_rad.shape
-    position, velocity, acceleration = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    samples, count = motion.position_rad.shape
+    position, velocity, acceleration = (
+        np.ascontiguousarray(states.T)
+        for states in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+    )
     by_link = out.reshape(count, count, WIDTH, samples)
     fill_rigid(robot, position, velocity, acceleration, by_link[:, :, : len(LINK_PARAMETERS)])
     for joint in range(count):
@@ -70,7 +73,7 @@ def fill_rows(robot: Robot, motion: Motion, out: FloatArray) -> None:
 
 
 def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> TorqueFit:
-    """Identify from motions and the joint torques [Nm] measured in them, shape (n, k) each."""
+    """Identify from motions and the joint torques [Nm] measured in them, shape (n, k)."""
     count = robot.joint_count
     drives = range(len(LINK_PARAMETERS), WIDTH)
     places = tuple(

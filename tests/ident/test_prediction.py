@@ -75,7 +75,7 @@ def _largest_difference(identification: Evidence) -> float:
     calibration = _of(identification)
     expected = identification.estimate.predicted_torque(identification.training)
     rows = [
-        decimate_rows(data, CONDITIONING, predict_torque(calibration, identification.model, data))
+        decimate_rows(data, CONDITIONING, predict_torque(calibration, identification.model, data).T)
         for data in identification.datasets
     ]
     return float(np.max(np.abs(np.concatenate(rows, axis=1) - expected)) / np.max(np.abs(expected)))
@@ -146,13 +146,13 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
         Parameter(name, float(value), 0.0, "") for name, value in zip(base.names, base.grouping @ standard, strict=True)
     )
     columns = truth.model.regressor(motion.motion())
-    expected = np.einsum("jck,c->jk", columns, standard)
+    expected = np.einsum("jck,c->kj", columns, standard)
     found = predict_torque(_calibration(GAINS, named), truth.model, motion)
     assert found == pytest.approx(expected, abs=1e-6 * np.max(np.abs(expected)))
 
 
 def _random_motion(like: Dataset, rng: np.random.Generator) -> Dataset:
-    position, velocity, acceleration = rng.normal(size=(3, 6, 50))
+    position, velocity, acceleration = rng.normal(size=(3, 50, 6))
     return replace(
         like,
         time_s=np.arange(50.0),
@@ -174,8 +174,8 @@ def test_the_true_parameters_predict_the_recorded_current(
     for run in clean_runs:
         data = differentiate(run, truth.model.drive_train, CONDITIONING)
         _, use = row_masks(truth.model.drive_train, data, CONDITIONING)  # at standstill dry friction is undetermined
-        recorded = decimate_rows(data, CONDITIONING, data.current_a)[use]
-        predicted = decimate_rows(data, CONDITIONING, predict_current(calibration, truth.model, data))[use]
+        recorded = decimate_rows(data, CONDITIONING, data.current_a.T)[use]
+        predicted = decimate_rows(data, CONDITIONING, predict_current(calibration, truth.model, data).T)[use]
         assert np.linalg.norm(predicted - recorded) < 2e-3 * np.linalg.norm(recorded)
         torque = measured_torque(calibration, truth.model, predict_current(calibration, truth.model, data))
         assert torque == pytest.approx(predict_torque(calibration, truth.model, data), rel=1e-9, abs=1e-9)

@@ -146,7 +146,7 @@ def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -
     rigid = np.array(
         [
             pin.rnea(robot, data, *state)
-            for state in zip(motion.position_rad.T, motion.velocity_rad_s.T, motion.acceleration_rad_s2.T, strict=True)
+            for state in zip(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2, strict=True)
         ]
     ).T
     assert np.linalg.norm(rigid + friction - expected) <= 2e-6 * np.linalg.norm(expected)

@@ -26,12 +26,12 @@ def test_derivatives_of_slow_sines_are_the_sines_own() -> None:
     data = differentiate(_run(), TRAIN, Conditioning(standstill_rad_s=(0.1, 0.1)))
     middle = slice(500, -500)
     w = 2 * np.pi
-    assert data.velocity_rad_s[0, middle] == pytest.approx(w * np.cos(w * data.time_s[middle]), abs=2e-3 * w)
-    assert data.acceleration_rad_s2[0, middle] == pytest.approx(
+    assert data.velocity_rad_s[middle, 0] == pytest.approx(w * np.cos(w * data.time_s[middle]), abs=2e-3 * w)
+    assert data.acceleration_rad_s2[middle, 0] == pytest.approx(
         -(w**2) * np.sin(w * data.time_s[middle]), abs=2e-3 * w**2
     )
     assert np.array_equal(data.moving, np.abs(data.velocity_rad_s) >= 0.1)
-    assert np.array_equal(data.motor_moving[1], np.abs(data.velocity_rad_s.sum(axis=0)) >= 0.1)
+    assert np.array_equal(data.motor_moving[:, 1], np.abs(data.velocity_rad_s.sum(axis=1)) >= 0.1)
 
 
 def test_moves_part_where_all_joints_rest() -> None:

@@ -29,10 +29,10 @@ def _resting(truth: Truth, runs: int = 3) -> tuple[Dataset, ...]:
     for number in range(runs):
         data = differentiate(record(truth, f"run{number}", rng, seconds=22.0), truth.model.drive_train, CONDITIONING)
         current = data.current_a.copy()
-        for motor, still in enumerate(~data.motor_moving):
+        for motor, still in enumerate(~data.motor_moving.T):
             for part in _parts(still):
                 t = np.linspace(-1.0, 1.0, part.stop - part.start)
-                current[motor, part] = rng.normal() + rng.normal() * t + 0.3 * rng.normal() * t**2
+                current[part, motor] = rng.normal() + rng.normal() * t + 0.3 * rng.normal() * t**2
         made.append(replace(data, current_a=current))
     return tuple(made)
 
@@ -45,8 +45,7 @@ def _parts(still: NDArray[np.bool_]) -> list[slice]:
 def _noisy(runs: tuple[Dataset, ...], seed: int = 5) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(seed)
     return tuple(
-        replace(data, current_a=data.current_a + NOISE_A[:, None] * rng.standard_normal(data.current_a.shape))
-        for data in runs
+        replace(data, current_a=data.current_a + NOISE_A * rng.standard_normal(data.current_a.shape)) for data in runs
     )
 
 
@@ -88,9 +87,9 @@ def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ..
     slipping = []
     for data in _noisy(resting):
         current = data.current_a.copy()
-        for motor, still in enumerate(~data.motor_moving):
+        for motor, still in enumerate(~data.motor_moving.T):
             for part in _parts(still)[::4]:
-                current[motor, (part.start + part.stop) // 2 : part.stop] += 200.0 * NOISE_A[motor]
+                current[(part.start + part.stop) // 2 : part.stop, motor] += 200.0 * NOISE_A[motor]
         slipping.append(replace(data, current_a=current))
     for floor, expected in zip(_all(noise_floors(slipping, CONDITIONING)), _expected_a(resting[0]), strict=True):
         assert floor.noise_a < 2.0 * expected
@@ -112,9 +111,9 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(resti
     cut = replace(
         first,
         time_s=first.time_s[short],
-        current_a=first.current_a[:, short],
-        motor_moving=first.motor_moving[:, short],
-        valid=first.valid[:, short],
+        current_a=first.current_a[short],
+        motor_moving=first.motor_moving[short],
+        valid=first.valid[short],
     )
     assert noise_floors((cut,), CONDITIONING) == (None,) * 6
     switched_off = [replace(data, current_a=np.zeros_like(data.current_a)) for data in resting]

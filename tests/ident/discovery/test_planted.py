@@ -207,7 +207,7 @@ def _true(truth: Truth, data: Dataset, axis: int) -> True1:
         """Torque of every joint per unit of acceleration of the axis, at every sample."""
         still = np.zeros_like(motion.position_rad)
         one = still.copy()
-        one[axis] = 1.0
+        one[:, axis] = 1.0
         moved, at_rest = (
             np.einsum("jck,c->jk", truth.model.regressor(Motion(motion.position_rad, still, a)), parameters * rigid)
             for a in (one, still)
@@ -216,10 +216,10 @@ def _true(truth: Truth, data: Dataset, axis: int) -> True1:
 
     return True1(
         axis=axis,
-        positions=motion.position_rad,
-        velocities=motion.velocity_rad_s,
-        accelerations=motion.acceleration_rad_s2,
-        motor_angles=truth.model.drive_train.ratio @ motion.position_rad,
+        positions=motion.position_rad.T,
+        velocities=motion.velocity_rad_s.T,
+        accelerations=motion.acceleration_rad_s2.T,
+        motor_angles=truth.model.drive_train.ratio @ motion.position_rad.T,
         loads=np.einsum("jck,c->jk", columns, parameters * rigid),
         frictions=np.einsum("jck,c->jk", columns, parameters * rubbing),
         motor_torques=truth.model.drive_train.to_motor @ np.einsum("jck,c->jk", columns, parameters),

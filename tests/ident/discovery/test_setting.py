@@ -27,7 +27,7 @@ def _needing(small: Evidence, truth: Truth, torque: Callable[[Dataset], FloatArr
 
 
 def _low_speed(data: Dataset, speed_rad_s: float = 0.17) -> FloatArray:
-    v = data.velocity_rad_s[1]
+    v = data.velocity_rad_s[:, 1]
     return np.asarray(20.0 * np.sign(v) * np.exp(-np.abs(v) / speed_rad_s))
 
 
@@ -61,7 +61,7 @@ def test_an_effect_that_a_later_one_makes_idle_is_taken_out(small: Evidence, sma
 
 
 def test_an_effect_that_is_still_needed_stays(small: Evidence, small_truth: Truth) -> None:
-    start = _needing(small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[1])
+    start = _needing(small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[:, 1])
     last = close_the_loop(start, np.random.default_rng(0), GATES)[-1].after
     assert {(placed.effect.name, placed.axis) for placed in last.effects} == {("stribeck", 1), ("spring", 1)}
 

@@ -25,9 +25,9 @@ def data(small: Evidence) -> Dataset:
     return replace(
         whole,
         time_s=whole.time_s[part],
-        position_rad=whole.position_rad[:, part],
-        velocity_rad_s=whole.velocity_rad_s[:, part],
-        acceleration_rad_s2=whole.acceleration_rad_s2[:, part],
+        position_rad=whole.position_rad[part],
+        velocity_rad_s=whole.velocity_rad_s[part],
+        acceleration_rad_s2=whole.acceleration_rad_s2[part],
     )
 
 
@@ -60,7 +60,7 @@ def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: 
     assert made.geared_torque_nm == pytest.approx(geared)
     assert made.motor_torque_nm == pytest.approx(small_truth.model.drive_train.to_motor @ whole)
     assert made.current_a * small_truth.gains[:, None] == pytest.approx(made.motor_torque_nm)
-    assert made.motor_position_rad == pytest.approx(np.diag([40.0, 50.0, -45.0]) @ data.position_rad)
+    assert made.motor_position_rad == pytest.approx(np.diag([40.0, 50.0, -45.0]) @ data.position_rad.T)
 
 
 def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, data: Dataset) -> None:
@@ -74,7 +74,7 @@ def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, 
         for a in (acceleration, still)
     )
     inertia = _made(small_truth, data).inertia_kg_m2
-    found = np.einsum("ijk,jk->ik", inertia, acceleration)
+    found = np.einsum("ijk,kj->ik", inertia, acceleration)
     assert np.max(np.abs(found - (moved - held))) < 0.01 * np.max(np.abs(moved - held))
     assert inertia == pytest.approx(np.swapaxes(inertia, 0, 1), abs=1e-9)
     for sample in range(0, 1000, 100):

@@ -37,16 +37,18 @@ def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -
 
 
 def _low_speed(axis: int) -> Torque:
-    return lambda data: 7.0 * np.sign(data.velocity_rad_s[axis]) * np.exp(-np.abs(data.velocity_rad_s[axis]) / 0.3)
+    return lambda data: (
+        7.0 * np.sign(data.velocity_rad_s[:, axis]) * np.exp(-np.abs(data.velocity_rad_s[:, axis]) / 0.3)
+    )
 
 
 def _ripples(data: Dataset) -> FloatArray:
-    q = data.position_rad[1]
+    q = data.position_rad[:, 1]
     return np.asarray(6.0 * np.sin(3.0 * q) * np.exp(-(q**2)))
 
 
 def _bump(data: Dataset) -> FloatArray:
-    v = data.velocity_rad_s[2]
+    v = data.velocity_rad_s[:, 2]
     return np.asarray(5.0 * np.sign(v) * np.exp(-(((np.abs(v) - 1.5) / 0.5) ** 2)))
 
 
@@ -64,7 +66,7 @@ NAMELESS = (
     Nameless(1, _ripples, (), "smooth-position"),
     Nameless(2, _bump, (), "smooth-velocity"),
     Nameless(1, _low_speed(1), ("stribeck", "nonlinear-viscous"), "smooth-velocity"),
-    Nameless(0, lambda data: 4.0 * np.sin(120.0 * data.position_rad[0]), ("cogging",), "periodic-motor-angle"),
+    Nameless(0, lambda data: 4.0 * np.sin(120.0 * data.position_rad[:, 0]), ("cogging",), "periodic-motor-angle"),
 )
 
 
@@ -111,7 +113,7 @@ def test_the_detection_limit_parts_what_is_found_from_what_is_not(
         ratio = small_truth.model.drive_train.ratio[axis, axis]
         start = _needing(
             small, small_truth, axis,
-            lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[axis]),
+            lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[:, axis]),
         )  # fmt: skip
         best = choose(find(search_problem_of(start), np.random.default_rng(0), GATES, families))
         return None if best is None else (best.effect.name, best.axis)

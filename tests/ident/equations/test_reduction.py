@@ -79,9 +79,9 @@ def test_the_layout_leaves_nothing_out(truth: Truth, noisy_runs: tuple[Run, ...]
     rng = np.random.default_rng(0)
     motion = replace(
         gathered(truth, noisy_runs[:2]).datasets[0].motion(slice(0, 1)),
-        position_rad=rng.normal(size=(6, 50)),
-        velocity_rad_s=rng.normal(size=(6, 50)),
-        acceleration_rad_s2=rng.normal(size=(6, 50)),
+        position_rad=rng.normal(size=(50, 6)),
+        velocity_rad_s=rng.normal(size=(50, 6)),
+        acceleration_rad_s2=rng.normal(size=(50, 6)),
     )
     columns = model.regressor(motion)
     assert not columns[~model.support].any()

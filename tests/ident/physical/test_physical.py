@@ -281,6 +281,6 @@ def test_links_of_the_prior_are_those_that_pinocchio_moves() -> None:
     data = robot.createData()
     for k in range(20):
         expected = pin.rnea(
-            robot, data, motion.position_rad[:, k], motion.velocity_rad_s[:, k], motion.acceleration_rad_s2[:, k]
+            robot, data, motion.position_rad[k], motion.velocity_rad_s[k], motion.acceleration_rad_s2[k]
         )
         assert torque[:, k] == pytest.approx(expected, abs=1e-9)

@@ -34,7 +34,7 @@ def test_poses_are_those_of_pinocchio(arm: Arm) -> None:
     robot, model = robot_from_urdf(arm.urdf), pin.buildModelFromXML(arm.urdf)
     data = model.createData()
     positions = np.random.default_rng(0).uniform(-2.0, 2.0, (model.nq, 5))
-    found = poses(robot, positions)
+    found = poses(robot, positions.T)
     for sample in range(5):
         pin.forwardKinematics(model, data, positions[:, sample])
         for joint in range(model.nq):
@@ -57,7 +57,7 @@ def test_distances_are_those_of_the_segments() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
         position = rng.uniform(-2.0, 2.0, (6, 1))
-        at = poses(robot, position)
+        at = poses(robot, position.T)
         ends = [
             at.origin_m[c.link + 1, 0] + at.rotation[c.link + 1, 0] @ np.array(point)
             for c in (bare.capsules[0], bare.capsules[2])

@@ -51,15 +51,15 @@ def _design(
 
 
 def _motion(rng: np.random.Generator, rows: int, still: int | None = None) -> Motion:
-    position, velocity, acceleration = (scale * rng.uniform(-1.0, 1.0, (6, rows)) for scale in (2.0, 3.0, 12.0))
+    position, velocity, acceleration = (scale * rng.uniform(-1.0, 1.0, (6, rows)).T for scale in (2.0, 3.0, 12.0))
     if still is not None:
-        position[still], velocity[still], acceleration[still] = 0.3, 0.0, 0.0
+        position[:, still], velocity[:, still], acceleration[:, still] = 0.3, 0.0, 0.0
     return Motion(position, velocity, acceleration)
 
 
 def _excitation(rng: np.random.Generator, rows: int = 400, still: int | None = None) -> Excitation:
     motion = _motion(rng, rows, still)
-    return Excitation(motion, motion.velocity_rad_s != 0.0)
+    return Excitation(motion, motion.velocity_rad_s.T != 0.0)
 
 
 def _data(truth: Truth, runs: tuple[Run, ...]) -> list[Dataset]:
