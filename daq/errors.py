@@ -1,64 +1,49 @@
-"""Everything that can go wrong between a file and a screen, and the exit code of every error of the three packages.
+"""Errors of the service, and the exit code of every error of the three packages.
 
 DaqError
-├── UsageError                  the command asks for what cannot be done                      exit 2
-│   ├── OutputExists            a file would be overwritten
-│   ├── SecretKeyUnfit          no secret key, another password, or a key that others may read
-│   └── PlanUnfit               no moves within these limits excite every parameter
-├── CalibrationRefused          a gate of the write-back is closed                            exit 3
-│   ├── CalibrationEdited       calibration.yaml was changed by hand
+├── UsageError                  the command asks for something that cannot be done            exit 2
+├── CalibrationRefused          a check of the write-back failed; nothing was written         exit 3
 │   ├── ControllerUnfit         the controller file cannot be read, or lacks a gain's key
-│   ├── ControllerChanged       the controller file is not the one that the diff was shown for
-│   ├── ControllerBusy          somebody else is writing the controller file
-│   ├── SignatureInvalid        a trusted person's signature does not fit the calibration
-│   ├── BackupMissing           there is nothing to roll back to
-│   └── AuditUnusable           what is done could not be written down
-├── DataError                   a recording cannot be used                                    exit 4
-│   ├── CalibrationMissing      there is no such calibration file
-│   ├── CalibrationUnreadable   it is none, of another version, or broken
-│   ├── LogUnreadable
-│   │   ├── LogMissing          there is no such log
+│   ├── ControllerChanged       the controller file changed after its diff was shown
+│   ├── SignatureInvalid        a signature of a trusted signer does not match the calibration
+│   └── AuditUnusable           the audit log cannot be written
+├── DataError                   recorded or derived data cannot be used                       exit 4
+│   ├── CalibrationMissing      the calibration file does not exist
+│   ├── CalibrationUnreadable   not a calibration file, of another version, or broken
+│   ├── LogUnreadable           the log cannot be read
+│   │   ├── LogMissing          it does not exist
 │   │   ├── LogForeign          not MCAP, or not a log of a cell
-│   │   ├── LogTruncated        the end is missing: power loss, a killed recorder, a broken copy
-│   │   ├── LogCorrupt          a checksum or a length does not fit
-│   │   └── LogIncomplete       cell configuration, readback or run metadata are not in the log
-│   ├── TableUnfit              a CSV file of another controller
-│   │   ├── TableMissing        there is no such file
-│   │   ├── TableEmpty          it has no rows
-│   │   ├── TableTruncated      its last row is incomplete
-│   │   ├── TableColumns        it has other columns than the description says
-│   │   ├── TableNotNumeric     a field is not a finite number
-│   │   └── TimeNotUniform      its time column has gaps or jumps
-│   ├── HistoryUnreadable       the history is no SQLite file of ours, broken, of another version, or cannot be written
-│   ├── HistoryMixed            a calibration of another cell, other axes, or gains in other units
-│   ├── AuditBroken             the audit is not what was written: entries were changed, moved or taken away
+│   │   ├── LogTruncated        the end is missing: power loss, a killed recorder, an incomplete copy
+│   │   ├── LogCorrupt          a checksum or a length does not match
+│   │   └── LogIncomplete       cell configuration, readback or run metadata are missing from the log
+│   ├── TableUnfit              a CSV file of another controller cannot be imported
+│   ├── HistoryUnreadable       not a history of drivegain, broken, of another version, or not writable
 │   ├── LogsDiffer              logs of different cells, or of different configurations of one
 │   ├── LogRepeated             one recording twice
 │   ├── RolesExchanged          loaded and unloaded runs are mistaken for each other
 │   ├── ModelContradicted       the declared model explains less of the data than it leaves
-│   └── RunUnfit
-│       ├── RunInvalid          the recorder itself marked it invalid
-│       ├── CyclesLost          SYNC cycles are missing
-│       ├── ClockImplausible    the time stamps show another rate than was asked for, or uneven steps
-│       ├── CurrentSaturated    a limit acted in too large a part of the run
-│       ├── CurrentImplausible  a dead channel, or a number that is no current
-│       ├── SpeedImplausible    faster than the joint can be: a wrong rate
-│       └── PositionImplausible far outside the joint limits: deg for rad, or a wrong drive train
+│   ├── RunInvalid              the recorder itself marked the run invalid
+│   ├── CyclesLost              SYNC cycles are missing
+│   ├── ClockImplausible        time stamps with another rate than declared, or uneven steps
+│   ├── CurrentSaturated        a limit was active in too large a part of the run
+│   └── PositionImplausible     far outside the joint limits: deg for rad, or a wrong drive train
 ├── ConfigurationError          a configuration file is wrong                                 exit 6
-│   ├── ConfigurationMissing    there is no such file
+│   ├── ConfigurationMissing    the file does not exist
 │   ├── YamlInvalid             not YAML, a duplicate key, an alias
 │   ├── SchemaMismatch          unknown key, missing key, wrong type
-│   └── ConfigurationInconsistent  each value is well-formed, together they describe no cell
-├── JobHeld                     a job may not go on now; the next one takes it up             exit 14
-│   ├── NotReleased             the interlock does not let the robot move                     exit 11
-│   ├── BusTaken                another recording or job of drivegain has the bus             exit 12
-│   ├── TimeBoundReached        the job took longer than it may; the axes were stopped        exit 13
-│   ├── MountFailed             the command that mounts a payload failed
-│   └── ClockWentBack           the wall clock is behind what was written down before
+│   └── ConfigurationInconsistent  valid values that contradict each other
+├── JobHeld                     a job may not go on now; the next one resumes it              exit 14
+│   ├── NotReleased             the interlock does not release the robot                      exit 11
+│   ├── BusTaken                another recording or job of drivegain uses the bus            exit 12
+│   └── TimeBoundReached        the job exceeded its time limit; the axes were stopped        exit 13
 └── OutputFailed                the disk is full, the folder is read-only                     exit 1
     └── DiskSpaceShort          too little room for a recording, before it or during it
 
-`drivegain recalibrate` ends with 10 where it found a change that waits for a person.
+A kind of failure has a class of its own where a caller catches it, where it has its own exit code, or where its name is
+data: `drivegain fleet` reports the class of every failed cell. Everything else raises the parent, with a message that
+says what was found.
+
+`drivegain recalibrate` exits with 10 when it found a change that an operator has to approve.
 drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4.
 """
 
@@ -72,7 +57,7 @@ from ident.errors import IdentificationError
 
 
 class ExitCode(IntEnum):
-    """What the shell, a scheduled job or a PLC sees of the outcome."""
+    """Outcome of a command for the shell, a scheduled job or a PLC."""
 
     OK = 0
     UNEXPECTED = 1
@@ -90,7 +75,7 @@ class ExitCode(IntEnum):
 
 
 class DaqError(Exception):
-    """Root of the tree: what it is about, what was found, what was expected, and what to do."""
+    """Root of the tree; its message names subject, what was found, what was expected, and what to do."""
 
     def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
         super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
@@ -100,33 +85,16 @@ class DaqError(Exception):
         self.remedy = remedy
 
     def __reduce__(self) -> tuple[object, ...]:
-        # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
-        # these to another.
+        # `args` holds the message, not the arguments of `__init__`: without this the error could not be pickled.
         return type(self).__new__, (type(self), *self.args), self.__dict__
 
 
 class UsageError(DaqError):
-    """The command asks for what cannot be done."""
-
-
-class OutputExists(UsageError):
-    """A file would be overwritten."""
-
-
-class SecretKeyUnfit(UsageError):
-    """No secret key, another password, or a key that others may read."""
-
-
-class PlanUnfit(UsageError):
-    """No moves within these limits and this time excite every parameter."""
+    """The command asks for something that cannot be done."""
 
 
 class CalibrationRefused(DaqError):
-    """A gate of the write-back is closed; nothing was written."""
-
-
-class CalibrationEdited(CalibrationRefused):
-    """A calibration file is not what was fitted."""
+    """A check of the write-back failed; nothing was written."""
 
 
 class ControllerUnfit(CalibrationRefused):
@@ -134,31 +102,23 @@ class ControllerUnfit(CalibrationRefused):
 
 
 class ControllerChanged(CalibrationRefused):
-    """The controller file is not the one that the diff was shown for."""
-
-
-class ControllerBusy(CalibrationRefused):
-    """Somebody else is writing the controller file."""
+    """The controller file changed after its diff was shown."""
 
 
 class SignatureInvalid(CalibrationRefused):
-    """A trusted person's signature stands beside the calibration and does not fit it."""
-
-
-class BackupMissing(CalibrationRefused):
-    """There is nothing to roll back to."""
+    """A signature of a trusted signer does not match the calibration."""
 
 
 class AuditUnusable(CalibrationRefused):
-    """The audit is no regular file, is locked for long, or its last line is not what was written."""
+    """The audit log is not a regular file, stays locked, or its last line was altered."""
 
 
 class DataError(DaqError):
-    """A recording cannot be used."""
+    """Recorded or derived data cannot be used."""
 
 
 class CalibrationMissing(DataError):
-    """There is no such calibration file, or it cannot be read."""
+    """The calibration file does not exist, or cannot be read."""
 
 
 class CalibrationUnreadable(DataError):
@@ -166,11 +126,11 @@ class CalibrationUnreadable(DataError):
 
 
 class LogUnreadable(DataError):
-    """A log cannot be read."""
+    """The log cannot be read."""
 
 
 class LogMissing(LogUnreadable):
-    """There is no such log."""
+    """The log does not exist."""
 
 
 class LogForeign(LogUnreadable):
@@ -178,55 +138,23 @@ class LogForeign(LogUnreadable):
 
 
 class LogTruncated(LogUnreadable):
-    """The end is missing."""
+    """The end of the log is missing."""
 
 
 class LogCorrupt(LogUnreadable):
-    """A checksum or a length does not fit."""
+    """A checksum or a length does not match."""
 
 
 class LogIncomplete(LogUnreadable):
-    """Something that a log must carry is not in it."""
+    """The log lacks something that every log must carry."""
 
 
 class TableUnfit(DataError):
     """A CSV file of another controller cannot be imported."""
 
 
-class TableMissing(TableUnfit):
-    """There is no such file."""
-
-
-class TableEmpty(TableUnfit):
-    """The file has no rows."""
-
-
-class TableTruncated(TableUnfit):
-    """The last row is incomplete."""
-
-
-class TableColumns(TableUnfit):
-    """The file has other columns than the description says."""
-
-
-class TableNotNumeric(TableUnfit):
-    """A field is not a finite number."""
-
-
-class TimeNotUniform(TableUnfit):
-    """The time column has gaps or jumps."""
-
-
 class HistoryUnreadable(DataError):
-    """The history is no SQLite file of ours, broken, of another version, or cannot be written."""
-
-
-class HistoryMixed(DataError):
-    """A calibration of another cell, of other axes, or with gains in other units than the history's."""
-
-
-class AuditBroken(DataError):
-    """The audit is not what was written: entries were changed, moved or taken away."""
+    """Not a history of drivegain, broken, of another version, or not writable."""
 
 
 class LogsDiffer(DataError):
@@ -245,36 +173,24 @@ class ModelContradicted(DataError):
     """The declared model explains less of the data than it leaves."""
 
 
-class RunUnfit(DataError):
-    """A log can be read, and its samples cannot be used."""
-
-
-class RunInvalid(RunUnfit):
+class RunInvalid(DataError):
     """The recorder itself marked the run invalid."""
 
 
-class CyclesLost(RunUnfit):
+class CyclesLost(DataError):
     """SYNC cycles are missing; they are never interpolated."""
 
 
-class ClockImplausible(RunUnfit):
-    """The time stamps show another rate than was asked for, or uneven steps."""
+class ClockImplausible(DataError):
+    """The time stamps show another rate than declared, or uneven steps."""
 
 
-class CurrentSaturated(RunUnfit):
-    """A limit acted in too large a part of the run."""
+class CurrentSaturated(DataError):
+    """A limit was active in too large a part of the run."""
 
 
-class CurrentImplausible(RunUnfit):
-    """A dead channel, or a number that is no current."""
-
-
-class SpeedImplausible(RunUnfit):
-    """Faster than the joint can be: a wrong rate."""
-
-
-class PositionImplausible(RunUnfit):
-    """Positions far outside the joint limits."""
+class PositionImplausible(DataError):
+    """Positions are far outside the joint limits."""
 
 
 class ConfigurationError(DaqError):
@@ -282,7 +198,7 @@ class ConfigurationError(DaqError):
 
 
 class ConfigurationMissing(ConfigurationError):
-    """There is no such file."""
+    """A configuration file does not exist."""
 
 
 class YamlInvalid(ConfigurationError):
@@ -294,31 +210,23 @@ class SchemaMismatch(ConfigurationError):
 
 
 class ConfigurationInconsistent(ConfigurationError):
-    """Each value is well-formed; together they describe no cell."""
+    """Each value is valid; together they contradict each other."""
 
 
 class JobHeld(DaqError):
-    """A job may not go on now; nothing was written to a controller, and the next one takes it up."""
+    """A job may not go on now; nothing was written to a controller, and the next job resumes it."""
 
 
 class NotReleased(JobHeld):
-    """The interlock does not let the robot move."""
+    """The interlock does not release the robot."""
 
 
 class BusTaken(JobHeld):
-    """Another recording or job of drivegain has the bus."""
+    """Another recording or job of drivegain uses the bus."""
 
 
 class TimeBoundReached(JobHeld):
-    """The job took longer than it may; the axes were stopped."""
-
-
-class MountFailed(JobHeld):
-    """The command that mounts a payload failed, or took too long."""
-
-
-class ClockWentBack(JobHeld):
-    """The wall clock is behind what was written down before."""
+    """The job exceeded its time limit; the axes were stopped."""
 
 
 class OutputFailed(DaqError):
@@ -326,7 +234,7 @@ class OutputFailed(DaqError):
 
     @classmethod
     def of(cls, path: Path, error: OSError) -> OutputFailed:
-        """What the file system said when a file was written whole or not at all."""
+        """Make the error for a file that was replaced whole or not at all."""
         return cls(
             str(path),
             found=(error.strerror or type(error).__name__).lower(),
@@ -336,7 +244,7 @@ class OutputFailed(DaqError):
 
 
 class DiskSpaceShort(OutputFailed):
-    """Too little room on the disk for a recording: it does not begin, or the axes were stopped and the log finished."""
+    """Too little room for a recording: it does not begin, or the axes were stopped and the log was finished."""
 
 
 EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
@@ -353,11 +261,11 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
     (MotionRefused, ExitCode.USAGE),
     (DriverError, ExitCode.DEVICE_FAULT),
 )
-"""Exit code of every error class with a cause that a user can act on; the first that fits wins."""
+"""Exit code of every error class with a cause that a user can act on; the first match wins."""
 
 
 def exit_code(kind: type[BaseException]) -> ExitCode | None:
-    """Exit code of an exception class, None when it is none of ours."""
+    """Exit code of an exception class, or None for a foreign one."""
     for root, code in EXIT_CODES:
         if issubclass(kind, root):
             return code

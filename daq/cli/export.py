@@ -18,7 +18,7 @@ from daq.config.cell import model_of
 from daq.config.cell_file import URDF, bundle, load_cell
 from daq.config.yaml_file import read_bytes
 from daq.environment import software
-from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputExists, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFailed, UsageError
 from daq.files import replace_file
 from daq.log.export import TableFormat, export_log
 from daq.workflow.calibration_file import load
@@ -119,9 +119,7 @@ def export_urdf_verb(
     require_good(known, str(calibration))
     content = bundle(given)[URDF] if urdf is None else read_bytes(given)
     if out.exists() and out.read_bytes() == content:
-        raise OutputExists(
-            str(out), found="the URDF to read", expected="a name of its own", remedy="choose another name"
-        )
+        raise UsageError(str(out), found="the URDF to read", expected="a name of its own", remedy="choose another name")
     parse_markup(content, str(given))  # before any other reader sees it
     text = content.decode("utf-8")
     model, limits, same = _declared(known, given) if urdf is None else (*_plain(text), None)

@@ -69,7 +69,7 @@ def fit_cases(
         json: print one JSON object.
 
     Raises:
-        OutputExists, OutputFailed: a file of another kind is in the way, or the file system refuses.
+        UsageError, OutputFailed: a file of another kind is in the way, or the file system refuses.
         DaqError, IdentificationError: a case cannot be fitted.
     """
     files = {case.name: folder / f"{case.name}.yaml" for case in CASES}

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from daq.cli.terminal import progress_bar, say_written
 from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.errors import ExitCode, OutputExists, OutputFailed
+from daq.errors import ExitCode, OutputFailed, UsageError
 from daq.files import replace_file
 from daq.jobs.cell_fit import Failure, Loop, open_cache
 from daq.jobs.fleet import FleetRow, fit_fleet
@@ -83,7 +83,7 @@ def check_table(path: Path | None) -> None:
     """Refuse a table that could not be written, or would replace something else than a table of a fleet.
 
     Raises:
-        OutputExists: there is another file of that name.
+        UsageError: there is another file of that name.
         OutputFailed: its folder is not there.
     """
     if path is None:
@@ -91,7 +91,7 @@ def check_table(path: Path | None) -> None:
     if not path.parent.is_dir():
         raise OutputFailed.of(path, FileNotFoundError(2, "No such folder"))
     if path.exists() and not (path.is_file() and _is_table(path)):
-        raise OutputExists(
+        raise UsageError(
             str(path),
             found="something that is no table of a fleet",
             expected="no file, or an earlier table",

@@ -19,11 +19,9 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
 from daq.errors import (
-    AuditBroken,
     ConfigurationInconsistent,
-    HistoryMixed,
+    DataError,
     HistoryUnreadable,
-    OutputExists,
     OutputFailed,
     UsageError,
 )
@@ -123,14 +121,14 @@ class Checked:
         """Raise what is wrong.
 
         Raises:
-            AuditBroken: the audit is not what was written, with the first line that is not and all flaws.
+            DataError: the audit is not what was written, with the first line that is not and all flaws.
             HistoryUnreadable: the history's file is broken, its rows are not what the audit tells, or it does not know
                 of a write.
         """
         if not self.verdict.holds:
             first = self.verdict.flaws[0]
             more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in self.verdict.flaws)
-            raise AuditBroken(
+            raise DataError(
                 f"{self.audit}, line {first.line}",
                 found=f"{len(self.verdict.flaws)} places that are not what was written{more}\n ",
                 expected="entries that were never changed, moved or taken away",
@@ -289,7 +287,7 @@ def _add(store: HistoryStore, cell: Cell, place: HistoryPlace, file: Path, now: 
     content = read(file)
     calibration = decode(content, str(file))
     if calibration.cell != cell.name:
-        raise HistoryMixed(
+        raise DataError(
             str(file),
             found=f"a calibration of cell {calibration.cell!r}",
             expected=f"one of {cell.name!r}",
@@ -391,7 +389,7 @@ def _check_csv(path: Path | None) -> None:
 def _require_replaceable(path: Path, begins: bytes) -> None:
     """A file of another kind is not written over."""
     if path.is_dir() or (path.is_file() and path.stat().st_size and not path.read_bytes().startswith(begins)):
-        raise OutputExists(
+        raise UsageError(
             str(path),
             found="something of another kind",
             expected="no file, or an earlier one of the same kind",

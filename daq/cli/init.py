@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.verb import Verb
 from daq.environment import shipped_configurations
-from daq.errors import OutputExists, OutputFailed, UsageError
+from daq.errors import OutputFailed, UsageError
 
 TEMPLATES = (
     ("cells/demo.yaml", "cells/{name}.yaml"),
@@ -96,7 +96,7 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
 
     Raises:
         UsageError: the folder's name is no name of a cell.
-        OutputExists: the folder holds something.
+        UsageError: the folder holds something.
         OutputFailed: the file system refuses.
     """
     name = folder.resolve().name
@@ -109,7 +109,7 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
         )
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputExists(
+            raise UsageError(
                 str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"
             )
         folder.parent.mkdir(parents=True, exist_ok=True)

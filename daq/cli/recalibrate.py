@@ -18,7 +18,7 @@ from daq.cli.terminal import interruptible
 from daq.cli.verb import JsonOption, Verb, print_json, printable
 from daq.config.cell_file import load_cell
 from daq.environment import login
-from daq.errors import DaqError, ExitCode, OutputExists, OutputFailed, UsageError, exit_code
+from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code
 from daq.files import replace_file
 from daq.jobs.conclusion import document, text
 from daq.jobs.job import preview, recalibrate
@@ -195,7 +195,7 @@ def require_own_unit(path: Path, saying: str = "") -> None:
         saying: what a unit of this cell says.
 
     Raises:
-        OutputExists: it is somebody else's.
+        UsageError: it is somebody else's.
     """
     try:
         # What is no regular file is nobody's unit, and a pipe would be waited for.
@@ -203,14 +203,14 @@ def require_own_unit(path: Path, saying: str = "") -> None:
     except OSError as error:
         raise OutputFailed.of(path, error) from error
     if text is not None and text.startswith(MARK) and saying not in text:
-        raise OutputExists(
+        raise UsageError(
             str(path),
             found="the unit of another cell file",
             expected=f"no such file, or one that says {saying}",
             remedy="name another folder with --to, or remove it where the cell file has moved",
         )
     if (text is None and path.exists()) or (text is not None and not text.startswith(MARK)):
-        raise OutputExists(
+        raise UsageError(
             str(path),
             found="a unit that drivegain did not make",
             expected="no such file, or one of an earlier `install-units`",

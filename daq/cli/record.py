@@ -15,7 +15,7 @@ from daq.config.bus import bus_loads
 from daq.config.cell import Cell, MotionPolicy, Pacing
 from daq.config.cell_file import load_cell
 from daq.environment import login
-from daq.errors import DiskSpaceShort, ExitCode, OutputExists, OutputFailed, UsageError
+from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
 from daq.workflow.plan import slowed
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import record
@@ -125,15 +125,15 @@ def _free(out: Path) -> Path:
     """Where the log grows until it is finished, before anything is asked of the bus.
 
     Raises:
-        OutputExists: the log, or the rest of a recording of that name, is there already.
+        UsageError: the log, or the rest of a recording of that name, is there already.
     """
     part = out.with_name(out.name + ".part")
     if out.exists():
-        raise OutputExists(
+        raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
         )
     if part.exists():
-        raise OutputExists(
+        raise UsageError(
             str(part),
             found="the rest of a recording of that name that failed, was interrupted, or still runs",
             expected="none",

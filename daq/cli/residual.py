@@ -28,7 +28,7 @@ from daq.cli.fit import (
 from daq.cli.terminal import check_output, say_written, status
 from daq.cli.verb import JsonOption, Verb, json_text, print_json
 from daq.config.cell_file import load_cell
-from daq.errors import OutputExists, OutputFailed
+from daq.errors import OutputFailed, UsageError
 from daq.files import replace_file
 from daq.log.reader import LossyLogs
 from daq.report.effect_names import placed_name
@@ -59,7 +59,7 @@ def check_report(folder: Path | None) -> None:
         folder: None where no report is wanted.
 
     Raises:
-        OutputExists: it holds a file of one of these names that is no earlier report.
+        UsageError: it holds a file of one of these names that is no earlier report.
         OutputFailed: it cannot be made, or nothing can be written into it.
     """
     if folder is None:
@@ -73,7 +73,7 @@ def check_report(folder: Path | None) -> None:
     for name, mark in _OURS:
         path = folder / name
         if path.exists() and not (path.is_file() and mark.encode() in _head(path)):
-            raise OutputExists(
+            raise UsageError(
                 str(path),
                 found="something that is no report of `drivegain residual`",
                 expected="no such file, or that of an earlier report",

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from daq.cli.verb import printable
-from daq.errors import OutputExists
+from daq.errors import UsageError
 from drivers.canopen.network import SignalBlocker
 
 _LOOK_BYTES = 4096
@@ -30,16 +30,16 @@ def check_output(out: Path | None, inputs: Iterable[Path], format_: str) -> None
         format_: what the first lines of a file of the same kind say (``format: …``); such a file may be replaced.
 
     Raises:
-        OutputExists: it is one of the inputs, or a file of another kind.
+        UsageError: it is one of the inputs, or a file of another kind.
     """
     if out is None or not out.exists():
         return
     if any(given.exists() and out.samefile(given) for given in inputs):
-        raise OutputExists(
+        raise UsageError(
             str(out), found="one of the files to read", expected="a name of its own", remedy="choose another name"
         )
     if not out.is_file() or f"format: {format_}".encode() not in _head(out):
-        raise OutputExists(
+        raise UsageError(
             str(out),
             found="something that is no " + format_,
             expected="no file, or an earlier one of the same kind",

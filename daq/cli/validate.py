@@ -73,7 +73,7 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
 
     Raises:
         CalibrationMissing: a folder holds none.
-        CalibrationUnreadable, CalibrationEdited: a file is none, or was changed by hand.
+        CalibrationUnreadable, CalibrationRefused: a file is none, or was changed by hand.
     """
     files = [calibration]
     for place in beside:

@@ -22,8 +22,8 @@ from daq.errors import (
     ExitCode,
     LogsDiffer,
     LogUnreadable,
-    OutputExists,
     OutputFailed,
+    UsageError,
     exit_code,
 )
 from daq.files import read_regular, replace_file
@@ -205,7 +205,7 @@ class CalibrationCache:
         The file itself is not parsed: it is the one that was written, by its digest.
 
         Raises:
-            OutputExists: there is something that no calibration, or no note beside it, can replace.
+            UsageError: there is something that no calibration, or no note beside it, can replace.
         """
         file = self.file(cell)
         for path in (file, _state(file)):
@@ -260,11 +260,11 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
     """Make the folder, and see that files can be put there.
 
     Raises:
-        OutputExists: it is no folder.
+        UsageError: it is no folder.
         OutputFailed: the file system refuses.
     """
     if folder.exists() and not folder.is_dir():
-        raise OutputExists(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
+        raise UsageError(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -286,7 +286,7 @@ def _check_replaceable(path: Path) -> None:
         found = "a link to something that is no regular file"
     else:
         return
-    raise OutputExists(
+    raise UsageError(
         str(path),
         found=found,
         expected="a file that an earlier fleet has left, or none",

@@ -85,7 +85,7 @@ def fit_fleet(
 
     Raises:
         UsageError: the workers have gone; what was fitted stays on the shelf.
-        OutputExists: something on the shelf is in the way of a calibration; no cell was fitted.
+        UsageError: something on the shelf is in the way of a calibration; no cell was fitted.
         OutputFailed: a calibration could not be kept.
     """
     cells, unknown = _surveyed(logs, pool, report_progress)

@@ -18,7 +18,7 @@ from types import FrameType
 
 from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock, InterlockFile, PlannedRun, Recalibration
-from daq.errors import MountFailed, NotReleased, TimeBoundReached
+from daq.errors import JobHeld, NotReleased, TimeBoundReached
 from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
@@ -146,12 +146,12 @@ def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
     """Have the payload of a run mounted, or none; asked before every run, also where nothing changes.
 
     Raises:
-        MountFailed: the command did not end with 0, in its time.
+        JobHeld: the command did not end with 0, in its time.
     """
     wanted = planned.payload or NOTHING
     ended = run(section.mount, (wanted,), section.working_folder)
     if ended.code != 0:
-        raise MountFailed(
+        raise JobHeld(
             f"mount command {section.mount.arguments[0]} {wanted}",
             found=str(ended),
             expected="exit code 0: it is mounted as the run needs it",

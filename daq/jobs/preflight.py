@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 
 from daq.config.cell import Cell, MotionPolicy
 from daq.config.recalibration import Recalibration
-from daq.errors import ClockWentBack, ConfigurationInconsistent, DiskSpaceShort, OutputFailed
+from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, OutputFailed
 from daq.jobs.interlock import require_release
 from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import GainTarget, JobContext
@@ -84,11 +84,11 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
     """Refuse to write times that lie before those that are written down.
 
     Raises:
-        ClockWentBack: the clock is behind the newest session.
+        JobHeld: the clock is behind the newest session.
     """
     last = max(found, key=lambda session: session.last_written, default=None)
     if last is not None and now + CLOCK_SLACK < last.last_written:
-        raise ClockWentBack(
+        raise JobHeld(
             "the clock of this computer",
             found=now.isoformat(timespec="seconds"),
             expected=f"a time after {last.last_written.isoformat(timespec='seconds')}, which stands in {last.folder}",

@@ -105,7 +105,7 @@ def record_runs(context: JobContext, session: Session, journal: Journal) -> Sess
     """Make all recordings that the session does not have yet; its state is written after each of them.
 
     Raises:
-        MountFailed, NotReleased: before a run; what was recorded until then stands.
+        JobHeld, NotReleased: before a run; what was recorded until then stands.
         RunInvalid: its recorder does not stand for a run, however often it was made.
         DriverError, OutputFailed, ConfigurationError: see `daq.workflow.record`.
     """

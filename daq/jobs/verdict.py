@@ -78,7 +78,7 @@ class GainHistory:
         """Enter this session's calibration; once, however often a session is taken up.
 
         Raises:
-            HistoryMixed, HistoryUnreadable, OutputFailed: see `daq.ledger.store`.
+            DataError, HistoryUnreadable, OutputFailed: see `daq.ledger.store`.
         """
         self._digest = sha256_of(path) or ""
         self._store.add(calibration, digest=self._digest, at=self._now())
@@ -118,7 +118,7 @@ def decide_outcome(
 
     Raises:
         CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
-        ControllerChanged, ControllerBusy, ControllerUnfit, AuditUnusable, OutputFailed: see
+        ControllerChanged, CalibrationRefused, ControllerUnfit, AuditUnusable, OutputFailed: see
         `daq.writeback.file_proposal`.
     """
     session = _written_before(context, session, gain_history, journal)

@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any
 from urllib.parse import quote
 
-from daq.errors import HistoryMixed, HistoryUnreadable, OutputFailed
+from daq.errors import DataError, HistoryUnreadable, OutputFailed
 from daq.ledger import schema
 from daq.ledger.entry import (
     COLUMNS,
@@ -179,7 +179,7 @@ class HistoryStore:
             whether it is new: the same file is entered once.
 
         Raises:
-            HistoryMixed: another cell, other axes, or a gain in another unit than the history's.
+            DataError: another cell, other axes, or a gain in another unit than the history's.
             HistoryUnreadable: see `__enter__`.
             OutputFailed: the file cannot be written.
         """
@@ -348,7 +348,7 @@ class HistoryStore:
             found, expected = f"the gain of {axis} in {mine[axis]}", f"{theirs[axis]}, as in the calibrations before"
         else:
             return
-        raise HistoryMixed(
+        raise DataError(
             str(self.path),
             found=found,
             expected=expected,

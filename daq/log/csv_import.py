@@ -24,15 +24,8 @@ from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import Columns, ImportDescription, PositionUnit, Side, Table, TimeColumn, load_import
 from daq.errors import (
     ConfigurationInconsistent,
-    CurrentImplausible,
     PositionImplausible,
-    SpeedImplausible,
-    TableColumns,
-    TableEmpty,
-    TableMissing,
-    TableNotNumeric,
-    TableTruncated,
-    TimeNotUniform,
+    TableUnfit,
 )
 from daq.log.conversion import check_limits, scaling
 from daq.log.message import AxisReadback, Readback
@@ -72,28 +65,28 @@ def read_table(path: Path, table: Table) -> TableFile:
     """Read a file as lines, all of the same number of fields.
 
     Raises:
-        TableMissing: there is no such file, or it cannot be read.
-        TableEmpty: no line of numbers.
-        TableTruncated: the last line is shorter than the others, or has no end.
-        TableColumns: another line is shorter or longer than the others.
+        TableUnfit: there is no such file, or it cannot be read.
+        TableUnfit: no line of numbers.
+        TableUnfit: the last line is shorter than the others, or has no end.
+        TableUnfit: another line is shorter or longer than the others.
     """
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
-        raise TableMissing(
+        raise TableUnfit(
             str(path),
             found=(error.strerror or type(error).__name__).lower(),
             expected="a CSV file",
             remedy="check --data and the file name in the import description",
         ) from error
     except UnicodeDecodeError as error:
-        raise TableNotNumeric(
+        raise TableUnfit(
             str(path), found=f"byte {error.start} is no UTF-8", expected="text", remedy="is this a CSV file?"
         ) from error
     lines = text.splitlines()
     if len(lines) > 1 and not text.endswith(("\n", "\r")):
         # The last number may lack digits, and nobody would see it.
-        raise TableTruncated(
+        raise TableUnfit(
             f"{path}:{len(lines)}",
             found=f"a last line {lines[-1][-40:]!r} without an end of line",
             expected="an end of line, as after all others",
@@ -104,7 +97,7 @@ def read_table(path: Path, table: Table) -> TableFile:
     start = table.skip_rows + (1 if table.header else 0)
     rows = tuple(lines[start:])
     if not rows:
-        raise TableEmpty(
+        raise TableUnfit(
             str(path),
             found=f"{len(lines)} lines, of which {min(start, len(lines))} before the numbers",
             expected="a line of numbers for each sample",
@@ -120,8 +113,8 @@ def columns(file: TableFile, wanted: Columns) -> FloatArray:
     """Some columns as numbers, shape (k, len(wanted.columns)).
 
     Raises:
-        TableColumns: a column is not in the file.
-        TableNotNumeric: a field is not a finite number.
+        TableUnfit: a column is not in the file.
+        TableUnfit: a field is not a finite number.
     """
     indices = [_index(file, column) for column in wanted.columns]
     table = file.table
@@ -149,14 +142,14 @@ def _check_shape(file: TableFile, named: int) -> None:
     last = len(file.rows) - 1
     if wrong.size and (wrong[0] != last or counts[last] > usual or last == 0):
         first = int(wrong[0])
-        raise TableColumns(
+        raise TableUnfit(
             f"{file.path}:{file.first_line + first}",
             found=f"{counts[first]} columns",
             expected=f"{usual}, as in {'the header' if named else 'most lines'}",
             remedy="check the delimiter in the import description, and the export",
         )
     if wrong.size or not file.fields(file.rows[last])[-1]:
-        raise TableTruncated(
+        raise TableUnfit(
             f"{file.path}:{file.first_line + last}",
             found=f"a last line {file.rows[last][-40:]!r} of {counts[last]} fields",
             expected=f"{usual} complete fields",
@@ -169,12 +162,12 @@ def _index(file: TableFile, column: str | int) -> int:
     if isinstance(column, int):
         if column <= width:
             return column - 1
-        raise TableColumns(
+        raise TableUnfit(
             str(file.path), found=f"{width} columns", expected=f"a column {column}", remedy="columns count from 1"
         )
     if file.names.count(column) == 1:
         return file.names.index(column)
-    raise TableColumns(
+    raise TableUnfit(
         str(file.path),
         found=f"columns {', '.join(file.names)}",
         expected=f"one column {column!r}",
@@ -182,7 +175,7 @@ def _index(file: TableFile, column: str | int) -> int:
     )
 
 
-def _not_numeric(file: TableFile, indices: list[int]) -> TableNotNumeric:
+def _not_numeric(file: TableFile, indices: list[int]) -> TableUnfit:
     """The error for the first field that is no finite number."""
     for number, row in enumerate(file.rows):
         fields = file.fields(row)
@@ -190,13 +183,13 @@ def _not_numeric(file: TableFile, indices: list[int]) -> TableNotNumeric:
             text = fields[index].replace(",", ".") if file.table.decimal == "," else fields[index]
             if not _finite(text):
                 label = file.names[index] if file.names else str(index + 1)
-                return TableNotNumeric(
+                return TableUnfit(
                     f"{file.path}:{file.first_line + number}, column {label}",
                     found=repr(fields[index]),
                     expected="a finite number",
                     remedy="samples are never invented: cut the recording there, or export it again",
                 )
-    return TableNotNumeric(
+    return TableUnfit(
         str(file.path), found="fields that are no numbers", expected="numbers", remedy="check the decimal sign"
     )
 
@@ -240,8 +233,8 @@ def import_csv(
 
     Raises:
         ConfigurationError: description or cell are wrong, or contradict each other.
-        TableUnfit, CurrentImplausible, PositionImplausible, SpeedImplausible: the files cannot be used.
-        OutputExists, OutputFailed: the log cannot be written.
+        TableUnfit, TableUnfit, PositionImplausible, TableUnfit: the files cannot be used.
+        UsageError, OutputFailed: the log cannot be written.
     """
     wanted = load_import(description)
     path = cell_path or wanted.cell
@@ -321,7 +314,7 @@ def _counts(
         fractional = np.argwhere(position != np.rint(position))
         if fractional.size or np.abs(position).max() > LARGEST_RAW:
             row, column = fractional[0] if fractional.size else np.argwhere(np.abs(position) > LARGEST_RAW)[0]
-            raise TableNotNumeric(
+            raise TableUnfit(
                 f"{file.path}:{file.first_line + row}, column {wanted.position.columns[column]}",
                 found=f"{position[row, column]!r}",
                 expected="a whole number of encoder counts of at most 31 bits",
@@ -350,7 +343,7 @@ def _rate_hz(wanted: ImportDescription, files: dict[str, TableFile]) -> float:
     """The rate that the description states, or that the time column shows.
 
     Raises:
-        TimeNotUniform: a time stamp is more than half a period from where it should be.
+        TableUnfit: a time stamp is more than half a period from where it should be.
     """
     if not isinstance(wanted.rate, TimeColumn):
         return wanted.rate
@@ -361,7 +354,7 @@ def _rate_hz(wanted: ImportDescription, files: dict[str, TableFile]) -> float:
     wrong = np.abs(np.diff(time_s) - period_s) > TIME_TOLERANCE * period_s
     if period_s <= 0.0 or wrong.any():
         row = int(np.argmax(wrong))
-        raise TimeNotUniform(
+        raise TableUnfit(
             f"{file.path}:{file.first_line + row + 1}, column {wanted.rate.columns.columns[0]}",
             found=f"{time_s[min(row + 1, len(time_s) - 1)] - time_s[row]:.6g} s after the sample before",
             expected=f"{period_s:.6g} s, the same between all samples",
@@ -415,7 +408,7 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
 def _check_lengths(files: dict[str, TableFile]) -> None:
     lengths = {name: len(file.rows) for name, file in files.items()}
     if len(set(lengths.values())) > 1:
-        raise TableColumns(
+        raise TableUnfit(
             ", ".join(str(file.path) for file in files.values()),
             found=" and ".join(f"{length} rows in {name}" for name, length in lengths.items()),
             expected="as many in each",
@@ -430,14 +423,14 @@ def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFi
     for index, column in enumerate(wanted.current.columns):
         row = int(np.argmax(size[:, index]))
         if size[row, index] == 0.0:
-            raise CurrentImplausible(
+            raise TableUnfit(
                 f"{file.path}, column {column}",
                 found="zero in every row",
                 expected="the current reference of a motor that moves",
                 remedy="is the channel connected, and the column the right one?",
             )
         if size[row, index] > LARGEST_OUTLIER * max(usual[index], 1e-200):
-            raise CurrentImplausible(
+            raise TableUnfit(
                 f"{file.path}:{file.first_line + row}, column {column}",
                 found=f"{current[row, index]:.6g}, while 99 % of the column are within {usual[index]:.3g}",
                 expected="a current",
@@ -453,7 +446,7 @@ def _check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     for axis, speed, limit in zip(cell.axes, fastest.tolist(), limits.tolist(), strict=True):
         if speed > SPEED_MARGIN * limit:
-            raise SpeedImplausible(
+            raise TableUnfit(
                 f"{name}, axis {axis.name}",
                 found=f"{axis.unit.spell(speed)}/s over {step} samples at {rate_hz:g} Hz",
                 expected=f"at most {axis.unit.spell(limit)}/s, the limit in the cell configuration",

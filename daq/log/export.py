@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
-from daq.errors import ConfigurationMissing, OutputExists, OutputFailed
+from daq.errors import ConfigurationMissing, OutputFailed, UsageError
 from daq.log.conversion import moves, scaling
 from daq.log.reader import LogReader, SampleBlock
 from drivers.stream.sample import CellEvent
@@ -78,14 +78,14 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         kind: of file.
 
     Raises:
-        OutputExists: there is a file of that name.
+        UsageError: there is a file of that name.
         OutputFailed: the file system refuses.
         ConfigurationMissing: the package for the format is missing.
         LogUnreadable: the log is damaged or lacks what makes it one; nothing is written then.
     """
     require_format(kind)
     if out.exists():
-        raise OutputExists(
+        raise UsageError(
             str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
         )
     reader = LogReader(log)

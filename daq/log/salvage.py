@@ -60,7 +60,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
 
     Raises:
         UsageError: the recorder still writes the file, or nothing is wrong with it.
-        OutputExists, OutputFailed: the log cannot be written.
+        UsageError, OutputFailed: the log cannot be written.
         LogUnreadable: not even one sample, or not the start of the log, can be saved.
         ConfigurationError: the cell configuration in it is inconsistent.
     """

@@ -14,7 +14,7 @@ from types import TracebackType
 
 from mcap.writer import CompressionType, Writer
 
-from daq.errors import OutputExists, OutputFailed
+from daq.errors import OutputFailed, UsageError
 from daq.log.container import UNFINISHED
 from daq.log.message import (
     DEFINITIONS,
@@ -78,7 +78,7 @@ class LogWriter:
     error the `.part` keeps everything up to that moment.
 
     Raises (on entry and later):
-        OutputExists: the log, or a `.part` of the same name, is there already; or at the end, when somebody has put a
+        UsageError: the log, or a `.part` of the same name, is there already; or at the end, when somebody has put a
             file there meanwhile: then the `.part` is the whole log.
         OutputFailed: the file system refuses.
     """
@@ -118,7 +118,7 @@ class LogWriter:
     def __enter__(self) -> LogWriter:
         """Open the file and write all that stands before the first sample."""
         if self.path.exists():
-            raise OutputExists(
+            raise UsageError(
                 str(self.path),
                 found="a file of that name",
                 expected="none",
@@ -127,7 +127,7 @@ class LogWriter:
         try:
             self._stream: BufferedWriter = self.part.open("xb")
         except FileExistsError as error:
-            raise OutputExists(
+            raise UsageError(
                 str(self.part),
                 found="an unfinished log of that name",
                 expected="none",
@@ -258,8 +258,8 @@ class LogWriter:
         else:
             self.part.unlink()
 
-    def _name_taken(self) -> OutputExists:
-        return OutputExists(
+    def _name_taken(self) -> UsageError:
+        return UsageError(
             str(self.path),
             found="a file of that name, which was not there when the recording began",
             expected="none",

@@ -18,7 +18,7 @@ from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.errors import OutputExists, UsageError
+from daq.errors import UsageError
 from daq.report.fit import draw
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.calibration_file import as_document, save
@@ -193,7 +193,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 def _make_room(out: Path, logs: tuple[Path, ...]) -> None:
     """Take a folder, and remove what an earlier demonstration left in it; a folder of anything else is not ours."""
     if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / MARK).is_file())):
-        raise OutputExists(
+        raise UsageError(
             str(out),
             found="something that is no folder of a demonstration",
             expected="no such folder, an empty one, or that of an earlier demonstration",

@@ -15,7 +15,7 @@ import yaml
 from pydantic import Field
 
 from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
-from daq.errors import CalibrationEdited, CalibrationMissing, CalibrationUnreadable, SchemaMismatch, YamlInvalid
+from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.data.run import Recording
@@ -276,7 +276,7 @@ def load(path: Path) -> Calibration:
     Raises:
         CalibrationMissing: there is no such file, it is none but a folder or a pipe, or it cannot be read.
         CalibrationUnreadable: no calibration of this version, or a key, type or number does not belong, with its line.
-        CalibrationEdited: the content is not what `save` wrote, with the sections that were changed.
+        CalibrationRefused: the content is not what `save` wrote, with the sections that were changed.
     """
     return decode(read(path), str(path))
 
@@ -313,7 +313,7 @@ def decode(content: bytes, name: str) -> Calibration:
         ) from error
     edited = _edited_sections(document.tree)
     if edited:
-        raise CalibrationEdited(
+        raise CalibrationRefused(
             name,
             found=f"a change by hand in {', '.join(edited)}",
             expected="the content that was fitted",

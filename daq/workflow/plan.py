@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell, JointUnit
-from daq.errors import PlanUnfit
+from daq.errors import UsageError
 from daq.workflow.experiment import Experiment, PlannedMove, duration_of, experiment_of
 from daq.workflow.plan_search import Search
 from drivers.motion.move import Trapezoid, synchronised
@@ -85,7 +85,7 @@ def plan(
         progress: told the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
-        PlanUnfit: no plan of this length shows every gain, or there is no clear way.
+        UsageError: no plan of this length shows every gain, or there is no clear way.
         ConfigurationInconsistent: the cell declares no payload.
     """
     experiment = experiment or experiment_of(cell)
@@ -97,14 +97,14 @@ def plan(
     subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if found > largest_condition:
-        raise PlanUnfit(
+        raise UsageError(
             subject,
             found=f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges",
             expected=f"at most {largest_condition:.0f}",
             remedy=remedy,
         )
     if predicted[worst] > largest_std_percent:
-        raise PlanUnfit(
+        raise UsageError(
             subject,
             found=f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}",
             expected=f"at most {largest_std_percent:g} %",

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from daq.errors import PlanUnfit
+from daq.errors import UsageError
 from daq.workflow.experiment import Experiment, PlannedMove, path_of
 from drivers.motion.move import Trapezoid
 from ident.planning.clearance import Obstruction
@@ -102,7 +102,7 @@ class Search:
         """Clear random moves that fill the duration.
 
         Raises:
-            PlanUnfit: it has no room for five moves, or no clear way is found.
+            UsageError: it has no room for five moves, or no clear way is found.
         """
         most: list[PlannedMove] = []
         for _ in range(MAX_STARTS):
@@ -261,16 +261,16 @@ class Search:
         units = [axis.unit.si for axis in self._cell.axes]
         return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
 
-    def _blocked(self, what: str) -> PlanUnfit:
+    def _blocked(self, what: str) -> UsageError:
         return self._unfit(
             f"no clear {what} among hundreds of random ones",
             "room to move in",
             "correct `workspace` and `clearance` in the cell file, or the joint limits",
         )
 
-    def _unfit(self, found: str, expected: str, remedy: str) -> PlanUnfit:
+    def _unfit(self, found: str, expected: str, remedy: str) -> UsageError:
         subject = f"plan of {self._duration_s:g} s for cell {self._cell.name!r}"
-        return PlanUnfit(subject, found=found, expected=expected, remedy=remedy)
+        return UsageError(subject, found=found, expected=expected, remedy=remedy)
 
 
 _Way = tuple[tuple[float, ...], PlannedMove]

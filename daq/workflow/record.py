@@ -152,7 +152,7 @@ def record(
         MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
             marked invalid.
-        ConfigurationInconsistent, OutputExists, OutputFailed: see daq/errors.py.
+        ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
         DriverError: from the bus; the axes were stopped. What was recorded until then stays in an unfinished log
             (`.part`), which no fit reads and `daq.log.salvage` makes a partial log of.
     """

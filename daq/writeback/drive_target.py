@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.errors import BackupMissing, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditRecorder
 from daq.writeback.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
@@ -60,7 +60,7 @@ def plan_drive_rollback(declared: Cell, network: CanopenNetwork) -> DriveRollbac
         network: of all axes of the cell, open, and not prepared for recording.
 
     Raises:
-        BackupMissing: there is no record of such a write.
+        CalibrationRefused: there is no record of such a write.
         ControllerUnfit: its record was changed, or is of another cell.
         ControllerChanged: a drive was exchanged, or somebody has changed a gain since.
         DriverError: see `drivers.canopen.parameters.read_parameters`.
@@ -79,7 +79,7 @@ def plan_drive_rollback(declared: Cell, network: CanopenNetwork) -> DriveRollbac
             for value, note in zip(base, record.drives, strict=True)
         )
         return DriveRollback(declared.name, folder, record, base, writes)
-    raise BackupMissing(
+    raise CalibrationRefused(
         drives_of(declared.name),
         found=f"{len(paths)} records of what stands there now" if paths else f"no record in {folder}",
         expected="the record of a write that changed them",
@@ -172,7 +172,7 @@ def apply_to_drives(
     Raises:
         CalibrationRefused: a gate is closed, with every one of them.
         ControllerChanged: something else stands in the drives than when the change was worked out.
-        ControllerBusy: another drivegain writes them.
+        CalibrationRefused: another drivegain writes them.
         AuditUnusable: what is done could not be written down.
         DriverError: see `drivers.canopen.parameters.write_parameters`.
         OSError: the record could not be written; nothing was written to the drives.
@@ -209,7 +209,7 @@ def roll_back_drives(
 
     Raises:
         ControllerChanged: something else stands in the drives than when the way was worked out.
-        ControllerBusy, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
+        CalibrationRefused, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
     """
     details = {"drives": _documented(rollback.base, rollback.writes), "restored": str(rollback.record.path)}
     with exclusive_writer(_made(rollback.folder)):

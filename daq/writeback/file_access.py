@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daq.errors import ControllerBusy, ControllerUnfit
+from daq.errors import CalibrationRefused, ControllerUnfit
 from daq.files import fsync_folder, replace_file
 from daq.writeback.formats.document import read_bytes
 
@@ -136,7 +136,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
     that has no name any more, which it sees by the inode, and takes the lock anew.
 
     Raises:
-        ControllerBusy: somebody else holds it.
+        CalibrationRefused: somebody else holds it.
         OSError: from the file system.
     """
     lock = target.parent / f".{target.name}.lock"
@@ -181,7 +181,7 @@ def _take(descriptor: int, target: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise ControllerBusy(
+        raise CalibrationRefused(
             str(target),
             found="another drivegain writing it",
             expected="one writer at a time",

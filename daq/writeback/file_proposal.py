@@ -202,7 +202,7 @@ def apply(proposal: Proposal, now: datetime, *, audit: Path | None = None, who: 
 
     Raises:
         CalibrationRefused: a gate is closed, with every one of them.
-        ControllerChanged, ControllerBusy, AuditUnusable: see `daq.writeback.file_target.write`.
+        ControllerChanged, CalibrationRefused, AuditUnusable: see `daq.writeback.file_target.write`.
         OSError: from the file system; the file stands as it was.
     """
     details = {"changes": [_documented(change) for change in proposal.changes], **proposal.evidence}

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from daq.config.controller import ControllerFormat
-from daq.errors import BackupMissing, ControllerChanged
+from daq.errors import CalibrationRefused, ControllerChanged
 from daq.files import replace_file, sha256
 from daq.ledger.audit import AuditAction, AuditRecorder
 from daq.writeback.file_access import Backup, back_up, backups, exclusive_writer, put_back, resolve_links, short_digest
@@ -81,7 +81,7 @@ def write(
 
     Raises:
         ControllerChanged: somebody has changed the file since, or saves it while it is written.
-        ControllerBusy: somebody is writing it.
+        CalibrationRefused: somebody is writing it.
         ControllerUnfit: from `check`, or it cannot be read.
         AuditUnusable: it could not be written down; the old content stands.
         OSError: from the file system; the old content stands, and neither backup nor temporary file is left.
@@ -127,8 +127,8 @@ def roll_back(
         format: of the file; None where its name tells.
 
     Raises:
-        BackupMissing: there is none.
-        ControllerBusy: somebody is writing the file.
+        CalibrationRefused: there is none.
+        CalibrationRefused: somebody is writing the file.
         ControllerChanged: the file is not what was written when that backup was made: somebody has edited it since.
         ControllerUnfit: the file cannot be read; the backup was changed, or does not parse.
         AuditUnusable: it could not be written down; the file stands as it was.
@@ -159,7 +159,7 @@ def _backup_to_restore(file: Path, target: Path, before: bytes | None) -> Backup
         # A writer that was killed before it replaced the file leaves a backup of what is still there.
         if before is None or backup.was != short_digest(before):
             return backup
-    raise BackupMissing(
+    raise CalibrationRefused(
         str(file),
         found=f"{len(found)} backups with the same content" if found else "no backup beside it",
         expected=f"{target.name}.<time>.<digests>.bak with another content",

@@ -13,9 +13,7 @@ from daq.config.yaml_file import MAX_BYTES
 from daq.errors import (
     CalibrationMissing,
     ConfigurationInconsistent,
-    OutputExists,
     OutputFailed,
-    SecretKeyUnfit,
     SignatureInvalid,
     UsageError,
 )
@@ -48,13 +46,13 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
 
     Raises:
         UsageError: not a name for a file.
-        OutputExists: there is a key of this name; it is never replaced.
+        UsageError: there is a key of this name; it is never replaced.
         OutputFailed: from the file system.
     """
     secret, public = folder / f"{_checked(name)}.key", folder / f"{name}.pub"
     for path in (secret, public):
         if path.exists() or path.is_symlink():
-            raise OutputExists(
+            raise UsageError(
                 str(path), found="a key", expected="no file", remedy="keys are not replaced: choose another name"
             )
     key = SecretKey(os.urandom(8), os.urandom(32))
@@ -68,7 +66,7 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
 
 
 def needs_password(secret_key: Path) -> bool:
-    """Whether a secret key is encrypted. Raises SecretKeyUnfit as `sign`."""
+    """Whether a secret key is encrypted. Raises UsageError as `sign`."""
     try:
         return is_encrypted(_read_key(secret_key))
     except ValueError as error:
@@ -90,16 +88,16 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
 
     Raises:
         UsageError: not a name for a file.
-        SecretKeyUnfit: no secret key, another password, or a plain key that others may read.
+        UsageError: no secret key, another password, or a plain key that others may read.
         CalibrationMissing: the file cannot be read.
-        OutputExists: something that is no signature stands where it would go.
+        UsageError: something that is no signature stands where it would go.
         OutputFailed: from the file system.
     """
     path = signature_path(file, _checked(name))
     key = _secret_key(secret_key, password)
     content = _read_signed(file)
     if _is_in_the_way(path):
-        raise OutputExists(
+        raise UsageError(
             str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
         )
     when = [] if at is None else [f"timestamp:{int(at.timestamp())}", f"at:{at.isoformat(timespec='seconds')}"]
@@ -198,7 +196,7 @@ def _secret_key(path: Path, password: str) -> SecretKey:
         raise _unfit(path, error) from error
     mode = stat.S_IMODE(path.stat().st_mode)
     if plain and mode & 0o077:
-        raise SecretKeyUnfit(
+        raise UsageError(
             str(path),
             found=f"a key without a password that others may read (mode {mode:04o})",
             expected="mode 0600",
@@ -214,8 +212,8 @@ def _read_key(path: Path) -> str:
         raise _unfit(path, error) from error
 
 
-def _unfit(path: Path, error: Exception) -> SecretKeyUnfit:
-    return SecretKeyUnfit(
+def _unfit(path: Path, error: Exception) -> UsageError:
+    return UsageError(
         str(path),
         found=_spelled(error),
         expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",

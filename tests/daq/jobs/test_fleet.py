@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 
 from daq.cli import main
 from daq.config.cell_file import bundle
-from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputExists, OutputFailed, UsageError
+from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError
 from daq.jobs import fleet as fleet_module
 from daq.jobs import workers as workers_module
 from daq.jobs.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell, open_cache
@@ -276,7 +276,7 @@ def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fit
         target.mkdir() if what == "link to a folder" else os.mkfifo(target)
         file.symlink_to(target)
     before = file.lstat().st_ino
-    with pytest.raises(OutputExists, match=re.escape(str(file))) as caught:
+    with pytest.raises(UsageError, match=re.escape(str(file))) as caught:
         _fitted(few, out)
     assert ("a folder" if "folder" in what else "no regular file") in str(caught.value)
     assert "move it away" in str(caught.value)

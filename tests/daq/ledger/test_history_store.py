@@ -19,7 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.errors import HistoryMixed, HistoryUnreadable, OutputFailed, exit_code
+from daq.errors import DataError, HistoryUnreadable, OutputFailed, exit_code
 from daq.ledger import schema
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
 from daq.ledger.store import HistoryStore
@@ -97,10 +97,10 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, different: str) -> N
     }[different]
     with HistoryStore(tmp_path / "h") as store:
         enter(store, known)
-        with pytest.raises(HistoryMixed) as refused:
+        with pytest.raises(DataError) as refused:
             enter(store, other)
         assert len(store.entries()) == 1
-    assert exit_code(HistoryMixed) == 4
+    assert exit_code(DataError) == 4
     assert "nothing was entered" in refused.value.remedy
 
 
@@ -336,7 +336,7 @@ def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random)
                 store.entries()
                 store.integrity()
                 enter(store, calibration_of(9))
-        except (HistoryUnreadable, HistoryMixed, OutputFailed) as error:
+        except (DataError, OutputFailed) as error:
             assert str(path) in str(error)
 
 

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, OutputExists, TimeNotUniform
+from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
 
@@ -274,7 +274,7 @@ def test_a_missing_description(bench: Bench, capsys: pytest.CaptureFixture[str])
 
 def test_an_existing_log_stays(bench: Bench) -> None:
     bench.out.write_bytes(b"precious")
-    with pytest.raises(OutputExists):
+    with pytest.raises(UsageError, match="a file of that name"):
         import_csv(bench.description, bench.data, bench.out, software="x")
     assert bench.out.read_bytes() == b"precious"
     assert bench.left == ["run.mcap"]
@@ -352,7 +352,7 @@ def test_the_rate_of_a_time_column(bench: Bench) -> None:
 @pytest.mark.parametrize(("index", "shift"), [(100, 4.0), (100, -4.0), (299, 3.0)])
 def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
     _with_time(bench, 4.0 * np.arange(300) + shift * (np.arange(300) >= index))
-    with pytest.raises(TimeNotUniform, match=rf"run\.csv:{index + 2}, column t"):
+    with pytest.raises(TableUnfit, match=rf"run\.csv:{index + 2}, column t"):
         import_csv(bench.description, bench.data, bench.out, software="x")
     assert bench.left == []
 

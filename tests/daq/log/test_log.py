@@ -16,7 +16,7 @@ from mcap.records import Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
-from daq.errors import LogIncomplete, OutputExists, OutputFailed
+from daq.errors import LogIncomplete, OutputFailed, UsageError
 from daq.log.container import RecordFile
 from daq.log.reader import LogReader, read_log
 from daq.log.writer import LogWriter
@@ -153,7 +153,7 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
         found.extend(StreamReader(stream).records)
     sequences = [record.sequence for record in found if isinstance(record, Message)]
     assert sequences == [10, 0, *range(11, 17)]  # seven samples, and after the first of them the first JointState
-    with pytest.raises(OutputExists, match="unfinished"):
+    with pytest.raises(UsageError, match="unfinished"):
         write(path, content(1), samples([[0]]))
     assert part.read_bytes() == data
 
@@ -161,7 +161,7 @@ def test_an_error_leaves_the_part_with_everything_so_far(tmp_path: Path) -> None
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", content(1), samples([[0]]))
     before = path.read_bytes()
-    with pytest.raises(OutputExists):
+    with pytest.raises(UsageError, match="a file of that name"):
         write(path, content(1), samples([[1]]))
     assert path.read_bytes() == before
     with pytest.raises(OutputFailed, match="no such file"):
@@ -183,7 +183,7 @@ def test_a_file_that_appeared_meanwhile_is_not_replaced(
             log.conclude(True)
             path.write_bytes(b"somebody else's")
 
-    with pytest.raises(OutputExists, match=r"a\.mcap\.part") as raised:
+    with pytest.raises(UsageError, match=r"a\.mcap\.part") as raised:
         record()
     assert path.read_bytes() == b"somebody else's"
     assert "which was not there" in raised.value.found

@@ -18,7 +18,7 @@ import yaml
 
 from daq.cli.app import main
 from daq.config.policy import ApplyPolicy
-from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, OutputExists, UsageError
+from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, UsageError
 from daq.log.conversion import load_run
 from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
@@ -182,7 +182,7 @@ def test_the_name_of_the_whole_recording_is_not_taken(part: Path, tmp_path: Path
     with pytest.raises(UsageError, match=r"run-partial\.mcap"):
         salvage(part, tmp_path / "run.mcap")
     (tmp_path / "there.mcap").touch()
-    with pytest.raises(OutputExists):
+    with pytest.raises(UsageError, match="a file of that name"):
         salvage(part, tmp_path / "there.mcap")
 
 

@@ -20,7 +20,7 @@ from daq.cli.residual import DOCUMENT, PAGE, check_report, save_report
 from daq.cli.verb import json_text
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.errors import ExitCode, OutputExists, OutputFailed
+from daq.errors import ExitCode, OutputFailed, UsageError
 from daq.report.effect_names import WORDS, effect_text, other_axis, placed_name
 from daq.report.residual_document import error_change_text, residual_document, summary
 from daq.report.residual_page import page, paragraph, residual_page, table
@@ -288,7 +288,7 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("the user's own", encoding="utf-8")
-        with pytest.raises(OutputExists, match=name):
+        with pytest.raises(UsageError, match=name):
             check_report(folder)
         # Nothing of the logs is looked at: they do not exist.
         assert main(["residual", "no.mcap", "--report", str(folder)]) == ExitCode.USAGE

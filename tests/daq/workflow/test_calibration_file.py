@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 
-from daq.errors import CalibrationEdited, CalibrationMissing, CalibrationUnreadable, exit_code
+from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
 from daq.workflow.calibration_file import as_document, decode, encode, load, save
 from ident.calibration import Calibration
 from tests.daq.calibrations import calibrations, demo_calibration
@@ -73,7 +73,7 @@ def test_an_edit_by_hand_is_noticed_and_named(path: Path, old: str, new: str, se
     text = path.read_text()
     assert text.count(old) == 1
     path.write_text(text.replace(old, new))
-    with pytest.raises(CalibrationEdited, match=rf"by hand in {section};"):
+    with pytest.raises(CalibrationRefused, match=rf"by hand in {section};"):
         load(path)
 
 
@@ -124,7 +124,7 @@ def test_a_truncated_file_is_never_taken_for_a_whole_one(path: Path) -> None:
     content = path.read_bytes()
     for length in range(0, len(content) - 1, 97):
         path.write_bytes(content[:length])
-        with pytest.raises((CalibrationUnreadable, CalibrationEdited)):
+        with pytest.raises((CalibrationUnreadable, CalibrationRefused)):
             load(path)
 
 
@@ -139,7 +139,7 @@ def test_a_number_that_is_not_finite_is_not_saved(path: Path) -> None:
 def test_the_exit_codes_distinguish_data_from_refusal() -> None:
     assert exit_code(CalibrationUnreadable) == 4
     assert exit_code(CalibrationMissing) == 4
-    assert exit_code(CalibrationEdited) == 3
+    assert exit_code(CalibrationRefused) == 3
 
 
 @pytest.mark.parametrize("call", ["open", "fchmod", "fsync", "replace"])

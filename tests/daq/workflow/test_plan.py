@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.clearance import Clearance
-from daq.errors import ConfigurationInconsistent, PlanUnfit
+from daq.errors import ConfigurationInconsistent, UsageError
 from daq.workflow.experiment import Experiment, experiment_of, paths_of
 from daq.workflow.plan import Plan, plan, slowed
 from drivers.motion.move import Trapezoid
@@ -121,14 +121,14 @@ def test_other_robots_can_be_planned_for(name: str) -> None:
 
 
 def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment: Experiment) -> None:
-    with pytest.raises(PlanUnfit, match="predicted for the gain of J"):
+    with pytest.raises(UsageError, match="predicted for the gain of J"):
         plan(demo, seed=1, exchanges=0, experiment=experiment, largest_std_percent=0.01)
-    with pytest.raises(PlanUnfit, match="condition"):
+    with pytest.raises(UsageError, match="condition"):
         plan(demo, seed=1, exchanges=0, experiment=experiment, largest_condition=2.0)
-    with pytest.raises(PlanUnfit, match="room for"):
+    with pytest.raises(UsageError, match="room for"):
         plan(demo, seed=1, duration_s=1.0, experiment=experiment)
     walled = replace(demo, clearance=replace(TIGHT, workspace=Box("workspace", (5.0, 5.0, 5.0), (6.0, 6.0, 6.0))))
-    with pytest.raises(PlanUnfit, match="no clear posture"):
+    with pytest.raises(UsageError, match="no clear posture"):
         plan(walled, seed=1)
     with pytest.raises(ConfigurationInconsistent, match="weigh a body"):
         plan(replace(demo, payloads=()), seed=1)

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
-from daq.errors import BackupMissing, CalibrationRefused, ControllerBusy, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read
 from daq.writeback.file_access import backups, exclusive_writer
 from daq.writeback.file_proposal import Proposal, apply, propose
@@ -129,7 +129,7 @@ def test_a_second_writer_is_refused(controller: Path) -> None:
     lock = controller.parent / ".demo.yaml.lock"
     with lock.open("w") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(ControllerBusy):
+        with pytest.raises(CalibrationRefused, match="another drivegain writing it"):
             apply(proposal, NOW)
         assert lock.exists()
     assert controller.read_bytes() == before
@@ -157,13 +157,14 @@ def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: 
     shared = Path(tempfile.mkdtemp())
     lock = lock.rename(shared / lock.name)
     shared.chmod(0o1777)
+    busy = pytest.raises(CalibrationRefused, match="another drivegain writing it")
     os.seteuid(65534)
     try:
         fcntl.flock(held, fcntl.LOCK_EX)
-        with pytest.raises(ControllerBusy), exclusive_writer(shared / "x.yaml"):
+        with busy, exclusive_writer(shared / "x.yaml"):
             pass
         fcntl.flock(held, fcntl.LOCK_UN)
-        with exclusive_writer(shared / "x.yaml"), pytest.raises(ControllerBusy), exclusive_writer(shared / "x.yaml"):
+        with exclusive_writer(shared / "x.yaml"), busy, exclusive_writer(shared / "x.yaml"):
             pass
         assert lock.exists()  # root's, in a folder where each removes their own
     finally:
@@ -335,16 +336,16 @@ def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str =
 
 
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
-    with pytest.raises(BackupMissing, match="no backup beside it"):
+    with pytest.raises(CalibrationRefused, match="no backup beside it"):
         roll_back(controller, NOW)
     # What a writer leaves that was killed before it replaced the file is no way back either.
     _make_backup(controller, controller.read_bytes(), b"never written")
-    with pytest.raises(BackupMissing, match="same content"):
+    with pytest.raises(CalibrationRefused, match="same content"):
         roll_back(controller, NOW)
     controller.with_name("demo.yaml.bak").write_text("a human's own")
     controller.unlink()
     controller.parent.joinpath("other.yaml").write_text("x: 1\n")
-    with pytest.raises(BackupMissing, match="no backup beside it"):
+    with pytest.raises(CalibrationRefused, match="no backup beside it"):
         roll_back(controller.with_name("other.yaml"), NOW)
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
-from daq.errors import BackupMissing, CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read, verify
 from daq.writeback.drive_proposal import DriveProposal, propose_to_drives
 from daq.writeback.drive_record import read_record, read_records, record_folder
@@ -493,7 +493,7 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
 def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
-        with pytest.raises(BackupMissing, match="no record"):
+        with pytest.raises(CalibrationRefused, match="no record"):
             roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         written = _write(cell, address)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
@@ -570,7 +570,7 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Pa
             if writes:
                 roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
             else:
-                with pytest.raises(BackupMissing, match="1 records of what stands there now"):
+                with pytest.raises(CalibrationRefused, match="1 records of what stands there now"):
                     roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
