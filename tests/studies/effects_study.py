@@ -257,15 +257,15 @@ def _is_structure_of(row: Row) -> bool:
 def table(rows: Iterable[Row]) -> str:
     """For docs/evidence/effects-study.md."""
     lines = [
-        "| case | named | error before → after (clean) % | worst gain before → after % |",
-        "|---|---|---|---|",
+        "| part | effects | named | error before % | after % | clean % | worst gain before % | after % |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        floor = "" if row.floor_percent is None else f" ({row.floor_percent:.2f})"
+        floor = "" if row.floor_percent is None else f"{row.floor_percent:.2f}"
         lines.append(
-            f"| {row.part}: {', '.join(row.true) or 'clean'} | {', '.join(row.named) or '–'} | "
-            f"{row.error_before_percent:.2f} → {row.error_after_percent:.2f}{floor} | "
-            f"{row.max_gain_error_before_percent:.2f} → {row.max_gain_error_percent:.2f} |"
+            f"| {row.part} | {', '.join(row.true) or 'clean'} | {', '.join(row.named) or '–'} | "
+            f"{row.error_before_percent:.2f} | {row.error_after_percent:.2f} | {floor} | "
+            f"{row.max_gain_error_before_percent:.2f} | {row.max_gain_error_percent:.2f} |"
         )
     return "\n".join(lines)
 
