@@ -1,4 +1,7 @@
-"""What a plant may do that no configuration declares: made by physics, a file each."""
+"""Undeclared effects of a simulated plant: the physics that no configuration declares and `ident` has to discover.
+
+To add one, write a class with an `axis`, its parameters in SI units and an `act(moment)`, and a line in `EFFECTS`.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,15 @@ from numpy.typing import NDArray
 
 from drivers.simulation.spec import EffectUnknown, UndeclaredEffect
 
-# What an undeclared effect sees of the plant in one substep, and what it may change.
-
-
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(slots=True)
 class Moment:
-    """One substep of n joints and motors, N coordinates and m directions of dry friction.
+    """State of the plant in one substep: what an effect reads and what it may change.
 
-    Coordinates are the joints first, then the motors behind a flexible drive; of a prismatic joint N for Nm, m for rad.
+    There are n joints and motors, N coordinates and m directions of dry friction. The coordinates are the joints,
+    then the motors behind a flexible drive. A prismatic joint has N for Nm and m for rad.
 
     Attributes:
         time_s: since power-on.
@@ -28,7 +29,7 @@ class Moment:
         position_rad, velocity_rad_s: at its start, shape (N,); read only.
         motor_rad: rotor angles, shape (n,); read only.
         current_a: in the motors, shape (n,); read only.
-        load_torque_nm: what the links asked of each joint in the step before, shape (n,); read only.
+        load_torque_nm: torque of the links on each joint in the step before, shape (n,); read only.
         bound_nm: of dry friction, shape (m,); the first n are the joints'. May be changed; must not become negative.
         viscous_nm_s_rad: of viscous friction, shape (N,); may be changed.
         torque_nm: other torques on each coordinate, shape (N,); may be changed.
@@ -48,12 +49,9 @@ class Moment:
     motor_torque_nm: FloatArray
 
 
-# Stribeck: dry friction is larger near standstill.
-
-
 @dataclass(frozen=True, slots=True)
 class Stribeck:
-    """Dry friction Fs + rise·exp(−|v|/speed): static friction exceeds the sliding one (Bo and Pavelescu 1982)."""
+    """Stribeck friction Fs + rise·exp(−|v|/speed): larger near standstill than sliding (Bo and Pavelescu 1982)."""
 
     axis: int
     rise_nm: float
@@ -65,12 +63,9 @@ class Stribeck:
         moment.bound_nm[self.axis] += self.rise_nm * math.exp(-speed / self.speed_rad_s)
 
 
-# Load-dependent friction: what the gear transmits presses its teeth together.
-
-
 @dataclass(frozen=True, slots=True)
 class LoadFriction:
-    """Dry friction Fs + coefficient·|τ_L|; τ_L is what the links ask of the joint (gravity, inertia, payload)."""
+    """Dry friction Fs + coefficient·|τ_L| of a loaded gear; τ_L is the torque of the links on the joint."""
 
     axis: int
     coefficient: float
@@ -80,12 +75,9 @@ class LoadFriction:
         moment.bound_nm[self.axis] += self.coefficient * abs(moment.load_torque_nm[self.axis])
 
 
-# Viscous friction that is not proportional to speed (lubricants shear-thin, seals and churning do not).
-
-
 @dataclass(frozen=True, slots=True)
 class NonlinearViscous:
-    """Friction c·|v|^η against the motion, v in rad/s, beside the linear one.
+    """Friction c·|v|^η against the motion, v in rad/s, beside the linear one: lubricants, seals, churning.
 
     It joins the bound of dry friction, which can only dissipate: as an explicit torque |v|^(1/3) would chatter at zero.
     """
@@ -99,28 +91,22 @@ class NonlinearViscous:
         moment.bound_nm[self.axis] += self.torque_at_1_rad_s_nm * abs(moment.velocity_rad_s[self.axis]) ** self.exponent
 
 
-# Viscous friction that differs with the direction of motion.
-
-
 @dataclass(frozen=True, slots=True)
 class AsymmetricViscous:
-    """Friction coefficient Fv + c forwards and Fv − c backwards, that is a torque −c·|v| beside −Fv·v."""
+    """Viscous friction Fv + c forwards and Fv − c backwards: a torque −c·|v| beside −Fv·v."""
 
     axis: int
     coefficient_nm_s_rad: float
 
     def act(self, moment: Moment) -> None:
-        """Change the joint's viscous coefficient by the sign of its speed; it never becomes a drive (negative)."""
+        """Change the joint's viscous coefficient by the sign of its speed; it never becomes negative."""
         change = self.coefficient_nm_s_rad if moment.velocity_rad_s[self.axis] >= 0.0 else -self.coefficient_nm_s_rad
         moment.viscous_nm_s_rad[self.axis] = max(0.0, moment.viscous_nm_s_rad[self.axis] + change)
 
 
-# Dry friction that changes over a revolution of the joint (an eccentric gear, a bearing out of line).
-
-
 @dataclass(frozen=True, slots=True)
 class PositionFriction:
-    """Dry friction Fs + amplitude·cos(q − phase), never below zero."""
+    """Dry friction Fs + amplitude·cos(q − phase), never below zero: an eccentric gear, a bearing out of line."""
 
     axis: int
     amplitude_nm: float
@@ -132,16 +118,15 @@ class PositionFriction:
         moment.bound_nm[self.axis] = max(0.0, moment.bound_nm[self.axis] + change)
 
 
-# Presliding: contacts bend before they slide, so friction builds up over a distance after each reversal.
-
-
 @dataclass(slots=True)
 class Presliding:
-    """Dahl's friction torque·z, dz/dq = (1 − z·sign(v)) / distance (Dahl 1968), in the place of as much dry friction.
+    """Dahl's friction torque·z, dz/dq = (1 − z·sign(v)) / distance (Dahl 1968), in place of as much dry friction.
+
+    Contacts bend before they slide, so friction builds up over a distance after each reversal.
 
     Attributes:
         axis: joint.
-        torque_nm: of friction after a long way in one direction.
+        torque_nm: friction after a long distance in one direction.
         distance_rad: over which 63 % of a change of z happens.
         bristle: z, the state.
     """
@@ -152,7 +137,7 @@ class Presliding:
     bristle: float = 0.0
 
     def act(self, moment: Moment) -> None:
-        """Exchange dry friction for Dahl's; z is advanced by the exact solution over the way of the step."""
+        """Exchange dry friction for Dahl's; z is advanced by the exact solution over the distance of the step."""
         velocity = moment.velocity_rad_s[self.axis]
         if velocity != 0.0:
             end = math.copysign(1.0, velocity)
@@ -161,12 +146,9 @@ class Presliding:
         moment.torque_nm[self.axis] -= self.torque_nm * self.bristle
 
 
-# Warm-up: cold grease makes a joint stiff, and it warms in the session.
-
-
 @dataclass(frozen=True, slots=True)
 class WarmUp:
-    """Dry and viscous friction of the joint times 1 + cold_fraction·exp(−t/time_constant), t since power-on."""
+    """Friction of the joint times 1 + cold_fraction·exp(−t/time_constant), t since power-on: grease that warms up."""
 
     axis: int
     cold_fraction: float
@@ -177,9 +159,6 @@ class WarmUp:
         factor = 1.0 + self.cold_fraction * math.exp(-moment.time_s / self.time_constant_s)
         moment.bound_nm[self.axis] *= factor
         moment.viscous_nm_s_rad[self.axis] *= factor
-
-
-# Coupling: friction between two axes that the drive train matrix does not know.
 
 
 @dataclass(slots=True)
@@ -212,12 +191,9 @@ class Coupling:
         moment.torque_nm[self.other] -= shared
 
 
-# A spring between the link and its base: a gravity compensator, a cable or hose.
-
-
 @dataclass(frozen=True, slots=True)
 class Spring:
-    """Torque −k·(q − rest) on the joint."""
+    """Torque −k·(q − rest) on the joint: a gravity compensator, a cable or hose."""
 
     axis: int
     stiffness_nm_per_rad: float
@@ -228,12 +204,9 @@ class Spring:
         moment.torque_nm[self.axis] -= self.stiffness_nm_per_rad * (moment.position_rad[self.axis] - self.rest_rad)
 
 
-# Cogging: the motor's torque ripples with its angle.
-
-
 @dataclass(frozen=True, slots=True)
 class Cogging:
-    """Torque −amplitude·sin(order·θ + phase) of the motor, θ its rotor angle; the amplitude in joint units."""
+    """Cogging torque −amplitude·sin(order·θ + phase) of the motor, θ its rotor angle; the amplitude in joint units."""
 
     axis: int
     amplitude_nm: float
@@ -246,12 +219,9 @@ class Cogging:
         moment.motor_torque_nm[self.axis] -= self.amplitude_nm * ripple
 
 
-# Magnetic saturation: the torque constant drops with the current.
-
-
 @dataclass(frozen=True, slots=True)
 class Saturation:
-    """Torque g·i / (1 + (i / half_current)²): half the torque constant is left at half_current.
+    """Magnetic saturation, torque g·i / (1 + (i / half_current)²): half the torque constant is left at half_current.
 
     To first order the current that a torque needs is v = v₀ + v₀³/half_current², v₀ = τ/g.
     """
@@ -264,12 +234,9 @@ class Saturation:
         moment.motor_torque_nm[self.axis] /= 1.0 + (moment.current_a[self.axis] / self.half_current_a) ** 2
 
 
-# Lag: the amplifier reports its current reference late.
-
-
 @dataclass(slots=True)
 class Lag:
-    """First-order lag of the reported current reference; the current itself is not late.
+    """First-order lag of the reported current reference; the current itself is not delayed.
 
     Attributes:
         axis: motor.
@@ -285,9 +252,6 @@ class Lag:
         """Replace this axis' reference by the filtered one; called once a substep (exact for a held input)."""
         self.value_a += (float(reported_a[self.axis]) - self.value_a) * -np.expm1(-step_s / self.time_constant_s)
         reported_a[self.axis] = self.value_a
-
-
-# A gear that gives: elasticity and backlash between a motor and the links it drives.
 
 
 @dataclass(slots=True)
@@ -386,7 +350,7 @@ STATE_FIELDS = frozenset({"axis", "bristle", "value_a"})
 
 
 def build_effect(effect: UndeclaredEffect, axes: int) -> Effect:
-    """The physics of an undeclared effect.
+    """Build the physics of an undeclared effect.
 
     Args:
         effect: name, joint and parameters.
