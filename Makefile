@@ -45,12 +45,12 @@ $(STAMP): requirements.lock pyproject.toml
 		echo "drivegain needs Python 3.11 or later; found: $$($(PYTHON) --version 2>&1)." >&2; \
 		echo "Install one (Debian, Ubuntu: apt install python3 python3-pip) or name it: make PYTHON=python3.12 ..." >&2; \
 		exit 1; }
+	@echo "setting up $(VENV), once: 1.3 GB of tools and locked packages"
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV); $(PYTHON) -m venv $(VENV) >/dev/null 2>&1; } || { \
 		rm -rf $(VENV); $(PYTHON) -m venv --without-pip $(VENV) && \
 		$(PYTHON) -m pip --python $(BIN)/python install -qq pip; } || { \
 		echo "$(PYTHON) can make no environment with pip in it (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
-	@echo "installing the locked dependencies into $(VENV) (once; some hundred MB)"
-	@$(BIN)/python -m pip install -qq --require-hashes --requirement requirements.lock
+	@$(BIN)/python .ci/set_up.py requirements.lock
 	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
 	@touch $@
 

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.model.kinematics import Poses, poses
+from ident.model.kinematics import poses
 from ident.model.robot import JointKind, Robot
 
-# Distances of segments from segments and from boxes, in closed form, for many samples at once.
-#
-# A capsule is a segment with a radius, so the distance of two capsules, or of a capsule and a box, is one of these
-# less
-# the radii.
+FloatArray = NDArray[np.float64]
+
+# A capsule is a segment with a radius: the distance of two capsules, or of a capsule and a box, is one of the two
+# below less the radii.
 
 
 def segment_to_segment(
@@ -28,9 +27,9 @@ def segment_to_segment(
 ) -> FloatArray:
     """Distance of two segments in each sample [m].
 
-    The nearest points are an end of one segment and a point of the other, or lie inside both, where the straight lines
-    through them are nearest to each other. The minimum of all five candidates is exact for parallel segments and
-    segments without length, too.
+    The squared distance of points s and t along the segments is a convex quadratic. Its minimum over s, cut off at the
+    ends, gives the best t, and t, cut off, the best s (Ericson, Real-Time Collision Detection, 5.1.9). For parallel
+    segments any s will do to begin with.
 
     Args:
         start, end, other_start, other_end: ends of the segments [m], shape (k, 3).
@@ -41,15 +40,9 @@ def segment_to_segment(
     along, other, between = end - start, other_end - other_start, start - other_start
     a, b, e = _dot(along, along), _dot(along, other), _dot(other, other)
     c, f = _dot(along, between), _dot(other, between)
-    inside = start + along * _share(b * f - c * e, a * e - b * b)[:, None]
-    candidates = (
-        _point_to_segment(inside, other_start, other_end),
-        _point_to_segment(start, other_start, other_end),
-        _point_to_segment(end, other_start, other_end),
-        _point_to_segment(other_start, start, end),
-        _point_to_segment(other_end, start, end),
-    )
-    return np.asarray(np.min(candidates, axis=0))
+    t = _share(b * _share(b * f - c * e, a * e - b * b) + f, e)
+    s = _share(b * t - c, a)
+    return _length(between + s[:, None] * along - t[:, None] * other)
 
 
 def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
@@ -76,7 +69,7 @@ def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper:
     low, high = slope[sample, after - 1], slope[sample, after]
     first, last = bends[sample, after - 1], bends[sample, after]
     nearest = start + along * (first + (last - first) * _share(-low, high - low))[:, None]
-    distance = np.linalg.norm(nearest - np.clip(nearest, lower, upper), axis=1)
+    distance = _length(nearest - np.clip(nearest, lower, upper))
     depth = _depth(start, end, lower, upper)
     return np.where(depth > 0.0, -depth, distance)
 
@@ -98,24 +91,21 @@ def _depth(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatAr
     return np.asarray(ways.min(axis=1))
 
 
-def _point_to_segment(point: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    along = end - start
-    share = _share(_dot(point - start, along), _dot(along, along))
-    return np.asarray(np.linalg.norm(point - start - along * share[:, None], axis=1))
-
-
 def _share(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """The quotient within 0 to 1; 0 where the denominator is zero."""
-    usable = denominator != 0.0
+    """The quotient, cut off at 0 and 1; 0 where the denominator is zero."""
+    quotient = np.zeros_like(numerator)
     with np.errstate(over="ignore"):
-        return np.clip(np.divide(numerator, denominator, out=np.zeros_like(numerator), where=usable), 0.0, 1.0)
+        np.divide(numerator, denominator, out=quotient, where=denominator != 0.0)
+    return np.minimum(np.maximum(quotient, 0.0), 1.0)
 
 
 def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.asarray((first * second).sum(axis=-1))
+    return np.asarray(np.einsum("...d,...d->...", first, second))
 
 
-FloatArray = NDArray[np.float64]
+def _length(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(_dot(vectors, vectors)))
+
 
 BASE = -1
 """Index of the link that does not move."""
@@ -198,15 +188,19 @@ class Checker:
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self.robot = robot
         self.scene = scene
-        moving = [index for index, capsule in enumerate(scene.capsules) if capsule.link != BASE]
-        boxes = range(len(scene.capsules), len(scene.capsules) + len(scene.boxes))
-        # Capsules are numbered as in the scene, boxes behind them.
-        self._questions = [*scene.pairs, *((index, box) for index in moving for box in boxes)]
+        capsules, boxes = scene.capsules, scene.boxes
+        moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
+        # Capsules are numbered as in the scene, boxes behind them; a box is given by opposite corners on the base.
+        behind = range(len(capsules), len(capsules) + len(boxes))
+        self._questions = [*scene.pairs, *((index, box) for index in moving for box in behind)]
         self._confined = scene.confined if scene.workspace is not None else ()
+        self._names = [thing.name for things in (capsules, boxes) for thing in things]
+        self._frame = np.array([capsule.link + 1 for capsule in capsules] + [0] * len(boxes), dtype=np.int64)
+        ends = [(c.start_m, c.end_m) for c in capsules] + [(box.lower_m, box.upper_m) for box in boxes]
+        self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
+        self._radius = np.array([capsule.radius_m for capsule in capsules] + [0.0] * len(boxes))
+        self._sphere = self._radius + 0.5 * np.linalg.norm(self._ends[:, :, 1] - self._ends[:, :, 0], axis=1)
         self._first, self._second = np.array(self._questions, dtype=np.int64).reshape(-1, 2).T
-        self._radius = np.array([capsule.radius_m for capsule in scene.capsules] + [0.0] * len(scene.boxes))
-        self._lower = np.array([box.lower_m for box in scene.boxes]).reshape(-1, 3)
-        self._upper = np.array([box.upper_m for box in scene.boxes]).reshape(-1, 3)
 
     def margins(self, position: FloatArray) -> FloatArray:
         """Distance beyond the minimum of the nearest two things; negative where it is not kept [m].
@@ -251,29 +245,26 @@ class Checker:
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Of each question, shape (questions, k); where spheres around both are farther apart than needed, theirs."""
         at = poses(self.robot, position.T)
-        samples, capsules, boxes = position.shape[1], self.scene.capsules, len(self.scene.boxes)
-        start = np.empty((len(capsules) + boxes, samples, 3))
-        end = np.empty_like(start)
-        for index, capsule in enumerate(capsules):
-            start[index], end[index] = _at(at, capsule.link, capsule.start_m), _at(at, capsule.link, capsule.end_m)
-        start[len(capsules) :], end[len(capsules) :] = self._lower[:, None], self._upper[:, None]
-        middle, sphere = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=2) + self._radius[:, None]
-        out = np.empty((len(needed), samples))
+        placed = at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None]
+        start, end = placed[..., 0], placed[..., 1]
+        out = np.empty((len(needed), position.shape[1]))
         asked, first, second = len(self._questions), self._first, self._second
-        out[:asked] = np.linalg.norm(middle[first] - middle[second], axis=2) - sphere[first] - sphere[second]
-        out[:asked] -= self.scene.minimum_m
-        near = out[:asked] < needed[:asked, None]
-        for boxed, distance in ((False, segment_to_segment), (True, segment_to_box)):
-            row, sample = np.nonzero(near & ((second >= len(capsules)) == boxed)[:, None])
-            if row.size:
-                a, b = (first[row], sample), (second[row], sample)
-                radii = self._radius[first[row]] + self._radius[second[row]]
-                out[row, sample] = distance(start[a], end[a], start[b], end[b]) - radii - self.scene.minimum_m
+        middle = 0.5 * (start + end)
+        between = _length(middle[first] - middle[second])
+        out[:asked] = between - (self._sphere[first] + self._sphere[second] + self.scene.minimum_m)[:, None]
+        row, sample = np.nonzero(out[:asked] < needed[:asked, None])
+        to_box = second[row] >= len(self.scene.capsules)
+        for distance, those in ((segment_to_segment, ~to_box), (segment_to_box, to_box)):
+            if those.any():
+                number, k = row[those], sample[those]
+                one, other = first[number], second[number]
+                kept = self._radius[one] + self._radius[other] + self.scene.minimum_m
+                out[number, k] = distance(start[one, k], end[one, k], start[other, k], end[other, k]) - kept
         if self.scene.workspace is not None:
             lower, upper = np.array(self.scene.workspace.lower_m), np.array(self.scene.workspace.upper_m)
-            for number, index in enumerate(self._confined, start=asked):
+            for question, index in enumerate(self._confined, start=asked):
                 inside = [np.minimum(ends[index] - lower, upper - ends[index]).min(axis=1) for ends in (start, end)]
-                out[number] = np.minimum(*inside) - capsules[index].radius_m
+                out[question] = np.minimum(*inside) - self._radius[index]
         return out
 
     def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
@@ -311,12 +302,7 @@ class Checker:
     def _obstruction_at(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
         where = tuple(float(value) for value in position)
         if question < len(self._questions):
-            names = [thing.name for things in (self.scene.capsules, self.scene.boxes) for thing in things]
-            first, second = (names[index] for index in self._questions[question])
+            first, second = (self._names[index] for index in self._questions[question])
             return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
         confined = self.scene.capsules[self._confined[question - len(self._questions)]]
         return Obstruction(confined.name, "the end of the workspace", margin_m, where)
-
-
-def _at(at: Poses, link: int, point_m: tuple[float, float, float]) -> FloatArray:
-    return np.asarray(at.origin_m[link + 1] + at.rotation[link + 1] @ np.array(point_m))
