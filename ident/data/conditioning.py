@@ -1,4 +1,9 @@
-"""The filters, chosen once and reported beside every relative error."""
+"""The filters between samples and rows (paper §2.3), chosen once and reported beside every relative error.
+
+Positions go through a zero-phase Butterworth low-pass before they are differentiated. Every column of the equations,
+and the currents, then go through one decimator. Both are written out here: they are twenty lines each, and importing
+scipy.signal for them would take longer than fitting a minute of data. The tests compare both with scipy.signal.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +12,20 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy.linalg import lapack
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """How raw samples become rows (paper §2.3).
+    """How raw samples become rows.
 
     Attributes:
         position_cutoff_hz, position_order: zero-phase Butterworth on the position, before the central differences.
         decimation_cutoff_hz: of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
-        standstill_rad_s: a joint slower than this stands still, one speed a joint (m/s for a prismatic one).
-        standstill_share: a row goes when standstill fills more than this share of its filter window.
+        standstill_rad_s: speed below which a joint is at standstill, one a joint (m/s for a prismatic one).
+        standstill_share: a row is left out when standstill fills more than this share of its filter window.
     """
 
     position_cutoff_hz: float = 40.0
@@ -30,7 +35,7 @@ class Conditioning:
     standstill_share: float = 0.1
 
     def document(self) -> dict[str, float | list[float]]:
-        """The settings by name, for a report."""
+        """Settings by name, for a report."""
         return {
             "position_cutoff_hz": self.position_cutoff_hz,
             "position_order": self.position_order,
@@ -40,12 +45,70 @@ class Conditioning:
         }
 
 
+def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
+    """Filter with a Butterworth low-pass forwards and backwards: no phase, −6 dB at the cut-off.
+
+    Either end is continued by its odd mirror image, as scipy.signal.sosfiltfilt does it by default.
+
+    Args:
+        values: time last, shape (c, k), longer than 3 (order + 1) samples.
+        rate_hz: sampling rate.
+        cutoff_hz: below half the sampling rate.
+        order: of the filter in one direction.
+
+    Returns:
+        shape (c, k).
+    """
+    pad = 3 * (order + 1)
+    before = 2.0 * values[:, :1] - values[:, pad:0:-1]
+    after = 2.0 * values[:, -1:] - values[:, -2 : -pad - 2 : -1]
+    sections = _butterworth(order, cutoff_hz / rate_hz)
+    forwards = _filtered(sections, np.concatenate((before, values, after), axis=1))
+    return _filtered(sections, forwards[:, ::-1])[:, ::-1][:, pad:-pad]
+
+
+def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Second-order sections (b_0, b_1, b_2), (a_1, a_2) of gain one at rest, by the bilinear transform.
+
+    Args:
+        order: N; an odd one ends with a section of first order.
+        cutoff: as a share of the sampling rate.
+    """
+    w = float(np.tan(np.pi * cutoff))
+    sections: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
+    for pair in range(order // 2):
+        # s² + 2 sin θ w s + w²: a pair of poles on the circle of radius w.
+        damping = 2.0 * float(np.sin(np.pi * (2 * pair + 1) / (2 * order))) * w
+        scale = 1.0 + damping + w**2
+        gain = w**2 / scale
+        sections.append(((gain, 2.0 * gain, gain), (2.0 * (w**2 - 1.0) / scale, (1.0 - damping + w**2) / scale)))
+    if order % 2:
+        gain = w / (1.0 + w)
+        sections.append(((gain, gain, 0.0), ((w - 1.0) / (1.0 + w), 0.0)))
+    return sections
+
+
+def _filtered(sections: list[tuple[tuple[float, ...], tuple[float, ...]]], values: FloatArray) -> FloatArray:
+    """Run the sections over values that were constant before their first sample, shape (c, k)."""
+    start = values[:, :1]
+    out = values - start
+    band = np.ones((3, out.shape[1]), order="F")
+    for (b0, b1, b2), feedback in sections:
+        driven = b0 * out
+        driven[:, 1:] += b1 * out[:, :-1]
+        driven[:, 2:] += b2 * out[:, :-2]
+        # y_k + a_1 y_k−1 + a_2 y_k−2 = driven_k is a triangular system with two bands.
+        band[1], band[2] = feedback
+        out = lapack.dtbtrs(band, driven.T, uplo="L", diag="U")[0].T
+    return np.asarray(out + start)
+
+
 @dataclass(frozen=True, slots=True)
 class Decimator:
     """A symmetric FIR low-pass that keeps every q-th output: zero phase, and a window of finite length.
 
-    The finite window is what makes it exact at the edges of a chunk, and what makes "standstill fills a tenth of the
-    window" a definite statement.
+    The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of the window" a
+    definite statement.
 
     Attributes:
         taps: weights, odd number, summing to one.
@@ -91,8 +154,8 @@ class Decimator:
 
 @lru_cache(maxsize=64)
 def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
-    """The decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off, transition as wide as the cut-off."""
+    """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off, transition as wide as the cut-off."""
     factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))
-    count = 2 * round(3.3 * rate_hz / cutoff_hz / 2.0) + 1
-    taps = signal.firwin(count, cutoff_hz, fs=rate_hz, window="hamming")
-    return Decimator(np.asarray(taps, dtype=np.float64), factor)
+    half = round(3.3 * rate_hz / cutoff_hz / 2.0)
+    taps = np.sinc(2.0 * cutoff_hz / rate_hz * np.arange(-half, half + 1)) * np.hamming(2 * half + 1)
+    return Decimator(taps / taps.sum(), factor)

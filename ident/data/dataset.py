@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
@@ -72,8 +71,8 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     """
     _check(run, drive_train, conditioning)
     rate = run.rate_hz
-    sections = signal.butter(conditioning.position_order, conditioning.position_cutoff_hz, fs=rate, output="sos")
-    smooth = signal.sosfiltfilt(sections, np.ascontiguousarray(run.position_rad.T, dtype=np.float64), axis=1)
+    raw = np.ascontiguousarray(run.position_rad.T, dtype=np.float64)
+    smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
     position = smooth[:, 1:-1]
     velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate)
     acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate**2

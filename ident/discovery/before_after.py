@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
 from ident.discovery.loop import Evidence, Step
@@ -232,7 +232,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     moves, count = before.shifts.shape
     shifts = after.shifts - before.shifts
     change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
-    limit = float(stats.norm.isf(FALSE_ALARM / (2 * count)))
+    limit = float(-special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),
         removed=tuple(placed for placed in before.effects if placed not in after.effects),

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from ident.data.conditioning import Conditioning, Decimator
 from ident.data.dataset import Dataset
@@ -90,7 +90,7 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
     variance, freedom = np.array(dwells).T
     if freedom.sum() < MIN_FREEDOM:
         return None
-    likely = variance * freedom / stats.chi2.median(freedom)
+    likely = variance * freedom / special.chdtri(freedom, 0.5)
     order = np.argsort(likely)
     share = np.cumsum(freedom[order]) / freedom.sum()
     middle = likely[order][int(np.searchsorted(share, 0.5))]

@@ -14,7 +14,7 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtr, ndtri
 
 FloatArray = NDArray[np.float64]
 
@@ -30,9 +30,11 @@ _CUT = 1.5
 """Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
 _FARTHEST = 1e100
 """Differences over their σ; farther ones are all the same, and their squares still numbers."""
-_MEAN_OF_CUT = float(1.0 - 2.0 * norm.sf(_CUT) - 2.0 * _CUT * norm.pdf(_CUT) + 2.0 * _CUT**2 * norm.sf(_CUT))
+_MEAN_OF_CUT = float(
+    1.0 - 2.0 * ndtr(-_CUT) - 2.0 * _CUT * np.exp(-0.5 * _CUT**2) / np.sqrt(2.0 * np.pi) + 2.0 * _CUT**2 * ndtr(-_CUT)
+)
 """E min(Z², c²) of a standard normal Z."""
-_MEDIAN_OF_NORMAL = float(norm.ppf(0.75))
+_MEDIAN_OF_NORMAL = float(ndtri(0.75))
 _STEPS = 20
 """Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
 
@@ -92,7 +94,7 @@ def change_significance(
     change = (new - old) * (np.sign(old) or 1.0)
     std = dispersion * np.hypot(old_std, new_std)
     sigmas = _ratio(float(change), float(std))
-    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, float(2.0 * norm.sf(abs(sigmas))))
+    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, float(2.0 * ndtr(-abs(sigmas))))
 
 
 def decide(
@@ -237,5 +239,5 @@ def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLik
     weights = 1.0 / stds**2
     common = float(weights @ changes / weights.sum())
     spread = float(weights @ (changes - common) ** 2)
-    alike = chi2.sf(spread, len(changes) - 1) > _UNLIKE
+    alike = chdtrc(len(changes) - 1, spread) > _UNLIKE
     return Pattern.COMMON if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS else Pattern.SEVERAL

@@ -1,4 +1,4 @@
-"""The decimator against the sum it stands for."""
+"""The filters against their definitions and against scipy.signal."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import signal
 
-from ident.data.conditioning import decimator
+from ident.data.conditioning import decimator, low_pass
 
 
 @settings(max_examples=40, deadline=None)
@@ -26,6 +27,21 @@ def test_each_row_is_its_whole_window_weighted(rate_hz: float, cutoff_hz: float,
     for row, centre in enumerate(filter_.centres(samples)):
         window = columns[:, centre - filter_.half : centre + filter_.half + 1]
         assert rows[:, row] == pytest.approx(window @ filter_.taps, abs=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 10])
+@pytest.mark.parametrize("cutoff_hz", [10.0, 40.0, 400.0])
+def test_the_low_pass_is_scipys(order: int, cutoff_hz: float) -> None:
+    values = np.cumsum(np.random.default_rng(order).normal(size=(2, 3000)), axis=1) + 40.0
+    sections = signal.butter(order, cutoff_hz, fs=1000.0, output="sos")
+    expected = signal.sosfiltfilt(sections, values, axis=1)
+    assert low_pass(values, 1000.0, cutoff_hz, order) == pytest.approx(expected, abs=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("rate_hz", "cutoff_hz"), [(1000.0, 20.0), (250.0, 7.5), (999.0, 90.0)])
+def test_the_taps_are_scipys(rate_hz: float, cutoff_hz: float) -> None:
+    taps = decimator(rate_hz, cutoff_hz).taps
+    assert taps == pytest.approx(signal.firwin(len(taps), cutoff_hz, fs=rate_hz, window="hamming"), abs=1e-15)
 
 
 def test_passes_what_is_slow_and_stops_what_is_fast() -> None:
