@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -113,7 +114,9 @@ def _recording_digest(files: Mapping[str, bytes]) -> str:
     return digest({name: _canonical(name, content) for name, content in files.items()})
 
 
+@lru_cache(maxsize=16)
 def _canonical(name: str, content: bytes) -> bytes:
+    """Content without its layout; the logs of a fit carry the same files, which are parsed once."""
     if name == URDF:
         return content
     tree = parse_yaml(content, name).tree

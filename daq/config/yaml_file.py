@@ -74,7 +74,38 @@ class Fault:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2 core scalars only: `no` is text and 1e-6 a number, unlike in YAML 1.1."""
+    """YAML 1.2 core scalars only: `no` is text and 1e-6 a number, unlike in YAML 1.1.
+
+    A few lines of aliases can unfold to gigabytes; deep nesting and very many values take minutes. All three are
+    refused while the file is read.
+    """
+
+    def __init__(self, text: bytes, name: str) -> None:
+        super().__init__(text)
+        self._name = name
+        self._depth = self._values = 0
+
+    def get_event(self) -> yaml.Event | None:
+        """Return the next event.
+
+        Raises:
+            YamlInvalid: it is an alias, too deep, or one too many.
+        """
+        event: yaml.Event | None = yaml.SafeLoader.get_event(self)
+        self._depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        self._values += isinstance(event, yaml.NodeEvent)
+        alias = isinstance(event, yaml.AliasEvent)
+        if event is not None and (alias or self._depth > MAX_DEPTH or self._values > MAX_VALUES):
+            mark = event.start_mark
+            large = self._values > MAX_VALUES
+            many = f"more than {MAX_VALUES} values" if large else f"more than {MAX_DEPTH} lists in lists"
+            raise YamlInvalid(
+                f"{self._name}:{mark.line + 1 if mark else '?'}",
+                found="an alias (*name)" if alias else many,
+                expected="plain values" if alias or self._depth > MAX_DEPTH else "a configuration",
+                remedy="write the value out" if alias else "is this the right file?",
+            )
+        return event
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -115,8 +146,7 @@ def parse_yaml(text: bytes, name: str) -> Document:
         )
     lines: dict[Location, int] = {}
     try:
-        _refuse_bombs(text, name)
-        loader = _Loader(text)
+        loader = _Loader(text, name)
         try:
             node = loader.get_single_node()
             tree = None if node is None else _convert(loader, node, (), name, lines)
@@ -138,24 +168,6 @@ def parse_yaml(text: bytes, name: str) -> Document:
             remedy="is this the right file?",
         ) from error
     return Document(name, tree, lines)
-
-
-def _refuse_bombs(text: bytes, name: str) -> None:
-    """A few lines of aliases can unfold to gigabytes; deep nesting and very many values take minutes."""
-    depth = values = 0
-    for event in yaml.parse(text, Loader=_Loader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        values += isinstance(event, yaml.NodeEvent)
-        alias = isinstance(event, yaml.AliasEvent)
-        if alias or depth > MAX_DEPTH or values > MAX_VALUES:
-            mark = event.start_mark
-            many = f"more than {MAX_VALUES} values" if values > MAX_VALUES else f"more than {MAX_DEPTH} lists in lists"
-            raise YamlInvalid(
-                f"{name}:{mark.line + 1 if mark else '?'}",
-                found="an alias (*name)" if alias else many,
-                expected="plain values" if alias or depth > MAX_DEPTH else "a configuration",
-                remedy="write the value out" if alias else "is this the right file?",
-            )
 
 
 def not_in_file(kind: str) -> str:
