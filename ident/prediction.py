@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import is_dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
-from ident.discovery.signals import declared_signals, inertia
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.placement import at_joints, check_settings
+from ident.effects.effect import Effect, PlacedEffect, check_settings
+from ident.effects.placement import at_joints
+from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
@@ -118,15 +116,15 @@ def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
     known = families[accepted.name]
-    if not is_dataclass(known) or set(accepted.settings) != set(known.settings):
+    if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
-    check_settings(accepted.name, accepted.settings, axis, axes)
+    check_settings(known, accepted.settings, axis, axes)
     # A file knows one kind of number; an order must be whole.
     given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:
         raise EffectRefused(f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers")
-    return replace(known, **given)
+    return known.with_settings(given)
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
@@ -139,7 +137,7 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
 def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
     payload = data.payload
     if payload is None:
-        return inertia(None, {})
+        return payload_parameters(None, {})
     identified: dict[str, float] = {}
     mountings: set[str] = set()
     for parameter in calibration.parameters:
@@ -149,7 +147,7 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
             if mounting == payload.mounting:
                 identified[name] = parameter.value
     _check_mounting(payload, identified, mountings, data.name)
-    return inertia(payload, identified)
+    return payload_parameters(payload, identified)
 
 
 def _check_mounting(payload: Payload, identified: dict[str, float], mountings: set[str], run: str) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ident.effects.effect import Abscissa, Effect, PlacedEffect, Side
+from ident.effects.effect import Effect, PlacedEffect, Side
+from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 
 WORDS = {

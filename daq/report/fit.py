@@ -19,8 +19,8 @@ from drivers.profiles.profile import TapPoint
 from ident.calibration import Calibration, Parameter
 from ident.discovery.before_after import declared
 from ident.discovery.loop import Evidence
-from ident.discovery.signals import session_began_s, signals
-from ident.effects.effect import Abscissa, PlacedEffect, values
+from ident.effects.effect import PlacedEffect
+from ident.effects.signals import Abscissa, fitted_signals, session_began_s
 from ident.equations.rows import decimate_rows
 from ident.estimators.comparison import Comparison, Trial
 from ident.planning.verdict import GOOD_PERCENT, GainVerdict
@@ -140,8 +140,8 @@ def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: Pl
     rows_before = before.holdout if before.holdout is not None else before.training
     rows_after = after.holdout if after.holdout is not None else after.training
     chosen, data = rows_after.run == index, after.datasets[index]
-    seen = signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
-    along = values(placed.effect.abscissa, seen, placed.axis, other_axis(placed.effect))
+    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
+    along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
     variable, velocity = (
         decimate_rows(data, rows_after.conditioning, column[None])[0]
         for column in (along, data.velocity_rad_s[:, placed.axis])

@@ -22,10 +22,10 @@ from daq.workflow.plan import extra_moves
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, Step, close_the_loop, gather
+from ident.discovery.loop import Evidence, Step, find_effects, gather
 from ident.discovery.search import Finding
-from ident.discovery.signals import session_began_s
 from ident.effects.effect import PlacedEffect, Side
+from ident.effects.signals import session_began_s
 from ident.equations.system import System
 from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
@@ -271,7 +271,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
         fixed = before.estimate.gains if before.estimate.gains_fixed else None
         before = replace(before, estimate=estimate_with(Method.ML, before.system, fixed))
         evidence = replace(evidence, estimate=before.estimate)
-    steps = close_the_loop(evidence, np.random.default_rng(seed), progress=progress)
+    steps = find_effects(evidence, np.random.default_rng(seed), progress=progress)
     return replace(start, identification=before, steps=steps)
 
 

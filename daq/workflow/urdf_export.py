@@ -98,7 +98,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     known = {p.name: p for p in calibration.parameters if p.name not in of_effects and ":" not in p.name}
     base = regroup(model, tuple(known), columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
     placed = [placed_effect(effect, calibration)[0] for effect in calibration.effects]
-    friction = frozenset(one.axis for one in placed if one.effect.holds is Property.ODD_IN_VELOCITY)
+    friction = frozenset(one.axis for one in placed if one.effect.declares is Property.ODD_IN_VELOCITY)
     prior = inertia_prior(urdf)
     values = np.array([known[name].value for name in base.names])
     found = physical_parameters(model, base, values, columns, prior, friction)

@@ -139,7 +139,7 @@ def account(
     leave_out_runs: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Account:
-    """Before and after every turn of `ident.discovery.loop.close_the_loop`, and in total.
+    """Before and after every turn of `ident.discovery.loop.find_effects`, and in total.
 
     Args:
         start: without effects, identified by ``ml``; its gains weigh the errors of all.

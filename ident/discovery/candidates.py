@@ -11,9 +11,9 @@ from scipy import linalg
 
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.discovery.signals import Signals, session_began_s, signals
-from ident.effects.effect import Abscissa, Effect
+from ident.effects.effect import Effect
 from ident.effects.placement import at_joints, effect_torque, is_placeable
+from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, cut, linearise
 from ident.equations.observation import Observation
 from ident.equations.rows import decimate_rows
@@ -318,7 +318,7 @@ def prepare_search(
     """
     pieces, whole = _pieces(observation)
     began_s = session_began_s(datasets)
-    runs = tuple(signals(model, data, observation, estimate, began_s) for data in datasets)
+    runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
     problem = linearise(
         replace(observation, move=pieces),
         estimate.gains,

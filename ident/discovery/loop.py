@@ -12,12 +12,21 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, prepare_search
-from ident.discovery.search import Finding, Gates, Place, choose, find, judge, place_of, refined
-from ident.discovery.signals import session_began_s, signals
+from ident.discovery.search import (
+    Finding,
+    Gates,
+    Place,
+    choose_effect,
+    place_of,
+    rank_effects,
+    rank_families,
+    refine_setting,
+)
 from ident.discovery.structure import MIN_MOVES, detection_limits_nm, find_structure, is_inadequate
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.placement import acts_on, effect_torque
+from ident.effects.placement import effect_torque, joints_of
+from ident.effects.signals import fitted_signals, session_began_s
 from ident.equations.observation import Observation, observe
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
@@ -126,7 +135,9 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     fixed = before.estimate.gains if before.estimate.gains_fixed else None
     passes = 1 if all(placed.effect.abscissa.is_kinematic for placed in effects) else 2
     for _ in range(passes):
-        runs = [signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets]
+        runs = [
+            fitted_signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets
+        ]
         whole = before.bare
         for placed in effects:
             torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, whole.conditioning, before.model)
@@ -137,7 +148,7 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
     return current
 
 
-def close_the_loop(
+def find_effects(
     start: Evidence,
     rng: np.random.Generator,
     gates: Gates | None = None,
@@ -167,14 +178,14 @@ def close_the_loop(
         known = len(current.effects)
         progress("looking for an effect that the model lacks" + (f" beside the {known} found" if known else ""))
         search_problem = prepare_search(current.model, start.trained, current.training, current.estimate, cache)
-        findings = find(search_problem, rng, gates, families)
+        findings = rank_effects(search_problem, rng, gates, families)
         taken = frozenset((*refused, *(place_of(placed.effect, placed.axis) for placed in current.effects)))
-        accepted = choose(findings, taken)
+        accepted = choose_effect(findings, taken)
         axes = range(search_problem.axes) if accepted is None else (accepted.axis,)
         if accepted is None:
             progress("looking for structure that no named effect explains")
         structures = find_structure(search_problem, axes, rng, gates)
-        best = choose(structures, taken)
+        best = choose_effect(structures, taken)
         if accepted is None or (best is not None and is_inadequate(accepted, best)):
             accepted = best
         limits_nm = detection_limits_nm(search_problem, gates)
@@ -186,7 +197,7 @@ def close_the_loop(
             steps.append(Step(findings, structures, limits_nm, None, current, "; ".join((*refused.values(), *words))))
             break
         place = place_of(accepted.effect, accepted.axis)
-        accepted = replace(accepted, effect=refined(search_problem, accepted.effect, accepted.axis, families))
+        accepted = replace(accepted, effect=refine_setting(search_problem, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         try:
             joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
@@ -206,18 +217,18 @@ def _without_idle(current: Evidence, rng: np.random.Generator, gates: Gates) -> 
     """Take out what the effect that joined last has made idle: earlier ones on its joints must pass the gates anew."""
     *earlier, last = current.effects
     train = current.model.drive_train
-    felt = acts_on(last.effect, last.axis, train)
+    felt = joints_of(last.effect, last.axis, train)
     for placed in earlier:
-        if not felt & acts_on(placed.effect, placed.axis, train):
+        if not felt & joints_of(placed.effect, placed.axis, train):
             continue
         try:
             rest = with_effects(current, tuple(other for other in current.effects if other != placed))
         except UNFITTED:
             continue  # what the data cannot be fitted without is not idle
         search_problem = prepare_search(rest.model, rest.trained, rest.training, rest.estimate)
-        (finding, *_) = judge(search_problem, search_problem.test(((placed.effect,),), placed.axis), rng, gates) or (
-            None,
-        )
+        (finding, *_) = rank_families(
+            search_problem, search_problem.test(((placed.effect,),), placed.axis), rng, gates
+        ) or (None,)
         if finding is None or not finding.passed:
             current = rest
     return current

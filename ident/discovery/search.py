@@ -101,7 +101,7 @@ class Finding:
     share_of_excess: float | None = None
 
 
-def find(
+def rank_effects(
     search_problem: SearchProblem,
     rng: np.random.Generator,
     gates: Gates | None = None,
@@ -116,10 +116,10 @@ def find(
         families: the dictionary.
     """
     tested = [found for axis in range(search_problem.axes) for found in search_problem.test(families, axis)]
-    return judge(search_problem, tested, rng, gates or Gates())
+    return rank_families(search_problem, tested, rng, gates or Gates())
 
 
-def choose(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
+def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
     """The best that passed; of those as good on the same axis, the one with the fewest parameters.
 
     A hinge that begins where the joint never comes is a spring, and is called one.
@@ -145,7 +145,7 @@ def place_of(effect: Effect, axis: int) -> Place:
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 
-def judge(
+def rank_families(
     search_problem: SearchProblem, tested: Sequence[TestedFamily], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
     """What the data say of each family, ranked by left-out moves.
@@ -299,7 +299,9 @@ DECLARED = {"exponent": (0.8, 1.25)}
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
-def refined(search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]) -> Effect:
+def refine_setting(
+    search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]
+) -> Effect:
     """Golden section on the squared residual, over the logarithm of a setting, between its neighbours in the family.
 
     An effect without a positive real setting, or at the end of its family, is returned as it is.

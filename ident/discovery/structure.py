@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.discovery.candidates import SearchProblem
-from ident.discovery.search import Finding, Gates, is_better, judge
-from ident.effects.effect import Abscissa, Effect, values
+from ident.discovery.search import Finding, Gates, is_better, rank_families
+from ident.effects.effect import Effect
+from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +55,7 @@ def find_structure(
     tested = [
         found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
     ]
-    return judge(search_problem, tested, rng, gates)
+    return rank_families(search_problem, tested, rng, gates)
 
 
 def is_inadequate(named: Finding, structure: Finding) -> bool:
@@ -107,7 +108,7 @@ def _has_session(search_problem: SearchProblem) -> bool:
 
 def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:
     other = term.other_axis - 1 if term.other_axis else None
-    x = np.concatenate([values(term.variable, run, axis, other) for run in search_problem.rows])
+    x = np.concatenate([run.variable(term.variable, axis, other) for run in search_problem.rows])
     x = x[search_problem.observation.use[axis]]
     if term.variable in FOLDED:
         x = np.abs(x)

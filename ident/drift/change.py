@@ -1,9 +1,9 @@
-"""Whether gains have changed: one change against its noise, a recalibration as a whole, and a slow drift over many.
+"""Significance of changed gains: one change against its noise, a recalibration as a whole, and the pattern of many.
 
 Recordings of different days are independent, so σ of a difference is the root of the sum of squares. But σ of a single
-fit knows only what one session shows: repeated sessions scatter more (friction warms up, magnets too). Every function
-here therefore takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions`
-estimates it from a history.
+fit covers one session: repeated sessions scatter more (friction warms up, magnets too). Every function here therefore
+takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions` estimates it from a
+history.
 """
 
 from __future__ import annotations
@@ -14,37 +14,42 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtrc, ndtr, ndtri
 
 FloatArray = NDArray[np.float64]
 
 DISPERSION = 1.05
-"""Before a history says otherwise: repeated fits of simulated cells scatter 5 % more than their σ."""
+"""Default without a history: repeated fits of simulated cells scatter 5 % more than their σ."""
 FALSE_ALARM = 0.01
 """Share of recalibrations without any change in which `decide` finds one."""
 
 _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
-"""How many successive differences the prior is worth, and the pooled estimate beside an axis' own."""
+"""Weights of the prior and of the pooled estimate beside an axis' own, in numbers of successive differences."""
 _MIN_DIFFERENCES = 4
 _CUT = 1.5
 """Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
 _FARTHEST = 1e100
-"""Differences over their σ; farther ones are all the same, and their squares still numbers."""
-_MEAN_OF_CUT = float(
-    1.0 - 2.0 * ndtr(-_CUT) - 2.0 * _CUT * np.exp(-0.5 * _CUT**2) / np.sqrt(2.0 * np.pi) + 2.0 * _CUT**2 * ndtr(-_CUT)
+"""Limit of a difference over its σ, so that its square is still a number."""
+_MEAN_OF_CUT = (
+    1.0
+    + (_CUT**2 - 1.0) * math.erfc(_CUT / math.sqrt(2.0))
+    - _CUT * math.sqrt(2.0 / math.pi) * math.exp(-(_CUT**2) / 2.0)
 )
 """E min(Z², c²) of a standard normal Z."""
-_MEDIAN_OF_NORMAL = float(ndtri(0.75))
+_MEDIAN_OF_NORMAL = 0.6744897501960817
+"""Median of |Z|, the upper quartile of a standard normal Z."""
 _STEPS = 20
 """Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
+_UNLIKE = 0.01
+"""Changes are not one common factor if noise makes them so different in fewer cases than this."""
+_COMMON_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One gain, then and now.
+    """Change of one gain.
 
     Attributes:
-        percent: of the old value's magnitude [%], inf from zero; negative where the gain has lost.
+        percent: of the old value's magnitude [%], inf from zero; negative where the gain has decreased.
         sigmas: the change over its σ, signed as `percent`.
         probability: of so large a change by noise alone, two-sided.
     """
@@ -56,7 +61,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class ChangeDecision:
-    """Whether a recalibration says anything new.
+    """Whether a recalibration differs from the gains in force.
 
     Attributes:
         differs: at least one gain has changed by more than noise.
@@ -73,13 +78,22 @@ class ChangeDecision:
     words: str
 
 
+class Pattern(Enum):
+    """Pattern of the changes of all gains."""
+
+    NONE = "none"
+    ONE = "one axis"
+    COMMON = "all axes by the same factor"
+    SEVERAL = "several axes"
+
+
 def change_significance(
     old: float, old_std: float, new: float, new_std: float, *, dispersion: float = DISPERSION
 ) -> Change:
-    """How significant one change is; of independent recordings, with normal errors.
+    """Compute the significance of one change between independent recordings with normal errors.
 
     Args:
-        old, old_std, new, new_std: gains and their σ in one unit; σ is 0 for what is known exactly.
+        old, old_std, new, new_std: gains and their σ in one unit; σ is 0 for a value known exactly.
         dispersion: scatter of repeated calibrations over their σ.
 
     Raises:
@@ -92,9 +106,8 @@ def change_significance(
             f"and dispersion {dispersion}"
         )
     change = (new - old) * (np.sign(old) or 1.0)
-    std = dispersion * np.hypot(old_std, new_std)
-    sigmas = _ratio(float(change), float(std))
-    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, float(2.0 * ndtr(-abs(sigmas))))
+    sigmas = _ratio(float(change), dispersion * math.hypot(old_std, new_std))
+    return Change(100.0 * _ratio(float(change), abs(old)), sigmas, math.erfc(abs(sigmas) / math.sqrt(2.0)))
 
 
 def decide(
@@ -107,10 +120,10 @@ def decide(
     dispersion: ArrayLike = DISPERSION,
     false_alarm: float = FALSE_ALARM,
 ) -> ChangeDecision:
-    """Whether a recalibration changes anything, over all axes together.
+    """Decide whether a recalibration changes anything, over all axes together.
 
-    Each axis is looked at by itself, with the probabilities corrected for there being several, however their errors
-    depend on each other. A fixed per cent is nowhere asked for.
+    Each axis is tested by itself against its own σ, and the probabilities are corrected for the number of axes, however
+    their errors depend on each other. There is no fixed threshold in per cent.
 
     Args:
         axes: n names.
@@ -133,15 +146,14 @@ def decide(
 
 
 def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
-    """How much more repeated calibrations scatter than their σ says, for each axis; never less than 1.
+    """Estimate how much more repeated calibrations scatter than their σ, for each axis; never less than 1.
 
     From differences of successive calibrations, so that a slow drift adds little; each counts up to 1.5 of their σ
-    (Huber 1964, proposal 2), so that a sudden change adds little too. All axes together tell more than one does: the
-    estimate of an axis is drawn towards theirs, and that towards DISPERSION, by weights in numbers of differences (as a
-    scaled inverse-χ² prior).
+    (Huber 1964, proposal 2), so that a sudden change adds little too. The estimate of an axis is drawn towards that of
+    all axes, and that towards DISPERSION, by weights in numbers of differences (as a scaled inverse-χ² prior).
 
     Args:
-        values, stds: shape (..., axes, n), oldest first; leading dimensions are histories of their own.
+        values, stds: shape (..., axes, n), oldest first; leading dimensions are separate histories.
 
     Returns:
         shape (..., axes).
@@ -150,20 +162,43 @@ def dispersions(values: ArrayLike, stds: ArrayLike) -> FloatArray:
     count = values.shape[-1] - 1
     if count < _MIN_DIFFERENCES:
         return np.full(values.shape[:-1], DISPERSION)
-    # Not about their own centre, which of few differences is too near to them.
+    # Differences not about their own centre: the centre of few differences is too near to them.
     with np.errstate(over="ignore"):
         away = 2.0 * (np.abs(np.diff(values / 2.0)) / np.hypot(stds[..., 1:], stds[..., :-1]))
     squares = np.minimum(away, _FARTHEST) ** 2
-    own = _variance(squares)
-    all_axes = _variance(squares.reshape(*squares.shape[:-2], -1))
+    own = _robust_variance(squares)
+    all_axes = _robust_variance(squares.reshape(*squares.shape[:-2], -1))
     total = count * values.shape[-2]
     pooled = (_POOLED_WEIGHT * DISPERSION**2 + total * all_axes) / (_POOLED_WEIGHT + total)
     drawn = (_AXIS_WEIGHT * pooled[..., None] + count * own) / (_AXIS_WEIGHT + count)
     return np.asarray(np.sqrt(np.maximum(drawn, 1.0)))
 
 
-def _variance(squares: FloatArray) -> FloatArray:
-    """s with mean(min(x², c² s)) = s E min(Z², c²) along the last axis, from the median on."""
+def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
+    """Classify the changes of all gains together.
+
+    They have one common factor where at least two raise an alarm, the weighted mean c̄ of all changes is significant,
+    and Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom makes plausible.
+
+    Args:
+        change_percent, std_percent: of each axis since its baseline, with σ > 0 [%], shape (n,).
+        alarmed: which of them raise an alarm, shape (n,).
+    """
+    changes, stds = np.asarray(change_percent, float), np.asarray(std_percent, float)
+    count = int(np.count_nonzero(alarmed))
+    if count < 2:
+        return Pattern.ONE if count else Pattern.NONE
+    from scipy.special import chdtrc  # noqa: PLC0415 - half of the start-up of `history`, which seldom needs it
+
+    weights = 1.0 / stds**2
+    common = float(weights @ changes / weights.sum())
+    spread = float(weights @ (changes - common) ** 2)
+    alike = chdtrc(len(changes) - 1, spread) > _UNLIKE
+    return Pattern.COMMON if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS else Pattern.SEVERAL
+
+
+def _robust_variance(squares: FloatArray) -> FloatArray:
+    """Solve mean(min(x², c² s)) = s E min(Z², c²) for s along the last axis, starting from the median."""
     found = np.median(squares, axis=-1) / _MEDIAN_OF_NORMAL**2
     for _ in range(_STEPS):
         found = np.minimum(squares, _CUT**2 * found[..., None]).mean(axis=-1) / _MEAN_OF_CUT
@@ -171,14 +206,14 @@ def _variance(squares: FloatArray) -> FloatArray:
 
 
 def _ratio(part: float, whole: float) -> float:
-    """Infinite where something changed that cannot, 0 where nothing did."""
+    """Quotient; infinite for a change of a value known exactly, 0 without a change."""
     if whole:
         return part / whole
     return math.copysign(math.inf, part) if part else 0.0
 
 
 def _holm(probabilities: FloatArray) -> FloatArray:
-    """Adjusted for several tests: the smallest times their number, the next times one less, never falling."""
+    """Adjust for several tests: the smallest times their number, the next times one less, never falling."""
     order = np.argsort(probabilities)
     count = len(probabilities)
     adjusted = np.empty(count)
@@ -201,43 +236,5 @@ def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatAr
 
 
 def _short(sigmas: float) -> str:
-    """A number of a few digits, however many σ it is."""
+    """Format a number in a few digits, however large."""
     return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"
-
-
-# Which gains have changed together: by one common factor, one alone, or several each by its own amount.
-
-
-_UNLIKE = 0.01
-"""Changes that noise makes so different in fewer cases than this are not one common factor."""
-_COMMON_SIGMAS = 4.0
-
-
-class Pattern(Enum):
-    """What the changes of all gains look like."""
-
-    NONE = "none"
-    ONE = "one axis"
-    COMMON = "all axes by the same factor"
-    SEVERAL = "several axes"
-
-
-def pattern(change_percent: ArrayLike, std_percent: ArrayLike, alarmed: ArrayLike) -> Pattern:
-    """What the changes of all gains look like together.
-
-    All by the same factor where at least two raise an alarm, the weighted mean c̄ of all changes is significant, and
-    Σ ((c − c̄)/σ)² is no larger than χ² with n − 1 degrees of freedom makes plausible.
-
-    Args:
-        change_percent, std_percent: of each axis since its baseline, with σ > 0 [%], shape (n,).
-        alarmed: which of them raise an alarm, shape (n,).
-    """
-    changes, stds = np.asarray(change_percent, float), np.asarray(std_percent, float)
-    count = int(np.count_nonzero(alarmed))
-    if count < 2:
-        return Pattern.ONE if count else Pattern.NONE
-    weights = 1.0 / stds**2
-    common = float(weights @ changes / weights.sum())
-    spread = float(weights @ (changes - common) ** 2)
-    alike = chdtrc(len(changes) - 1, spread) > _UNLIKE
-    return Pattern.COMMON if alike and abs(common) * weights.sum() ** 0.5 > _COMMON_SIGMAS else Pattern.SEVERAL

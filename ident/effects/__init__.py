@@ -1,1 +1,1 @@
-"""The dictionary of effects that a declared model may lack."""
+"""Effects beyond the declared model: a dictionary grouped by physics, and the signals that they depend on."""

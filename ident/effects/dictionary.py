@@ -1,10 +1,23 @@
-"""The dictionary of effects beyond rigid links, viscous and dry friction and offset."""
+"""The dictionary of effects beyond rigid links, viscous and dry friction and offset.
+
+To add an effect:
+
+1. Write one class in the chapter of its physics (`friction`, `position`, `transmission`, `electrical`, `timing`). It
+   derives from `Effect`; its docstring states equation, sign, source and signature; the class sets `name`, `declares`,
+   `abscissa` and `coefficients` (and `side`, if it does not act on its joint) and defines `columns`. Fields with a
+   `Range` are its searched parameters.
+2. Add one line to EFFECTS: the family, with the values of its searched parameters that the search tries.
+
+Search, refit, prediction, calibration files and reports then know it. The tests ask for one thing more: a recording
+with the effect, planted by a formula of your own, in `tests/ident/discovery/test_planted.py`. A phrase for reports may
+go into `daq/report/effect_names.py`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ident.effects.effect import Abscissa, Effect
+from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging, Saturation
 from ident.effects.friction import (
     AsymmetricViscous,
@@ -17,13 +30,14 @@ from ident.effects.friction import (
     WarmUp,
 )
 from ident.effects.position import Compensator, Hinge, Spring
+from ident.effects.signals import Abscissa
 from ident.effects.timing import Lag, TimeSkew
 from ident.effects.transmission import Backlash, Elasticity, InertialCoupling
 from ident.effects.unnamed import Periodic, Smooth
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
 PAIRED = range(2, 13)
-"""The higher number of a pair of joints; those that a robot does not have are left out of its search."""
+"""The higher number of a pair of joints; pairs that a robot does not have are left out of its search."""
 
 EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
@@ -45,7 +59,7 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     tuple(Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
     tuple(Compensator(order) for order in (1, 2)),
 )
-"""A family a row; within it, the candidates of its searched parameters. Adding an effect is a file and a line here."""
+"""One family a row, with the values of its searched parameters that the search tries."""
 
 UNNAMED: tuple[Effect, ...] = (Periodic(), *(Smooth(variable) for variable in Abscissa))
 """Terms that fit anything: what a calibration holds where structure was found that no name explains."""

@@ -1,86 +1,25 @@
-"""What an effect is: columns of torque that the declared model lacks."""
+"""The form of an effect: columns of joint torque that the declared model lacks.
+
+An effect adds Σ c_k φ_k to the torque that the motors must supply beside the declared model, in joint units. A positive
+coefficient c with a positive column φ therefore needs more current in the positive direction of the joint.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import Enum
-from typing import ClassVar, Protocol
+from functools import cache
+from typing import Annotated, Self, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.discovery.signals import Signals
+from ident.effects.signals import Abscissa, Signals
+from ident.errors import EffectRefused
 from ident.model.model import Column
-
-# The variables that a residual is held against: what a person plots, and what the search for structure tries.
-
-
-STICKING_RAD_S = 0.005
-"""Slower than this the filtered encoder's noise decides on the sign of a speed."""
-
-
-class Abscissa(Enum):
-    """A variable of one axis: label with unit."""
-
-    VELOCITY = "joint velocity [rad/s]"
-    POSITION = "joint position [rad]"
-    LOAD = "load torque [Nm]"
-    TIME = "time in the run [s]"
-    SESSION = "time in the session [s]"
-    MOTOR_ANGLE = "motor angle, one revolution [rad]"
-    CURRENT = "predicted current [A]"
-    TORQUE_RATE = "rate of the motor torque [Nm/s]"
-    LOAD_CURVATURE = "second derivative of the load torque [Nm/s²]"
-    DISTANCE = "way since the last reversal [rad]"
-    OTHER_VELOCITY = "velocity of the other joint [rad/s]"
-
-    @property
-    def is_kinematic(self) -> bool:
-        """Whether it is known from the motion alone, whatever the model predicts."""
-        return self not in {Abscissa.LOAD, Abscissa.CURRENT, Abscissa.TORQUE_RATE, Abscissa.LOAD_CURVATURE}
-
-
-def values(abscissa: Abscissa, signals: Signals, axis: int, other: int | None = None) -> FloatArray:
-    """A variable along a run, shape (k,).
-
-    Args:
-        abscissa: which.
-        signals: of the run.
-        axis: of it.
-        other: the other axis, for what speaks of one.
-    """
-    given: dict[Abscissa, Callable[[], FloatArray]] = {
-        Abscissa.VELOCITY: lambda: signals.velocity_rad_s[axis],
-        Abscissa.POSITION: lambda: signals.position_rad[axis],
-        Abscissa.LOAD: lambda: signals.load_torque_nm[axis],
-        Abscissa.TIME: lambda: signals.time_s,
-        Abscissa.SESSION: lambda: signals.session_s,
-        Abscissa.MOTOR_ANGLE: lambda: np.mod(signals.motor_position_rad[axis], 2.0 * np.pi),
-        Abscissa.CURRENT: lambda: signals.current_a[axis],
-        Abscissa.TORQUE_RATE: lambda: np.gradient(signals.motor_torque_nm[axis]) * signals.rate_hz,
-        Abscissa.LOAD_CURVATURE: lambda: curvature(signals.load_torque_nm[axis], signals.rate_hz),
-        Abscissa.DISTANCE: lambda: distance_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)[1],
-        Abscissa.OTHER_VELOCITY: lambda: signals.velocity_rad_s[axis if other is None else other],
-    }
-    return np.asarray(given[abscissa](), dtype=np.float64)
-
-
-def curvature(value: FloatArray, rate_hz: float) -> FloatArray:
-    """Second derivative in time by central differences, shape (k,)."""
-    return np.asarray(np.gradient(np.gradient(value)) * rate_hz**2)
-
-
-def distance_since_reversal(velocity_rad_s: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Direction of the last motion (−1, 0 before any, 1) and the way made in it [rad], both of shape (k,)."""
-    moving = np.abs(velocity_rad_s) > STICKING_RAD_S
-    way = np.cumsum(np.abs(velocity_rad_s) * moving) / rate_hz
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
-    direction = np.where(last >= 0, np.sign(velocity_rad_s[last]), 0.0)
-    turned = np.diff(direction, prepend=direction[:1]) != 0
-    start = np.maximum.accumulate(np.where(turned, np.arange(len(moving)), 0))
-    return direction, way - way[start]
-
 
 FloatArray = NDArray[np.float64]
 
@@ -89,8 +28,8 @@ class Side(Enum):
     """Where the torque acts.
 
     JOINT: on the joint. MOTOR: on the motor of that number, and through R on all joints that it turns. TWO_JOINTS: on
-    the joint and on another one, whose number is the setting `other_axis`. ALL_JOINTS: on every joint, through the
-    links. ALL_MOTORS: on every motor alike; it has no axis of its own and is placed on the first.
+    the joint and on a second one, whose number is the setting `other_axis`. ALL_JOINTS: on every joint, through the
+    links. ALL_MOTORS: on every motor alike; such an effect has no axis of its own and is placed on the first.
     """
 
     JOINT = "joint"
@@ -101,7 +40,7 @@ class Side(Enum):
 
 
 class Property(Enum):
-    """What an effect claims about its columns; one test tries to refute the claim of every entry of EFFECTS."""
+    """Property that an effect declares of its columns; one test tries to refute it for every entry of EFFECTS."""
 
     ODD_IN_VELOCITY = "turns its sign when the motion is reversed in place"
     EVEN_IN_VELOCITY = "keeps its value when the motion is reversed in place"
@@ -114,46 +53,119 @@ class Property(Enum):
     RATE_OF_LOAD = "is zero where the load does not change"
 
 
-class Effect(Protocol):
-    """An entry of the dictionary: a frozen dataclass whose fields are its searched (non-linear) parameters.
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Values that a searched parameter can have: far beyond what a search tries, short of an overflow."""
 
-    Attributes:
-        holds: what it claims about its columns.
+    least: float
+    largest: float
+
+
+Switch = Annotated[int, Range(0, 1)]
+Sense = Annotated[int, Range(-1, 1)]
+AxisNumber = Annotated[int, Range(0, math.inf)]
+"""Number of another axis, from 1; 0 where an effect has none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effect(ABC):
+    """An entry of the dictionary: a frozen dataclass whose fields with a `Range` are its searched parameters.
+
+    The docstring of an effect states the equation, its source and the signature: how the residual shows it. A subclass
+    sets `name`, `declares`, `abscissa` and `coefficients`, and defines `columns`.
     """
 
-    holds: ClassVar[Property]
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """Name of the family, as reports and calibrations write it."""
+
+    @property
+    @abstractmethod
+    def declares(self) -> Property:
+        """Property of the columns."""
+
+    @property
+    @abstractmethod
+    def abscissa(self) -> Abscissa:
+        """Variable that shows the effect in a plot."""
+
+    @property
+    @abstractmethod
+    def coefficients(self) -> tuple[Column, ...]:
+        """Name and unit of each linear parameter."""
 
     @property
     def side(self) -> Side:
-        """Where it acts."""
-        ...
+        """Where the torque acts."""
+        return Side.JOINT
 
     @property
-    def name(self) -> str:
-        """What a technician calls it."""
-        ...
+    def needs_revolute(self) -> bool:
+        """Whether the effect exists only where the joint's position is an angle."""
+        return False
 
-    @property
-    def abscissa(self) -> Abscissa:
-        """What shows it in a picture."""
-        ...
+    @abstractmethod
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Torque per unit of each coefficient [Nm], shape (p, k); (joints, p, k) where `side` is more than one."""
 
     @property
     def settings(self) -> dict[str, float]:
-        """The searched parameters by name, units in the names."""
-        ...
+        """Searched (non-linear) parameters by name, units in the names."""
+        return {name: getattr(self, name) for name in _ranges(type(self))}
 
-    @property
-    def coefficients(self) -> tuple[Column, ...]:
-        """Name and unit of each linear parameter."""
-        ...
-
-    def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit of each coefficient [Nm], shape (p, k), where several joints feel it (joints, p, k)."""
-        ...
+    def with_settings(self, settings: Mapping[str, float]) -> Self:
+        """Return the same effect with some of its searched parameters changed."""
+        return replace(self, **settings)
 
 
-# An effect and the axis that it acts on.
+@cache
+def _ranges(kind: type[Effect]) -> dict[str, Range]:
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: part for name, hint in hints.items() for part in get_args(hint)[1:] if isinstance(part, Range)}
+
+
+def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axes: int) -> None:
+    """Refuse settings that an effect cannot have on this axis: a calibration written by hand may hold anything.
+
+    Args:
+        effect: any member of the family.
+        settings: by name.
+        axis: index of the axis that it acts on.
+        axes: number of axes of the robot.
+
+    Raises:
+        EffectRefused: a setting is not finite, outside its range, or names an axis that is no other one.
+    """
+    name = effect.name
+    for setting, value in settings.items():
+        if not math.isfinite(value):
+            raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
+    for setting, allowed in _ranges(type(effect)).items():
+        if setting == "other_axis":
+            _check_other_axis(effect, settings[setting], axis, axes)
+        elif not allowed.least <= settings[setting] <= allowed.largest:
+            raise EffectRefused(
+                f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between {allowed.least:g} and "
+                f"{allowed.largest:g}"
+            )
+    if settings.get("sense") == 0:
+        raise EffectRefused(f"effect {name!r} is given sense = 0; it is 1 or -1")
+    if "lower" in settings and not settings["lower"] < settings["upper"]:
+        raise EffectRefused(
+            f"effect {name!r} is given the range {settings['lower']:g} to {settings['upper']:g}; it must not be empty"
+        )
+
+
+def _check_other_axis(effect: Effect, other: float, axis: int, axes: int) -> None:
+    if effect.abscissa is not Abscissa.OTHER_VELOCITY:
+        if other != 0:
+            raise EffectRefused(f"effect {effect.name!r} is given other_axis = {other:g}; it has no other axis: 0")
+    elif other not in range(1, axes + 1) or other == axis + 1:
+        raise EffectRefused(
+            f"effect {effect.name!r} on axis {axis + 1} is given other_axis = {other:g}; it is the number of another "
+            f"of the {axes} axes"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +177,7 @@ class PlacedEffect:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Its linear parameters, named after effect, axis and settings: an axis may have cogging of two orders."""
+        """Linear parameters named after effect, axis and settings, because an axis may have cogging of two orders."""
         name, number = self.effect.name, self.axis + 1
         settings = ", ".join(f"{key} {value:.6g}" for key, value in self.effect.settings.items())
         suffix = f" ({settings})" if settings else ""

@@ -15,13 +15,12 @@ from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.data.dataset import Dataset, differentiate, planned
 from ident.data.run import Run
 from ident.discovery.loop import Evidence, gather, with_effects
-from ident.discovery.signals import session_began_s
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import Abscissa, PlacedEffect
+from ident.effects.effect import PlacedEffect, check_settings
 from ident.effects.electrical import Cogging
 from ident.effects.friction import LoadFriction, Stribeck, WarmUp
-from ident.effects.placement import check_settings
 from ident.effects.position import Spring
+from ident.effects.signals import Abscissa, session_began_s
 from ident.equations.rows import decimate_rows, row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.estimators.estimate import Method, RelativeError
@@ -257,7 +256,7 @@ def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -
         given_ = dict(effect.settings)
         if effect.abscissa is Abscissa.OTHER_VELOCITY:
             given_["other_axis"] = given_["other_axis"] or 2
-        check_settings(effect.name, given_, 0, 12)
+        check_settings(effect, given_, 0, 12)
 
 
 def test_a_calibration_of_another_robot_is_refused(identified: Evidence) -> None:

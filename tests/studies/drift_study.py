@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from ident.drift.change import DISPERSION, dispersions
-from ident.drift.chart import CHART, Chart, path, trend
+from ident.drift.chart import CHART, Chart, cusum_paths, trend_statistic
 
 FloatArray = NDArray[np.float64]
 
@@ -135,8 +135,8 @@ def _days(values: FloatArray, stds: FloatArray, chart: Chart) -> Iterator[NDArra
     for day in range(2, values.shape[-1] + 1):
         known, reported = values[..., :day], stds[..., :day]
         dispersion = dispersions(known, reported)
-        deviations, upper, lower = (found[..., -1] for found in path(known, reported, dispersion, chart))
-        slopes = trend(known, reported, dispersion)[..., -1]
+        deviations, upper, lower = (found[..., -1] for found in cusum_paths(known, reported, dispersion, chart))
+        slopes = trend_statistic(known, reported, dispersion)[..., -1]
         yield np.stack(
             [
                 np.maximum(upper, lower) > chart.threshold,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from drivers.simulation.spec import UndeclaredEffect
-from ident.discovery.loop import Evidence, close_the_loop, gather
+from ident.discovery.loop import Evidence, find_effects, gather
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect, Side
 from ident.estimators.identify import identify
@@ -144,7 +144,7 @@ def _search(task: _Task) -> Row:
     begun_s = time.process_time()
     found = identify(model_of(cell), runs.fit, cell.conditioning)
     start = gather(found, runs.fit, runs.unused)
-    steps = close_the_loop(start, np.random.default_rng(0), families=families)
+    steps = find_effects(start, np.random.default_rng(0), families=families)
     spent_s = time.process_time() - begun_s
     truth = np.array([axis.gain_nm_per_a for axis in study_cell(case.seed).bare.axes])
     end = steps[-1].after

@@ -20,7 +20,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.workflow.fit import Fit, calibration_of
 from ident.data.run import Run
-from ident.discovery.loop import close_the_loop, gather
+from ident.discovery.loop import find_effects, gather
 from ident.estimators.estimate import Method
 from ident.estimators.identify import estimate_with, identify
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
@@ -67,7 +67,7 @@ def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
     """With the effects that the loop accepts."""
     trained, unseen = [runs[name] for name in FIT], [runs[UNUSED]]
     found = identify(model_of(cell), trained, cell.conditioning, holdout=unseen)
-    steps = close_the_loop(gather(found, trained, unseen), np.random.default_rng(0))
+    steps = find_effects(gather(found, trained, unseen), np.random.default_rng(0))
     return Fit(cell, (), (), (), found, steps, None)
 
 

@@ -21,7 +21,7 @@ from daq.cli.app import main as drivegain
 from daq.config.cell import model_of
 from daq.environment import shipped_configurations
 from daq.log.conversion import load_run
-from ident.discovery.loop import close_the_loop, gather
+from ident.discovery.loop import find_effects, gather
 from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate, Method, RelativeError, of_squares
 from ident.estimators.identify import identify
@@ -63,7 +63,7 @@ def main() -> int:
         unseen = replace(run, name="left out", move=block, valid=valid & left_out)
         found = identify(model, [training], cell.conditioning, method=Method.ML, fixed_gains=gains)
         start = gather(found, [training], [unseen])
-        steps = close_the_loop(start, np.random.default_rng(0))
+        steps = find_effects(start, np.random.default_rng(0))
         end = steps[-1].after
         if start.holdout is None or end.holdout is None:
             raise ValueError("nothing was left out")

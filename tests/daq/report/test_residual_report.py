@@ -30,9 +30,10 @@ from ident.discovery.before_after import Account, account
 from ident.discovery.loop import Step, with_effects
 from ident.discovery.search import Finding
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Abscissa, PlacedEffect
+from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.position import Spring
+from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 from tests.daq.workflow.test_fit import Shelf
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth

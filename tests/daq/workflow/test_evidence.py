@@ -33,7 +33,7 @@ from daq.writeback.gates.fit import fit_refusals
 from daq.writeback.gates.table import Gate
 from ident.calibration import Calibration
 from ident.data.run import Recording, Run
-from ident.discovery.loop import close_the_loop
+from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Stribeck
 from ident.effects.timing import Lag, TimeSkew
@@ -160,7 +160,7 @@ def with_effect(truth_runs: dict[str, Run]) -> Fit:
     cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-        patch.setattr(fit_module, "close_the_loop", partial(close_the_loop, families=((Stribeck(0.3),),)))
+        patch.setattr(fit_module, "find_effects", partial(find_effects, families=((Stribeck(0.3),),)))
         start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("unused")])
         found = close_loop(start, 0)
     assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]

@@ -13,7 +13,7 @@ from scipy import linalg
 from ident.discovery import candidates as inquiries
 from ident.discovery.candidates import SearchProblem, Trial, score_candidates
 from ident.discovery.loop import Evidence
-from ident.discovery.search import Gates, find, judge
+from ident.discovery.search import Gates, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging
@@ -104,7 +104,7 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
 
 
 def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
-    first, second = (find(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2))
+    first, second = (rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2))
     assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == [
         (f.effect, f.axis, f.probability, f.held_out_fall) for f in second
     ]
@@ -153,7 +153,7 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     for _ in range(20):
         sign = rng.choice((-1.0, 1.0), size=(3, int(observed.move.max()) + 1))[:, observed.move]
         shuffled = with_current(small, (sign - 1.0) * noise)
-        findings = find(search_problem_of(shuffled, cache), rng, GATES, families)
+        findings = rank_effects(search_problem_of(shuffled, cache), rng, GATES, families)
         false += any(finding.passed for finding in findings)
     assert false <= 1
 
@@ -188,6 +188,6 @@ def test_the_bootstrap_keeps_its_size(
     false = 0
     for _ in range(400):
         trial = replace(_noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3))
-        (finding,) = judge(search_problem, [inquiries.TestedFamily(0, ((effect, trial),))], rng, GATES)
+        (finding,) = rank_families(search_problem, [inquiries.TestedFamily(0, ((effect, trial),))], rng, GATES)
         false += finding.probability <= 0.05
     assert least <= false <= most

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache
-from ident.discovery.loop import Evidence, close_the_loop, with_effects
-from ident.discovery.search import Gates, find
+from ident.discovery.loop import Evidence, find_effects, with_effects
+from ident.discovery.search import Gates, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.errors import RankDeficient, TooFewMoves
@@ -264,7 +264,7 @@ def test_so_it_is_on_a_smaller_arm(
 
 
 def _is_named(start: Evidence, planted: Planted, cache: ColumnCache) -> None:
-    findings = find(search_problem_of(start, cache), np.random.default_rng(0), GATES)
+    findings = rank_effects(search_problem_of(start, cache), np.random.default_rng(0), GATES)
     best = findings[0]
     assert best.passed
     names = [(placed.effect.name, placed.axis) for placed in (PlacedEffect(best.effect, best.axis), *best.ambiguity)]
@@ -290,9 +290,9 @@ def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth
     )
     turned = replace(start, model=Model(truth.model.robot, train), training=training, estimate=ml(training.system()))
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
-    findings = find(search_problem_of(turned), np.random.default_rng(0), GATES, families)
+    findings = rank_effects(search_problem_of(turned), np.random.default_rng(0), GATES, families)
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
-    same = find(search_problem_of(start, cache), np.random.default_rng(0), GATES, families)
+    same = rank_effects(search_problem_of(start, cache), np.random.default_rng(0), GATES, families)
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
 
 
@@ -341,5 +341,5 @@ def test_sigma_is_true_for_correlated_noise(clean: Evidence, truth: Truth) -> No
 
 def test_the_loop_ends_where_nothing_is_left(small_session: Evidence, small_truth: Truth) -> None:
     start = _with(small_session, small_truth, next(case for case in SMALL_CASES if case.family == "load-friction"))
-    steps = close_the_loop(start, np.random.default_rng(1))
+    steps = find_effects(start, np.random.default_rng(1))
     assert [step.accepted is not None for step in steps] == [True, False]

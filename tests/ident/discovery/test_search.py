@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence, close_the_loop
+from ident.discovery.loop import Evidence, find_effects
 from tests.ident.recordings import GAINS, Truth, gathered
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +30,7 @@ def _identified(truth: Truth, runs: tuple[Run, ...]) -> Evidence:
 
 
 def test_clean_data_get_no_effect(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    steps = close_the_loop(_identified(truth, noisy_runs), np.random.default_rng(0))
+    steps = find_effects(_identified(truth, noisy_runs), np.random.default_rng(0))
     assert len(steps) == 1
     assert steps[0].accepted is None
     assert steps[0].after.effects == ()
@@ -43,7 +43,7 @@ def test_low_speed_friction_is_named_and_the_holdout_run_gets_better(truth: Trut
         v = _speed(run, 1)
         runs.append(_with_torque(run, 1, 5.0 * np.sign(v) * np.exp(-((v / 0.35) ** 2))))
     start = _identified(truth, tuple(runs))
-    steps = close_the_loop(start, np.random.default_rng(0))
+    steps = find_effects(start, np.random.default_rng(0))
     assert [(step.accepted.effect.name, step.accepted.axis) for step in steps if step.accepted] == [("stribeck", 1)]
     before, after = start.holdout_error, steps[-1].after.holdout_error
     assert before is not None
@@ -59,7 +59,7 @@ def test_a_spring_is_distinguished_from_gravity(small_truth: Truth, small_runs: 
         replace(run, current_a=run.current_a + np.outer(added, (0.0, 0.0, 1.0)))
         for run, added in zip(small_runs, torque, strict=True)
     )
-    steps = close_the_loop(_identified(small_truth, runs), np.random.default_rng(0))
+    steps = find_effects(_identified(small_truth, runs), np.random.default_rng(0))
     accepted = [step.accepted for step in steps if step.accepted]
     assert [(finding.effect.name, finding.axis) for finding in accepted] == [("spring", 2)]
     index = [column.name for column in steps[-1].after.training.columns].index("spring stiffness 3")

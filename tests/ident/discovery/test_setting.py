@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.loop import Evidence, close_the_loop, with_effects
-from ident.discovery.search import Finding, Gates, choose, find, refined
+from ident.discovery.loop import Evidence, find_effects, with_effects
+from ident.discovery.search import Finding, Gates, choose_effect, rank_effects, refine_setting
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
@@ -34,8 +34,8 @@ def _low_speed(data: Dataset, speed_rad_s: float = 0.17) -> FloatArray:
 def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small_truth: Truth) -> None:
     search_problem = search_problem_of(_needing(small, small_truth, _low_speed))
     families = (EFFECTS[0],)
-    best = find(search_problem, np.random.default_rng(0), GATES, families)[0]
-    effect = refined(search_problem, best.effect, best.axis, families)
+    best = rank_effects(search_problem, np.random.default_rng(0), GATES, families)[0]
+    effect = refine_setting(search_problem, best.effect, best.axis, families)
     assert isinstance(effect, Stribeck)
     assert best.axis == 1
     assert effect.speed_rad_s == pytest.approx(0.17, rel=0.1)
@@ -46,13 +46,13 @@ def test_a_setting_between_two_of_the_dictionary_is_found(small: Evidence, small
     "effect", [Spring(), Cogging(3), Hinge(0.5, 1), Stribeck(0.05), Stribeck(0.5), Stribeck(0.123), WarmUp(20.0, 0)]
 )
 def test_a_whole_signed_or_outermost_setting_stays(small: Evidence, effect: Effect) -> None:
-    assert refined(search_problem_of(small), effect, 1, EFFECTS) == effect
+    assert refine_setting(search_problem_of(small), effect, 1, EFFECTS) == effect
 
 
 def test_an_effect_that_a_later_one_makes_idle_is_taken_out(small: Evidence, small_truth: Truth) -> None:
     bare = _needing(small, small_truth, _low_speed)
     start = with_effects(bare, (PlacedEffect(AsymmetricViscous(), 1), PlacedEffect(AsymmetricViscous(), 2)))
-    last = close_the_loop(start, np.random.default_rng(0), GATES)[-1].after
+    last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
     # That of another axis was not asked: nothing has changed there.
     assert [(placed.effect.name, placed.axis) for placed in last.effects] == [
         ("asymmetric-viscous", 2),
@@ -62,7 +62,7 @@ def test_an_effect_that_a_later_one_makes_idle_is_taken_out(small: Evidence, sma
 
 def test_an_effect_that_is_still_needed_stays(small: Evidence, small_truth: Truth) -> None:
     start = _needing(small, small_truth, lambda data: _low_speed(data) + 9.0 * data.position_rad[:, 1])
-    last = close_the_loop(start, np.random.default_rng(0), GATES)[-1].after
+    last = find_effects(start, np.random.default_rng(0), GATES)[-1].after
     assert {(placed.effect.name, placed.axis) for placed in last.effects} == {("stribeck", 1), ("spring", 1)}
 
 
@@ -98,11 +98,11 @@ HINGE, SPRING = Hinge(-2.5, 1), Spring()
     ],
 )
 def test_of_two_that_explain_alike_the_simpler_is_chosen(findings: list[Finding], name: str) -> None:
-    chosen = choose(findings)
+    chosen = choose_effect(findings)
     assert chosen is not None
     assert chosen.effect.name == name
 
 
 def test_where_nothing_passed_nothing_is_chosen() -> None:
-    assert choose([]) is None
-    assert choose([_finding(SPRING, 10.0, passed=False)]) is None
+    assert choose_effect([]) is None
+    assert choose_effect([_finding(SPRING, 10.0, passed=False)]) is None

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery import loop
-from ident.discovery.loop import Evidence, Step, close_the_loop
-from ident.discovery.search import Gates, choose, find
+from ident.discovery.loop import Evidence, Step, find_effects
+from ident.discovery.search import Gates, choose_effect, rank_effects
 from ident.discovery.structure import detection_limits_nm
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Abscissa, Effect
+from ident.effects.effect import Effect
+from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
 from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
 
@@ -33,7 +34,7 @@ def _needing(small: Evidence, truth: Truth, axis: int, torque: Torque) -> Eviden
 
 
 def _loop(start: Evidence, families: tuple[tuple[Effect, ...], ...] = EFFECTS) -> Sequence[Step]:
-    return close_the_loop(start, np.random.default_rng(0), GATES, families)
+    return find_effects(start, np.random.default_rng(0), GATES, families)
 
 
 def _low_speed(axis: int) -> Torque:
@@ -115,7 +116,7 @@ def test_the_detection_limit_parts_what_is_found_from_what_is_not(
             small, small_truth, axis,
             lambda data: times * limit * np.sqrt(2.0) * np.sin(3.0 * ratio * data.position_rad[:, axis]),
         )  # fmt: skip
-        best = choose(find(search_problem_of(start), np.random.default_rng(0), GATES, families))
+        best = choose_effect(rank_effects(search_problem_of(start), np.random.default_rng(0), GATES, families))
         return None if best is None else (best.effect.name, best.axis)
 
     assert found(3.0) == ("cogging", axis)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,13 +12,31 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest, norm
 
+from ident.drift import change as change_module
 from ident.drift.change import DISPERSION, Pattern, change_significance, decide, dispersions, pattern
-from ident.drift.chart import CHART, Alarm, AlarmKind, Chart, cusum, path
+from ident.drift.chart import CHART, Alarm, AlarmKind, Chart, cusum, cusum_paths
 from tests.studies.drift_study import AXES, RECALIBRATIONS, delays, draw, false_alarms, most_percent, share_percent
 
 NAMES = tuple(f"J{number}" for number in range(1, AXES + 1))
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
 _gains = st.floats(0.1, 1e3) | st.floats(-1e3, -0.1)
+
+
+def test_constants_of_the_normal_distribution_are_those_of_scipy() -> None:
+    cut = change_module._CUT
+    expected = norm.expect(lambda z: np.minimum(z**2, cut**2))
+    assert pytest.approx(expected, rel=1e-9) == change_module._MEAN_OF_CUT
+    assert pytest.approx(norm.ppf(0.75), rel=1e-15) == change_module._MEDIAN_OF_NORMAL
+    sigmas = [change_significance(0.0, 0.6, x, 0.8, dispersion=1.0) for x in (0.1, 2.0, 30.0)]
+    expected_p = 2.0 * norm.sf([0.1, 2.0, 30.0])
+    assert [change.probability for change in sigmas] == pytest.approx(expected_p, rel=1e-12)
+
+
+def test_a_history_is_judged_without_importing_scipy() -> None:
+    code = (
+        "import sys, ident.drift.change, ident.drift.chart; sys.exit(any(m.startswith('scipy') for m in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_one_change_is_the_two_sided_normal_test() -> None:
@@ -156,7 +176,7 @@ def test_the_sums_are_pages() -> None:
     """By hand: baseline exact, k = 0.5, deviations of 2, 2, -3 σ."""
     values, stds = np.array([0.0, 2.0, 2.0, -3.0]) + 100.0, np.ones(4)
     stds[0] = 1e-9
-    found = path(values, stds, 1.0, Chart(reference=0.5, baseline=1))
+    found = cusum_paths(values, stds, 1.0, Chart(reference=0.5, baseline=1))
     np.testing.assert_allclose(found[0], [0.0, 2.0, 2.0, -3.0])
     np.testing.assert_allclose(found[1], [0.0, 1.5, 3.0, 0.0])
     np.testing.assert_allclose(found[2], [0.0, 0.0, 0.0, 2.5])
@@ -166,7 +186,7 @@ def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
     """Hawkins' recursive residuals: exactly standard normal, with the baseline's uncertainty counted."""
     rng = np.random.default_rng(5)
     values = rng.standard_normal((20_000, CHART.baseline))
-    deviations = path(values, np.ones_like(values), 1.0, CHART)[0][:, 1:]
+    deviations = cusum_paths(values, np.ones_like(values), 1.0, CHART)[0][:, 1:]
     assert kstest(deviations.ravel(), "norm").pvalue > 0.01
     correlation = np.corrcoef(deviations.T)
     assert np.abs(correlation - np.eye(CHART.baseline - 1)).max() < 0.03

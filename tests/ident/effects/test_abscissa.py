@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from ident.effects.effect import STICKING_RAD_S, curvature, distance_since_reversal
 from ident.effects.friction import Presliding
+from ident.effects.signals import STICKING_RAD_S, curvature, distance_since_reversal
 from ident.effects.unnamed import INTERVALS, cubic_basis
 from tests.ident.effects.test_effects import random_signals
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.signals import Signals
 from ident.discovery.structure import VARIABLES
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Abscissa, Effect, Property, Side, values
+from ident.effects.effect import Effect, Property, Side
 from ident.effects.electrical import Cogging, Saturation
 from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
 from ident.effects.placement import at_joints, is_placeable
 from ident.effects.position import Hinge, Spring
+from ident.effects.signals import Abscissa, Signals
 from ident.effects.timing import TimeSkew
 from ident.effects.transmission import Elasticity
 from ident.effects.unnamed import INTERVALS, Periodic, Smooth
@@ -66,7 +66,7 @@ def _scaled(s: Signals, factor: float) -> Signals:
 
 
 def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
-    x = np.abs(values(variable, random_signals(5), 0, other_axis - 1 if other_axis else None))
+    x = np.abs(random_signals(5).variable(variable, 0, other_axis - 1 if other_axis else None))
     return Smooth(variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis)
 
 
@@ -142,7 +142,7 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
 @pytest.mark.parametrize("effect", MEMBERS)
 def test_claims_hold(effect: Effect) -> None:
     for seed in range(3):
-        assert _claim_holds(effect, effect.holds, 0, seed)
+        assert _claim_holds(effect, effect.declares, 0, seed)
 
 
 WRONG: tuple[tuple[Effect, Property], ...] = (
@@ -171,7 +171,7 @@ def test_a_wrong_claim_is_refuted(effect: Effect, claim: Property) -> None:
 
 def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
     assert {claim for _, claim in WRONG} == set(Property)
-    assert {effect.holds for family in (*EFFECTS, *GENERIC) for effect in family} == set(Property)
+    assert {effect.declares for family in (*EFFECTS, *GENERIC) for effect in family} == set(Property)
 
 
 @pytest.mark.parametrize("effect", MEMBERS)
@@ -196,7 +196,7 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
     own = list(range(JOINTS)) if effect.side is Side.ALL_MOTORS else own
     assert np.array_equal(effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns)
     # What depends on the clock alone is the same on all axes.
-    of_the_clock = effect.holds is Property.SMOOTH and effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
+    of_the_clock = effect.declares is Property.SMOOTH and effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
     if not of_the_clock or effect.settings["signed"]:
         assert not np.allclose(effect.columns(changed(own), 0), columns)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery.loop import Evidence
-from ident.discovery.signals import Signals, declared_signals, session_began_s, signals
+from ident.effects.signals import Signals, declared_signals, fitted_signals, session_began_s
 from ident.model.kinematics import Motion
 from tests.ident.recordings import PAYLOAD_TRUTH, Truth
 
@@ -85,7 +85,7 @@ def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
     small: Evidence, small_truth: Truth, data: Dataset
 ) -> None:
     """Ia of joints 1 and 2 cannot be told from their links; that of joint 3 is a parameter of its own."""
-    found = signals(small.model, data, small.training, small.estimate).inertia_kg_m2
+    found = fitted_signals(small.model, data, small.training, small.estimate).inertia_kg_m2
     true = _made(small_truth, data).inertia_kg_m2
     rotors = np.array([0.03, 0.03, 0.0])
     expected = true + np.diag(rotors)[:, :, None]

@@ -1,9 +1,10 @@
-"""What an effect may depend on: motion, predicted load and predicted current, at full rate."""
+"""Signals that an effect may depend on: motion, predicted load and predicted current, at full rate."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,32 @@ from ident.model.model import Model
 
 FloatArray = NDArray[np.float64]
 
+STICKING_RAD_S = 0.005
+"""Below this speed the noise of the filtered encoder decides the sign."""
 CHUNK_SAMPLES = 4096
 POSTURE_SAMPLES = 20
-"""Between two postures in which the inertia of a joint is computed."""
+"""Samples between two postures in which the mass matrix is computed."""
+
+
+class Abscissa(Enum):
+    """Variable of one axis that a residual is plotted against and tested for: label with unit."""
+
+    VELOCITY = "joint velocity [rad/s]"
+    POSITION = "joint position [rad]"
+    LOAD = "load torque [Nm]"
+    TIME = "time in the run [s]"
+    SESSION = "time in the session [s]"
+    MOTOR_ANGLE = "motor angle, one revolution [rad]"
+    CURRENT = "predicted current [A]"
+    TORQUE_RATE = "rate of the motor torque [Nm/s]"
+    LOAD_CURVATURE = "second derivative of the load torque [Nm/s²]"
+    DISTANCE = "way since the last reversal [rad]"
+    OTHER_VELOCITY = "velocity of the other joint [rad/s]"
+
+    @property
+    def is_kinematic(self) -> bool:
+        """Whether the variable follows from the motion alone, not from the model's prediction."""
+        return self not in {Abscissa.LOAD, Abscissa.CURRENT, Abscissa.TORQUE_RATE, Abscissa.LOAD_CURVATURE}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +56,14 @@ class Signals:
     Attributes:
         rate_hz: sampling rate.
         time_s: since the start of the run, shape (k,).
-        session_s: since the first run of the session began, shape (k,); as time_s where no clock tells.
+        session_s: since the first run of the session began, shape (k,); equal to time_s without a common clock.
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
         motor_position_rad: of the motors, R q.
-        inertia_kg_m2: torque at joint i per unit of acceleration of joint j, of links and payload, with the
-            rotor's where it cannot be told from theirs (Ia regrouped), shape (n, n, k).
-        load_torque_nm: what links and payload ask of each joint, friction and drive chain left out.
-        geared_torque_nm: what goes through the gear of each joint: its load and its friction.
-        motor_torque_nm: what each motor must give, in joint units (g v), friction included, effects left out.
+        inertia_kg_m2: mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a
+            rotor's inertia where it is regrouped with theirs, shape (n, n, k).
+        load_torque_nm: torque at each joint for links and payload, without friction and drive chain.
+        geared_torque_nm: torque through the gear of each joint: load and friction.
+        motor_torque_nm: torque of each motor in joint units (g v), friction included, effects left out.
         current_a: the same in the unit of the current reference.
     """
 
@@ -56,8 +80,25 @@ class Signals:
     motor_torque_nm: FloatArray
     current_a: FloatArray
 
+    def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
+        """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""
+        choices: dict[Abscissa, Callable[[], FloatArray]] = {
+            Abscissa.VELOCITY: lambda: self.velocity_rad_s[axis],
+            Abscissa.POSITION: lambda: self.position_rad[axis],
+            Abscissa.LOAD: lambda: self.load_torque_nm[axis],
+            Abscissa.TIME: lambda: self.time_s,
+            Abscissa.SESSION: lambda: self.session_s,
+            Abscissa.MOTOR_ANGLE: lambda: np.mod(self.motor_position_rad[axis], 2.0 * np.pi),
+            Abscissa.CURRENT: lambda: self.current_a[axis],
+            Abscissa.TORQUE_RATE: lambda: np.gradient(self.motor_torque_nm[axis]) * self.rate_hz,
+            Abscissa.LOAD_CURVATURE: lambda: curvature(self.load_torque_nm[axis], self.rate_hz),
+            Abscissa.DISTANCE: lambda: distance_since_reversal(self.velocity_rad_s[axis], self.rate_hz)[1],
+            Abscissa.OTHER_VELOCITY: lambda: self.velocity_rad_s[axis if other is None else other],
+        }
+        return np.asarray(choices[abscissa](), dtype=np.float64)
 
-def signals(
+
+def fitted_signals(
     model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
 ) -> Signals:
     """Predict a run's torques with the declared part of an estimate.
@@ -65,14 +106,14 @@ def signals(
     Args:
         model: the declared model.
         data: the run.
-        observation: whose base parameters the estimate speaks of.
-        estimate: gains and parameters; columns of effects, behind the base parameters, are left out.
-        session_began_s: of the first run, by the clock of `Dataset.started_s`; None where the runs do not tell.
+        observation: rows of the fit, which name the base parameters.
+        estimate: gains and parameters; coefficients of effects, behind the base parameters, are left out.
+        session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
     standard[independent] = estimate.parameters[: len(independent)]
-    standard[model.flange] += inertia(data.payload, _identified(data.payload, observation, estimate))
+    standard[model.flange] += payload_parameters(data.payload, _identified(data.payload, observation, estimate))
     return declared_signals(model, data, standard, estimate.gains, session_began_s)
 
 
@@ -87,7 +128,7 @@ def declared_signals(
         standard: χ_st with the payload on the flange; base parameters at their leading columns, zero elsewhere,
             are as good as the true standard ones (paper §2.1). Shape (c,).
         gains: g of each motor [Nm at the joint per A], shape (n,).
-        session_began_s: of the first run, by the clock of `Dataset.started_s`.
+        session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
     """
     names = tuple(column.name for column in model.columns)
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
@@ -118,20 +159,20 @@ def declared_signals(
 
 
 def session_began_s(datasets: Sequence[Dataset]) -> float | None:
-    """When the first of some runs began, or None where one of them does not tell."""
+    """Return the start of the earliest run, None if one of them has no clock."""
     starts_s = [data.started_s for data in datasets if data.started_s is not None]
     return min(starts_s) if starts_s and len(starts_s) == len(datasets) else None
 
 
 def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:
-    """When a run began, in its session; a clock's reading alone tells nothing."""
+    """Return the start of a run in its session, 0 without a common clock."""
     if data.started_s is None or session_began_s is None:
         return 0.0
     return max(0.0, data.started_s - session_began_s)
 
 
 def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
-    """Mass matrix of links and payload, shape (n, n, k), drawn between few postures because it changes slowly."""
+    """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
     samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
     position = data.position_rad[postures]
@@ -146,12 +187,12 @@ def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatAr
     return mass
 
 
-def inertia(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
-    """χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without load.
+def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
+    """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without payload.
 
     Args:
-        payload: what was mounted.
-        identified: its unknown parameters by name; those that the data of the fit did not see are left out and zero.
+        payload: the mounted payload with its known parameters.
+        identified: unknown parameters by name; those that are not identifiable in the data are missing, and zero.
     """
     values = {} if payload is None else {**payload.known, **identified}
     return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])
@@ -165,3 +206,19 @@ def _identified(payload: Payload | None, observation: Observation, estimate: Est
             return {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
         first += len(indices)
     return {}
+
+
+def curvature(value: FloatArray, rate_hz: float) -> FloatArray:
+    """Second derivative in time by central differences, shape (k,)."""
+    return np.asarray(np.gradient(np.gradient(value)) * rate_hz**2)
+
+
+def distance_since_reversal(velocity_rad_s: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+    """Direction of the last motion (−1, 0 before any, 1) and the distance moved in it [rad], both of shape (k,)."""
+    moving = np.abs(velocity_rad_s) > STICKING_RAD_S
+    way = np.cumsum(np.abs(velocity_rad_s) * moving) / rate_hz
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))
+    direction = np.where(last >= 0, np.sign(velocity_rad_s[last]), 0.0)
+    turned = np.diff(direction, prepend=direction[:1]) != 0
+    start = np.maximum.accumulate(np.where(turned, np.arange(len(moving)), 0))
+    return direction, way - way[start]
