@@ -24,7 +24,8 @@ class Conditioning:
     Attributes:
         position_cutoff_hz, position_order: zero-phase Butterworth on the position, before the central differences.
         decimation_cutoff_hz: of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
-        standstill_rad_s: speed below which a joint is at standstill, one a joint (m/s for a prismatic one).
+        standstill_rad_s: speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty,
+            it is derived from each run (`ident.data.dataset.standstill_speed`).
         standstill_share: a row is left out when standstill fills more than this share of its filter window.
     """
 

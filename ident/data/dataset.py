@@ -17,6 +17,11 @@ from ident.model.model import DriveTrain
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+STANDSTILL_SHARE_OF_SPEED = 0.01
+"""Standstill speed as a share of the speed that a joint exceeds in a twentieth of a run."""
+STANDSTILL_SIGMAS = 6.0
+"""Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
+
 LONGEST_MOVE_S = 2.0
 """Two seconds are several times the residual's correlation (lag one about 0.67 at 50 rows a second)."""
 
@@ -64,7 +69,7 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     Args:
         run: a recording of n joints.
         drive_train: R, for the speed of coupled motors.
-        conditioning: cut-offs and standstill speeds.
+        conditioning: cut-offs and standstill speeds; these are derived from the run where none are declared.
 
     Raises:
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
@@ -76,7 +81,9 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     position = smooth[:, 1:-1]
     velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate)
     acceleration = (smooth[:, 2:] - 2.0 * position + smooth[:, :-2]) * rate**2
-    speed_limit = np.asarray(conditioning.standstill_rad_s or (0.0,) * len(velocity))[:, None]
+    speed_limit = np.asarray(conditioning.standstill_rad_s or standstill_speed(raw, smooth, rate, conditioning))[
+        :, None
+    ]
     moving = np.abs(velocity) >= speed_limit
     # A motor's speed is told as that of its joint, which need not have its number.
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
@@ -99,6 +106,33 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         payload=run.payload,
         started_s=run.started_s,
     )
+
+
+def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, conditioning: Conditioning) -> FloatArray:
+    """Speed below which a joint of a run is at standstill, for callers that declare none, shape (n,).
+
+    Dry friction is undetermined at standstill: rows of a resting joint bias its gain. The speed must lie above the
+    noise of a resting joint and well below the speeds that identify it, so it is the larger of
+
+    - STANDSTILL_SHARE_OF_SPEED of the 95 % quantile of |q̇|, and
+    - STANDSTILL_SIGMAS of the noise of q̇ that comes from the encoder. What the low-pass takes out of the positions
+      is white noise above its cut-off; its median absolute value gives σ_q, and the filters' impulse response σ_q̇.
+
+    Args:
+        raw, smooth: positions before and after the low-pass, shape (n, k).
+        rate_hz: sampling rate.
+        conditioning: the low-pass.
+    """
+    impulse = np.zeros((1, min(raw.shape[1], 2 * round(20.0 * rate_hz / conditioning.position_cutoff_hz) + 1)))
+    impulse[0, impulse.shape[1] // 2] = 1.0
+    response = low_pass(impulse, rate_hz, conditioning.position_cutoff_hz, conditioning.position_order)
+    removed = float(np.linalg.norm(impulse - response))
+    kept = float(np.linalg.norm(0.5 * rate_hz * (response[:, 2:] - response[:, :-2])))
+    noise = np.median(np.abs(raw - smooth), axis=1) / 0.6745 / removed
+    # A joint that is held exactly still has rounding noise alone.
+    noise = np.maximum(noise, 1e-12 * np.abs(raw).max(axis=1))
+    speed = np.quantile(np.abs(0.5 * rate_hz * (smooth[:, 2:] - smooth[:, :-2])), 0.95, axis=1)
+    return np.asarray(np.maximum(STANDSTILL_SHARE_OF_SPEED * speed, STANDSTILL_SIGMAS * kept * noise))
 
 
 def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> Dataset:

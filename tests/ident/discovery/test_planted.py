@@ -306,7 +306,7 @@ def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ..
 def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
     truth: Truth, clean_runs: tuple[Run, ...], noisy_runs: tuple[Run, ...]
 ) -> None:
-    never_still = replace(CONDITIONING, standstill_rad_s=())
+    never_still = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
     whole = identify(truth.model, noisy_runs, never_still)
     assert len(whole.system.moves) >= 4 * 11
     assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
