@@ -17,8 +17,7 @@ from daq.report.residual_plots import plot_residual
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
 from drivers.profiles.profile import TapPoint
 from ident.calibration import Calibration, Parameter
-from ident.discovery.before_after import declared
-from ident.discovery.loop import Evidence
+from ident.discovery.loop import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Abscissa, fitted_signals, session_began_s
 from ident.equations.rows import decimate_rows
@@ -111,7 +110,7 @@ def start_of(fitted: Fit) -> Evidence:
     """
     if not fitted.steps:
         return fitted.evidence()
-    return declared(fitted.steps[0].after, fitted.identification.estimate)
+    return without_effects(fitted.steps[0].after, fitted.identification.estimate)
 
 
 def draw_torques(path: Path | None, final: Evidence, cell: Cell) -> bytes:

@@ -1,14 +1,14 @@
-"""What accepted effects change: the error of every motor four times over, and every gain, before and after.
+"""Change by accepted effects: the error of every motor in four ways, and every gain, before and after.
 
-All errors are those of `ident.discovery.current_error`, with one set of weights. They differ in what the model had
-seen:
+All errors are those of `ident.discovery.current_error`, with one set of weights. They differ in the data that the model
+has seen:
 
-- in-sample: everything; it cannot rise when an effect joins, so it proves nothing;
+- in-sample: all data; it cannot rise when an effect joins, so it proves nothing;
 - cross-validated: all moves but those predicted (`ident.equations.linearisation.cut`, one Gauss-Newton step around
-the estimate, gains included); the choice of the effects has seen them all, which makes it kind to what was chosen;
+  the estimate, gains included); the choice of the effects has seen all moves, so the error is optimistic;
 - left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
-  choice and the settings of the effects have seen it;
-- hold-out: nothing of these runs, neither fit nor choice.
+  choice and the settings of the effects have seen the run;
+- hold-out: neither fit nor choice has seen these runs.
 
 Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
 is the jackknife of the change itself: leaving out move c shifts g by d_c = −(H − G_c)⁻¹ s_c
@@ -20,7 +20,7 @@ is the jackknife of the change itself: leaving out move c shifts g by d_c = −(
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,12 @@ from ident.estimators.estimate import Estimate, RelativeError
 FloatArray = NDArray[np.float64]
 
 FALSE_ALARM = 0.05
-"""That noise alone makes any gain's change significant, over all axes (Bonferroni)."""
+"""Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Of one model [%]; the module says what each has seen. None where nobody asked, or nothing was held out."""
+    """Errors of one model [%]; None where not requested, or without held-out runs."""
 
     in_sample: RelativeError
     cross_validated: RelativeError
@@ -55,9 +55,9 @@ class Assessment:
     """One model on its data.
 
     Attributes:
-        effects: in it.
-        errors: of it.
-        gains, gains_std: and their σ [Nm at the joint per A], shape (n,).
+        effects: in the model.
+        errors: of the model.
+        gains, gains_std: drive gains and their σ [Nm at the joint per A], shape (n,).
         shifts: of the gains when each move is left out, shape (m, n); zero for fixed gains.
     """
 
@@ -87,7 +87,7 @@ class GainChange:
 
     @property
     def change_percent(self) -> float:
-        """Of the gain before [%]."""
+        """Change [% of the gain before]."""
         return 100.0 * (self.after / self.before - 1.0)
 
     @property
@@ -101,8 +101,8 @@ class BeforeAfter:
     """Two models of the same data.
 
     Attributes:
-        added, removed: effects that only the second one has, and only the first one.
-        before, after: the errors of either.
+        added, removed: effects of the second model only, and of the first only.
+        before, after: errors of the two.
         gains: one a motor.
     """
 
@@ -115,14 +115,14 @@ class BeforeAfter:
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """What a whole closing of the loop changed.
+    """Change by a whole search for effects.
 
     Attributes:
         floors: noise of each motor at standstill, None where it rested too little.
-        floor: what that noise alone would leave of the rows of the fit [%]; NaN where it is not known.
-        holdout_floor: the same of the rows held out, None without any.
-        turns: of each turn of the loop, None where it added nothing.
-        total: the declared model and the last one.
+        floor: error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known.
+        holdout_floor: the same on held-out rows, None without any.
+        turns: change by each turn of the loop, None where it added nothing.
+        total: change from the declared model to the last one.
     """
 
     floors: tuple[NoiseFloor | None, ...]
@@ -139,16 +139,16 @@ def account(
     leave_out_runs: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Account:
-    """Before and after every turn of `ident.discovery.loop.find_effects`, and in total.
+    """Compare before and after every turn of `ident.discovery.loop.find_effects`, and in total.
 
     Args:
         start: without effects, identified by ``ml``; its gains weigh the errors of all.
         steps: from there.
         leave_out_runs: refit without each run in turn; takes as many fits as there are runs.
-        progress: told what is being done, in words.
+        progress: called with a description of each step.
 
     Raises:
-        TooFewMoves: to leave some out.
+        TooFewMoves: there are too few moves to leave some out.
     """
     weights_nm_a = start.estimate.gains
 
@@ -174,25 +174,8 @@ def account(
     )
 
 
-def declared(evidence: Evidence, estimate: Estimate) -> Evidence:
-    """The same data under the declared model alone.
-
-    Args:
-        evidence: with effects or without.
-        estimate: of the declared model, by ``ml``.
-    """
-    unseen = evidence.bare.run >= len(evidence.datasets) - evidence.held_out
-    return replace(
-        evidence,
-        training=evidence.bare.only(~unseen),
-        holdout=evidence.bare.only(unseen) if evidence.held_out else None,
-        effects=(),
-        estimate=estimate,
-    )
-
-
 def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns | None = None) -> Assessment:
-    """The errors and gains of one model.
+    """Compute the errors and gains of one model.
 
     Args:
         evidence: identified by ``ml``.
@@ -200,7 +183,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         left_out: by `left_out_runs`.
 
     Raises:
-        TooFewMoves: to leave some out.
+        TooFewMoves: there are too few moves to leave some out.
     """
     estimate = evidence.estimate
     folds = cut(
@@ -228,7 +211,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
 
 
 def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
-    """Two models of the same rows."""
+    """Compare two models of the same rows."""
     moves, count = before.shifts.shape
     shifts = after.shifts - before.shifts
     change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
@@ -253,20 +236,20 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
 
 
 def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> CurrentError:
-    """What the noise at standstill would leave of some rows; NaN for a motor of which it is not known."""
+    """Error that the noise at standstill would leave on some rows; NaN for a motor whose noise is not known."""
     use = observation.motor_use
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
     return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)
 
 
 def _gain_shifts(folds: Folds, estimate: Estimate) -> FloatArray:
-    """d_c of the gains, shape (m, n)."""
+    """Shift d_c of the gains when each move is left out, shape (m, n)."""
     count = len(estimate.gains)
     shifts = np.zeros((folds.problem.moves, count))
     if estimate.gains_fixed:
         return shifts
     hessian = folds.move_hessian.sum(axis=0)
-    # A direction that only the move left out has seen stays where the whole data put it.
+    # A direction that only this move shows keeps its value from the whole data.
     kept = np.diag(1e-10 * np.diag(hessian))
     for move, (gram, score) in enumerate(zip(folds.move_hessian, folds.move_score, strict=True)):
         step = linalg.cho_solve(linalg.cho_factor(hessian - gram + kept, lower=True), score)

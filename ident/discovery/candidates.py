@@ -1,4 +1,9 @@
-"""A residual put to candidates: the problem in folds, the signals that effects are made of, and trials of them."""
+"""Candidates tested on a residual: the search problem, and trials of effects on it, in-sample and on held-out moves.
+
+A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns off all declared
+directions, gains included, and measures what they explain of the residual: in-sample, and on folds of held-out moves. A
+*family* is one effect with all settings that the dictionary tries.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +25,125 @@ from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
-# Candidate columns put to the test on a problem in folds: what they explain, in-sample and on moves left out.
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ColumnCache = dict[tuple[Effect, int], FloatArray]
 
-
+MOVES_WANTED = 60
+SHORTEST_PIECE_S = 0.25
 REDUNDANT_SHARE = 1e-6
-"""Share of a column that must be left when all declared directions are taken out of it."""
+"""Share of a column that must be left when all declared directions are projected out of it."""
 UNSEEN = 1e-9
-"""Share of a direction, squared, below which the folds that a fit may use do not show it."""
+"""Share of a direction, squared, below which the folds of a fit do not show it."""
+FAST = frozenset({Abscissa.MOTOR_ANGLE})
+"""Variables that turn within a decimated row."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchProblem:
+    """The residual of an estimate, ready for trials of candidates.
+
+    Attributes:
+        model: the declared model.
+        datasets: the runs of the fit.
+        observation: their rows, with the columns of the effects accepted so far.
+        runs: predicted signals of each run, at full rate.
+        rows: the same at the observation's rows.
+        folds: the problem around the estimate, in folds of moves.
+        floors_a: noise of each motor's current in a row that no model of motion explains; None where not known.
+        cache: columns of motion and time alone, which stay the same from turn to turn.
+    """
+
+    model: Model
+    datasets: Sequence[Dataset]
+    observation: Observation
+    runs: tuple[Signals, ...]
+    rows: tuple[Signals, ...]
+    folds: Folds
+    floors_a: tuple[float | None, ...]
+    cache: ColumnCache = field(default_factory=dict)
+
+    @property
+    def axes(self) -> int:
+        """Number of axes."""
+        return self.observation.joint_count
+
+    def test(
+        self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False
+    ) -> tuple[FamilyTrials, ...]:
+        """Test families on an axis; families that the model contains already are left out.
+
+        Args:
+            families: effects, each with its settings.
+            axis: index.
+            at_rows: build columns at the rows, which is fast and good for effects that change slowly.
+        """
+        torque = self._torque_at_rows if at_rows else self.torque
+        placed = [
+            (number, effect)
+            for number, family in enumerate(families)
+            for effect in family
+            if is_placeable(effect, axis, self.model.robot)
+        ]
+        if not placed:
+            return ()
+        trials = self.trials([torque(effect, axis) for _, effect in placed])
+        members: dict[int, list[tuple[Effect, Trial]]] = {}
+        for (number, effect), trial in zip(placed, trials, strict=True):
+            if trial is not None:
+                members.setdefault(number, []).append((effect, trial))
+        return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
+
+    def trials(self, torques: Sequence[FloatArray]) -> tuple[Trial | None, ...]:
+        """Test candidates given by their joint torques (n, p, r); None where the model contains them already."""
+        ends = np.cumsum([torque.shape[1] for torque in torques])
+        candidates = [slice(int(end) - torque.shape[1], int(end)) for end, torque in zip(ends, torques, strict=True)]
+        whole = np.concatenate(torques, axis=1)
+        columns = self.folds.problem.whitened(whole, self.model.drive_train.to_motor)
+        return score_candidates(self.folds, columns, candidates)
+
+    def torque(self, effect: Effect, axis: int) -> FloatArray:
+        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
+        if (effect, axis) in self.cache:
+            return self.cache[effect, axis]
+        made = effect_torque(effect, axis, self.runs, self.datasets, self.observation.conditioning, self.model)
+        if effect.abscissa.is_kinematic:
+            self.cache[effect, axis] = made
+        return made
+
+    def _torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
+        if effect.abscissa in FAST:
+            return self.torque(effect, axis)
+        columns = np.concatenate([effect.columns(run, axis) for run in self.rows], axis=-1)
+        return at_joints(effect, axis, columns, self.model.drive_train)
+
+
+@dataclass(frozen=True, slots=True)
+class FamilyTrials:
+    """Trials of one family on one axis.
+
+    Attributes:
+        axis: index.
+        members: settings and their trials, at least one.
+    """
+
+    axis: int
+    members: tuple[tuple[Effect, Trial], ...]
+
+    def nested(self) -> FloatArray:
+        """‖e‖² of each fold and motor, shape (folds, n), with the setting chosen by the other folds alone."""
+        chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
+        return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One candidate's columns put to the test on a problem.
+    """Result of testing one candidate.
 
     Attributes:
         coefficients: in-sample, in the unit of the columns, shape (p,).
         fallen: in-sample fall of ‖e‖² of each motor, shape (n,).
-        training_fall: fall of ‖e‖² on the other folds, which may choose among settings, shape (folds,).
+        training_fall: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,).
         held_out: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n).
         score: Φ⊥ᵀe, shape (p,).
         scatter: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (moves, p).
@@ -52,29 +159,95 @@ class Trial:
     gram: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class Products:
-    """Of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns.
+def prepare_search(
+    model: Model,
+    datasets: Sequence[Dataset],
+    observation: Observation,
+    estimate: Estimate,
+    cache: ColumnCache | None = None,
+) -> SearchProblem:
+    """Linearise around an estimate, cut into folds, and predict the signals of every run.
 
-    Attributes:
-        move_jacobian, move_gram, move_score: JᵀΦ, ΦᵀΦ and Φᵀe of each move.
-        part_jacobian, part_gram, part_score, part_held: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
+    Args:
+        model: the declared model.
+        datasets: the runs of the fit, in the observation's order.
+        observation: their rows, with the columns of effects accepted so far.
+        estimate: by ``ml`` on that observation.
+        cache: kept by the caller from turn to turn; for these datasets alone.
+
+    Raises:
+        TooFewMoves: there are too few moves to leave some out.
     """
+    pieces, whole = _pieces(observation)
+    began_s = session_began_s(datasets)
+    runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
+    problem = linearise(
+        replace(observation, move=pieces),
+        estimate.gains,
+        estimate.parameters,
+        estimate.axis_noise,
+        gains_fixed=estimate.gains_fixed,
+    )
+    floors = noise_floors(datasets, observation.conditioning)
+    return SearchProblem(
+        model=model,
+        datasets=datasets,
+        observation=observation,
+        runs=runs,
+        rows=tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True)),
+        folds=cut(problem, whole=whole),
+        floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
+        cache={} if cache is None else cache,
+    )
 
-    move_jacobian: FloatArray
-    move_gram: FloatArray
-    move_score: FloatArray
-    part_jacobian: FloatArray
-    part_gram: FloatArray
-    part_score: FloatArray
-    part_held: FloatArray
+
+def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
+    """Piece of a move that each row belongs to, shape (r,), and the move that each piece with rows belongs to.
+
+    The scatter of moves is known well only from many: moves of a short recording are cut into pieces of many
+    correlation times (0.05 s) each. Folds still take whole moves.
+    """
+    time_s, move = observation.time_s, observation.move
+    first = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    length = np.diff(first, append=len(move))
+    total_s = float(np.sum(time_s[first + length - 1] - time_s[first]))
+    shortest_s = max(SHORTEST_PIECE_S, total_s / MOVES_WANTED) if len(first) < MOVES_WANTED else np.inf
+    since_s = time_s - np.repeat(time_s[first], length)
+    piece = np.floor(since_s / shortest_s).astype(np.int64)
+    change = (np.diff(move, prepend=move[0] - 1) != 0) | (np.diff(piece, prepend=-1) != 0)
+    pieces = np.cumsum(change).astype(np.int64)
+    used = np.flatnonzero(observation.motor_use.any(axis=0))
+    _, at = np.unique(pieces[used], return_index=True)
+    return pieces, move[used[at]]
+
+
+def _at_rows(run: Signals, data: Dataset, observation: Observation) -> Signals:
+    def rows(column: FloatArray) -> FloatArray:
+        return decimate_rows(data, observation.conditioning, column)
+
+    time_s = rows(run.time_s)
+    return replace(
+        run,
+        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
+        time_s=time_s,
+        session_s=rows(run.session_s),
+        position_rad=rows(run.position_rad),
+        velocity_rad_s=rows(run.velocity_rad_s),
+        acceleration_rad_s2=rows(run.acceleration_rad_s2),
+        motor_position_rad=rows(run.motor_position_rad),
+        inertia_kg_m2=rows(run.inertia_kg_m2),
+        load_torque_nm=rows(run.load_torque_nm),
+        geared_torque_nm=rows(run.geared_torque_nm),
+        motor_torque_nm=rows(run.motor_torque_nm),
+        current_a=rows(run.current_a),
+    )
 
 
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
-    """Project columns off all declared directions, gains included, and see what they explain.
+    """Project columns off all declared directions, gains included, and measure what they explain.
 
-    Everything is computed from products that are summed block by block, so that a candidate costs no pass over the
-    rows of its own.
+    Everything is computed from products that are summed block by block, so that no candidate needs a pass over the rows
+    of its own.
 
     Args:
         folds: the problem in folds.
@@ -82,7 +255,7 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
         candidates: which columns belong together.
 
     Returns:
-        for each candidate; None where the declared model says the same already.
+        one trial a candidate; None where the declared model contains it already.
     """
     made = _products(folds, columns)
     f = len(folds.motor_score[0])
@@ -103,7 +276,7 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
             made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w, folds.move_hessian
         )
         gram = move_gram.sum(axis=0)
-        if np.any(np.diag(gram) <= REDUNDANT_SHARE * squares[chosen]) or np.linalg.cond(gram / _size(gram)) > 1e10:
+        if np.any(np.diag(gram) <= REDUNDANT_SHARE * squares[chosen]) or np.linalg.cond(_normalised(gram)) > 1e10:
             trials.append(None)
             continue
         score = move_score[:, chosen].sum(axis=0)
@@ -132,21 +305,10 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     return tuple(trials)
 
 
-def _size(gram: FloatArray) -> FloatArray:
-    root = np.sqrt(np.diag(gram))
-    return np.asarray(np.outer(root, root))
-
-
-def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, hessian: FloatArray) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (parts, p, p)."""
-    crossed = np.swapaxes(jacobian, 1, 2) @ along
-    return np.asarray(gram - crossed - np.swapaxes(crossed, 1, 2) + along.T @ (hessian @ along))
-
-
 def _left_out(
-    folds: Folds, made: Products, chosen: slice, moved: Sequence[FloatArray], before: FloatArray
+    folds: Folds, made: _Products, chosen: slice, moved: Sequence[FloatArray], before: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Fall on the other folds, and ‖e‖² on each fold with coefficients from the others."""
+    """Fall of ‖e‖² on the other folds, and ‖e‖² on each fold with coefficients from the others."""
     training_fall, held_out = np.empty(folds.count), np.empty_like(before)
     gram, score = made.part_gram[:, :, chosen, chosen], made.part_score[:, :, chosen]
     jacobian = made.part_jacobian[:, :, :, chosen]
@@ -167,11 +329,35 @@ def _left_out(
     return training_fall, held_out
 
 
-def _products(folds: Folds, columns: FloatArray) -> Products:
+def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, hessian: FloatArray) -> FloatArray:
+    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (parts, p, p)."""
+    crossed = np.swapaxes(jacobian, 1, 2) @ along
+    return np.asarray(gram - crossed - np.swapaxes(crossed, 1, 2) + along.T @ (hessian @ along))
+
+
+@dataclass(frozen=True, slots=True)
+class _Products:
+    """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns.
+
+    Attributes:
+        move_jacobian, move_gram, move_score: JᵀΦ, ΦᵀΦ and Φᵀe of each move.
+        part_jacobian, part_gram, part_score, part_held: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
+    """
+
+    move_jacobian: FloatArray
+    move_gram: FloatArray
+    move_score: FloatArray
+    part_jacobian: FloatArray
+    part_gram: FloatArray
+    part_score: FloatArray
+    part_held: FloatArray
+
+
+def _products(folds: Folds, columns: FloatArray) -> _Products:
     problem, n = folds.problem, len(folds.problem.gamma)
     f, q = problem.jacobian.shape[1], columns.shape[1]
     moves, count = problem.moves, folds.count
-    made = Products(
+    made = _Products(
         np.zeros((moves, f, q)),
         np.zeros((moves, q, q)),
         np.zeros((moves, q)),
@@ -196,187 +382,6 @@ def _products(folds: Folds, columns: FloatArray) -> Products:
     return made
 
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-ColumnCache = dict[tuple[Effect, int], FloatArray]
-MOVES_WANTED = 60
-SHORTEST_PIECE_S = 0.25
-FAST = frozenset({Abscissa.MOTOR_ANGLE})
-"""Variables that turn within a decimated row."""
-
-
-@dataclass(frozen=True, slots=True)
-class TestedFamily:
-    """A family on one axis, tested with each of its settings that says something.
-
-    Attributes:
-        axis: index.
-        members: settings and their trials, at least one.
-    """
-
-    axis: int
-    members: tuple[tuple[Effect, Trial], ...]
-
-    def nested(self) -> FloatArray:
-        """‖e‖² of each fold and motor, shape (folds, n), the setting chosen by the other folds alone."""
-        chosen = np.argmax(np.stack([trial.training_fall for _, trial in self.members]), axis=0)
-        return np.stack([self.members[best][1].held_out[fold] for fold, best in enumerate(chosen)])
-
-
-@dataclass(frozen=True, slots=True)
-class SearchProblem:
-    """What candidates are tested on.
-
-    Attributes:
-        model: the declared model.
-        datasets: the runs of the fit.
-        observation: their rows, with the columns of effects accepted so far.
-        runs: what the model predicts of each run, at full rate.
-        rows: the same at the observation's rows.
-        folds: the problem around the estimate.
-        floors_a: noise of each motor's current in a row that no model of motion explains; None where not known.
-        cache: columns of motion and time alone, which stay the same from turn to turn.
-    """
-
-    model: Model
-    datasets: Sequence[Dataset]
-    observation: Observation
-    runs: tuple[Signals, ...]
-    rows: tuple[Signals, ...]
-    folds: Folds
-    floors_a: tuple[float | None, ...]
-    cache: ColumnCache = field(default_factory=dict)
-
-    @property
-    def axes(self) -> int:
-        """Number of axes."""
-        return self.observation.joint_count
-
-    def torque(self, effect: Effect, axis: int) -> FloatArray:
-        """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
-        if (effect, axis) in self.cache:
-            return self.cache[effect, axis]
-        made = effect_torque(effect, axis, self.runs, self.datasets, self.observation.conditioning, self.model)
-        if effect.abscissa.is_kinematic:
-            self.cache[effect, axis] = made
-        return made
-
-    def slow_torque(self, effect: Effect, axis: int) -> FloatArray:
-        """The same of an effect that changes slowly: made at the rows, which is as good and much faster."""
-        if effect.abscissa in FAST:
-            return self.torque(effect, axis)
-        columns = np.concatenate([effect.columns(run, axis) for run in self.rows], axis=-1)
-        return at_joints(effect, axis, columns, self.model.drive_train)
-
-    def trials(self, torques: Sequence[FloatArray]) -> tuple[Trial | None, ...]:
-        """Candidates given by their joint torques (n, p, r); None where the model says the same already."""
-        ends = np.cumsum([torque.shape[1] for torque in torques])
-        candidates = [slice(int(end) - torque.shape[1], int(end)) for end, torque in zip(ends, torques, strict=True)]
-        whole = np.concatenate(torques, axis=1)
-        columns = self.folds.problem.whitened(whole, self.model.drive_train.to_motor)
-        return score_candidates(self.folds, columns, candidates)
-
-    def test(
-        self, families: Iterable[Sequence[Effect]], axis: int, *, at_rows: bool = False
-    ) -> tuple[TestedFamily, ...]:
-        """Families on an axis; those of which the model lacks nothing are left out."""
-        torque = self.slow_torque if at_rows else self.torque
-        placed = [
-            (number, effect)
-            for number, family in enumerate(families)
-            for effect in family
-            if is_placeable(effect, axis, self.model.robot)
-        ]
-        if not placed:
-            return ()
-        trials = self.trials([torque(effect, axis) for _, effect in placed])
-        members: dict[int, list[tuple[Effect, Trial]]] = {}
-        for (number, effect), trial in zip(placed, trials, strict=True):
-            if trial is not None:
-                members.setdefault(number, []).append((effect, trial))
-        return tuple(TestedFamily(axis, tuple(found)) for found in members.values())
-
-
-def prepare_search(
-    model: Model,
-    datasets: Sequence[Dataset],
-    observation: Observation,
-    estimate: Estimate,
-    cache: ColumnCache | None = None,
-) -> SearchProblem:
-    """Linearise around an estimate, cut into folds, and predict what effects are made of.
-
-    Args:
-        model: the declared model.
-        datasets: the runs of the fit, in the observation's order.
-        observation: their rows, with the columns of effects accepted so far.
-        estimate: by ``ml`` on that observation.
-        cache: kept by the caller from turn to turn; of these datasets alone.
-
-    Raises:
-        TooFewMoves: to leave some out.
-    """
-    pieces, whole = _pieces(observation)
-    began_s = session_began_s(datasets)
-    runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
-    problem = linearise(
-        replace(observation, move=pieces),
-        estimate.gains,
-        estimate.parameters,
-        estimate.axis_noise,
-        gains_fixed=estimate.gains_fixed,
-    )
-    rows = tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True))
-    floors = noise_floors(datasets, observation.conditioning)
-    return SearchProblem(
-        model=model,
-        datasets=datasets,
-        observation=observation,
-        runs=runs,
-        rows=rows,
-        folds=cut(problem, whole=whole),
-        floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
-        cache={} if cache is None else cache,
-    )
-
-
-def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
-    """The piece of a move that each row belongs to, shape (r,), and the move that each piece with rows is of.
-
-    Whoever weighs a candidate by the scatter of moves needs many: those of a short recording are cut into pieces of
-    many correlation times (0.05 s) each. Folds still take whole moves.
-    """
-    time_s, move = observation.time_s, observation.move
-    first = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
-    length = np.diff(first, append=len(move))
-    total_s = float(np.sum(time_s[first + length - 1] - time_s[first]))
-    shortest_s = max(SHORTEST_PIECE_S, total_s / MOVES_WANTED) if len(first) < MOVES_WANTED else np.inf
-    since_s = time_s - np.repeat(time_s[first], length)
-    piece = np.floor(since_s / shortest_s).astype(np.int64)
-    change = (np.diff(move, prepend=move[0] - 1) != 0) | (np.diff(piece, prepend=-1) != 0)
-    pieces = np.cumsum(change).astype(np.int64)
-    used = np.flatnonzero(observation.motor_use.any(axis=0))
-    _, at = np.unique(pieces[used], return_index=True)
-    return pieces, move[used[at]]
-
-
-def _at_rows(run: Signals, data: Dataset, observation: Observation) -> Signals:
-    def rows(column: FloatArray) -> FloatArray:
-        return decimate_rows(data, observation.conditioning, column)
-
-    time_s = rows(run.time_s[None])[0]
-    return replace(
-        run,
-        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
-        time_s=time_s,
-        session_s=rows(run.session_s[None])[0],
-        position_rad=rows(run.position_rad),
-        velocity_rad_s=rows(run.velocity_rad_s),
-        acceleration_rad_s2=rows(run.acceleration_rad_s2),
-        motor_position_rad=rows(run.motor_position_rad),
-        inertia_kg_m2=rows(run.inertia_kg_m2),
-        load_torque_nm=rows(run.load_torque_nm),
-        geared_torque_nm=rows(run.geared_torque_nm),
-        motor_torque_nm=rows(run.motor_torque_nm),
-        current_a=rows(run.current_a),
-    )
+def _normalised(gram: FloatArray) -> FloatArray:
+    root = np.sqrt(np.diag(gram))
+    return np.asarray(gram / np.outer(root, root))

@@ -1,14 +1,14 @@
-"""One error for every model and every data set: what a model leaves of each motor's current.
+"""One error for every model and every data set: the part of each motor's current that a model does not explain.
 
-Of motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i and T from the drive train,
+For motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i and T from the drive train,
 
     e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
 
-The current is what was measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6)
-grows and shrinks with the gains that a model finds. The weights w turn currents of different motors into torques at the
-joint, so that a robot without coupled axes has the ε of Table 6. They are one set of gains for all that is compared.
-Whitened by σ_i instead, ε would have a yardstick that an accepted effect moves. A robot with prismatic and revolute
-axes adds Nm to N in ε, as Table 6 would; its ε_i stand for themselves.
+The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6) scales with
+the gains that a model finds. The weights w convert currents of different motors to torques at the joint, so that a
+robot without coupled axes has the ε of Table 6. They are one set of gains for all models that are compared; whitened by
+σ_i instead, ε would have a scale that an accepted effect moves. A robot with prismatic and revolute axes adds Nm to N
+in ε, as Table 6 would; its ε_i are not affected.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.maximum_likelihood import ml
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class CurrentError:
-    """Sums over rows, so that parts of the data can be put together.
+    """Sums over rows, so that errors of parts of the data can be added.
 
     Attributes:
         size: ‖v_i‖² of each motor [A²], shape (n,).
@@ -44,28 +45,28 @@ class CurrentError:
     left: FloatArray
 
     def __add__(self, other: CurrentError) -> CurrentError:
-        """Of the rows of both."""
+        """Error on the rows of both."""
         return CurrentError(self.size + other.size, self.left + other.left)
 
     def relative(self, weights_nm_a: FloatArray) -> RelativeError:
         """ε_i and ε [%]; NaN for a motor without a row.
 
         Args:
-            weights_nm_a: w, one set of gains for all that is compared, shape (n,).
+            weights_nm_a: w, one set of gains for all models that are compared, shape (n,).
         """
         return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
 
 
 def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
-    """Of an estimate on rows, those of its fit or others with the same columns."""
+    """Error of an estimate on rows, those of its fit or others with the same columns."""
     use, measured = observation.motor_use, observation.current
-    asked = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
-    residual = measured - asked / estimate.gains[:, None]
+    predicted = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
+    residual = measured - predicted / estimate.gains[:, None]
     return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
 
 
 def error_left_out(folds: Folds) -> CurrentError:
-    """Of each fold's rows, predicted by a fit that has not seen their moves."""
+    """Error on each fold's rows, predicted by a fit that has not seen their moves."""
     problem = folds.problem
     size, left = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
     np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
@@ -73,15 +74,9 @@ def error_left_out(folds: Folds) -> CurrentError:
     return CurrentError(size, left)
 
 
-# Each run of a fit left out in turn: everything refitted without it, and the run predicted.
-
-
-IntArray = NDArray[np.int64]
-
-
 @dataclass(frozen=True, slots=True)
 class LeftOutRun:
-    """One run of the fit, predicted by the others; `error` is None where they cannot, and `reason` says why."""
+    """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
 
     run: str
     error: RelativeError | None
@@ -90,11 +85,11 @@ class LeftOutRun:
 
 @dataclass(frozen=True, slots=True)
 class LeftOutRuns:
-    """Each run of the fit left out in turn.
+    """Errors on each run of the fit, left out in turn.
 
     Attributes:
         runs: in the order of the fit.
-        together: over the rows of all that could be predicted; None without any.
+        together: over the rows of all runs that could be predicted; None without any.
     """
 
     runs: tuple[LeftOutRun, ...]
@@ -104,7 +99,7 @@ class LeftOutRuns:
 def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
     """Refit everything without each run of the fit in turn, and predict that run.
 
-    A run that alone carries the known payload, or alone goes without, cannot be spared: it is told with the reason.
+    The only run with the known payload, or the only one without, cannot be left out: it is listed with the reason.
 
     Args:
         evidence: identified by ``ml``.
@@ -123,7 +118,7 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
 
 
 def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
-    """Of one run of the fit, the model refitted without it."""
+    """Error on one run of the fit, with the model refitted without it."""
     order = [index for index in range(len(evidence.trained)) if index != left_out] + [left_out]
     whole = _in_order(evidence.bare, order)
     last = whole.run == len(order) - 1
@@ -146,7 +141,7 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
 
 
 def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
-    """The rows of some runs, run by run in this order."""
+    """Sort rows by run, in this order."""
     rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
     number = np.zeros(len(bare.runs), dtype=np.int64)
     number[list(order)] = np.arange(len(order))

@@ -1,22 +1,20 @@
-"""How small a model's error could be: the noise of each motor's current, seen where nothing moves.
+"""Noise floor: the noise of each motor's current at standstill, which bounds a model's error from below.
 
 While a joint stands still no model of motion has anything to explain: friction holds it within ±Fs, the amplifier's
-integrator creeps, and what the current does faster than that is noise of measurement and control. So each standstill
-of a motor is filtered and decimated like every row (windows wholly inside), a parabola in time is taken out of it,
-and the rest gives an estimate of σ² from each dwell d,
+integrator creeps, and faster changes of the current are noise of measurement and control. Each standstill of a motor
+is filtered and decimated like every row (windows wholly inside), a parabola in time is subtracted, and the rest gives
+an estimate of σ² from each dwell d,
 
     s_d² = ‖M_d v_d‖²/tr(M_d P_d),        M_d = I − H_d,
 
 with H_d the projection on (1, t, t²) and P_d the correlation that the filter itself gives to rows of white noise, so
-that a short dwell, of which the detrending takes a large part, is counted as what is left of it. s_d² is nearly
-σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP) (Satterthwaite 1946); divided by the median of χ²_ν/ν every dwell is as likely above
-σ² as below, and σ² is their median, weighted by ν. The median, because an axis slips or rings in some of its dwells and
-in most it does not.
+that a short dwell counts only by what the detrending leaves of it. s_d² is nearly σ² χ²_ν/ν with ν = tr(MP)²/tr(MPMP)
+(Satterthwaite 1946); divided by the median of χ²_ν/ν every dwell is as likely above σ² as below, and σ² is their
+median, weighted by ν. A median, because an axis slips or rings in some of its dwells.
 
-Limits. It is a lower bound: a motor that turns has ripple, commutation error and an encoder's noise differentiated,
-which standstill does not show; noise slower than a dwell goes with the parabola. It is too high where an axis hunts
-about its target in most of its dwells. Dwells in which the drive tells one constant number (power stage off, brake on)
-are no measurement and are left out.
+Limits. It is a lower bound: standstill does not show ripple, commutation error and the differentiated noise of the
+encoder; noise slower than a dwell is subtracted with the parabola. It is too high where an axis hunts about its target
+in most of its dwells. Dwells with one constant number (power stage off, brake on) are no measurement and are left out.
 """
 
 from __future__ import annotations
@@ -39,19 +37,19 @@ MIN_DWELLS = 8
 MIN_FREEDOM = 20.0
 """σ is then known to 20 %."""
 _TREND = 3
-"""Coefficients of the parabola: a straight line leaves the bend of a controller that settles."""
+"""Coefficients of the parabola: a straight line would leave the bend of a settling controller."""
 _MEDIAN_EFFICIENCY = 2.0 / np.pi
-"""Of a median of many, against their mean (van der Vaart 1998, §21.2)."""
+"""Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFloor:
-    """Of one motor.
+    """Noise floor of one motor.
 
     Attributes:
         noise_a: σ of the current in the observation's rows [A].
-        dwells: standstills that it rests on.
-        freedom: degrees of freedom that they leave, ν summed.
+        dwells: number of standstills used.
+        freedom: their degrees of freedom, ν summed.
     """
 
     noise_a: float
@@ -65,11 +63,11 @@ class NoiseFloor:
 
 
 def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tuple[NoiseFloor | None, ...]:
-    """The noise of each motor's current in rows, None where it rested too seldom or too shortly to tell.
+    """Estimate the noise of each motor's current in rows, None where it rested too seldom or too briefly.
 
     Args:
-        datasets: of the fit.
-        conditioning: the filters, and below which speed a joint stands still.
+        datasets: runs of the fit.
+        conditioning: the filters, and the speed below which a joint stands still.
 
     Raises:
         DataUnfit: a run is too short for the filter.
@@ -98,7 +96,7 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
 
 
 def _variance(filter_: Decimator, current: FloatArray) -> tuple[float, float]:
-    """s_d² [A²] and ν of one dwell."""
+    """Variance s_d² [A²] and freedom ν of one dwell."""
     seen = filter_(current)
     trend, _ = np.linalg.qr(np.vander(np.arange(len(seen), dtype=np.float64), _TREND))
     rest = np.eye(len(seen)) - trend @ trend.T
@@ -114,7 +112,7 @@ def _standstills(still: BoolArray) -> Iterator[slice]:
 
 
 def _correlation(filter_: Decimator, rows: int) -> FloatArray:
-    """P: of rows of white noise, shape (rows, rows)."""
+    """Correlation P of rows of white noise, shape (rows, rows)."""
     taps = filter_.taps
     lags = filter_.factor * np.arange(rows)
     of_lag = np.array([float(taps[lag:] @ taps[: len(taps) - lag]) if lag < len(taps) else 0.0 for lag in lags])

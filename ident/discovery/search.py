@@ -1,28 +1,28 @@
-"""Find the effect that a residual asks for, or say that it asks for none.
+"""Find the effect that a residual calls for, or report that it calls for none.
 
-The lag-one correlation of a residual is about 0.67, so textbook tests lie. A candidate must pass every gate:
+The lag-one correlation of a residual is about 0.67, so textbook tests are wrong. A candidate must pass every gate:
 
 1. cluster Wald, max-T: its statistic, clustered by move, is larger than the largest of all candidates' in 99 % of
    draws in which each move's noise keeps its size and gets a random sign (a wild bootstrap, Cameron et al. 2008), or in
    95 % where it is better on nearly all folds and by a tenth;
-2. it is better on at least three quarters of the folds of left-out moves;
-3. it explains at least 3 % of the squared residual of the motor that feels it most;
-4. that motor's error on left-out moves falls by at least 2 %.
+2. it lowers the error on at least three quarters of the folds of held-out moves;
+3. it explains at least 3 % of the squared residual of the motor that it affects most;
+4. that motor's error on held-out moves falls by at least 2 %.
 
-Candidates are ranked by left-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
+Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from ident.discovery.candidates import SearchProblem, TestedFamily, Trial
+from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 
@@ -30,23 +30,28 @@ FloatArray = NDArray[np.float64]
 Place = tuple[str, int, tuple[int, ...]]
 
 AS_GOOD = 0.99
-"""Of the best one's fall on left-out moves."""
+"""Share of the best one's fall on held-out moves that counts as equal."""
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
+GOLDEN_STEPS = 6
+"""Steps of the golden section: the bracket between two neighbours becomes an eighteenth."""
+DECLARED = {"exponent": (0.8, 1.25)}
+"""Settings between which an effect is nearly a declared one: friction with exponent one is viscous."""
+GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Gates:
-    """What a candidate must show before it may join the model.
+    """Limits that a candidate must pass before it may join the model.
 
     Attributes:
         false_alarm: largest probability that noise makes one this strong anywhere.
         folds_better, explained, error_fall: least share of folds, of the motor's squared residual and of its error on
-            left-out moves.
-        strong_folds, strong_fall: whoever shows as much on left-out moves may have strong_false_alarm: with few moves
-            the bootstrap sees little, and being right on what was not seen is evidence of another kind.
-        strong_false_alarm: see there.
-        draws: of the bootstrap.
+            held-out moves.
+        strong_folds, strong_fall: shares of folds and error on held-out moves from which `strong_false_alarm` applies:
+            with few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
+        strong_false_alarm: as `false_alarm`, for strong candidates.
+        draws: number of draws of the bootstrap.
     """
 
     false_alarm: float = 0.01
@@ -60,28 +65,28 @@ class Gates:
 
     @property
     def smallest_share(self) -> float:
-        """Of a motor's squared residual: what explains less passes no gate."""
+        """Share of a motor's squared residual below which an effect passes no gate."""
         return max(self.explained, 1.0 - (1.0 - self.error_fall) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One family on one axis, and what the data say of it.
+    """Result of testing one family on one axis.
 
     Attributes:
         effect: with the setting that explains most.
         axis: index of the joint (or motor).
-        coefficients, deviations: first estimate of its linear parameters, and its σ by the scatter of moves.
+        coefficients, deviations: first estimate of its linear parameters, and their σ by the scatter of moves.
         probability: that noise alone makes a candidate this strong somewhere among all.
         folds_better: share of folds on which it lowers the error.
-        explained: share of the squared residual of the motor that feels it most.
-        error_before_percent, error_after_percent: of that motor on left-out moves, ‖e‖/‖v‖ of its current [%].
+        explained: share of the squared residual of the motor that it affects most.
+        error_before_percent, error_after_percent: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%].
         error_fall: relative fall from one to the other.
-        held_out_fall: fall of the whole whitened ‖e‖² on left-out moves; the rank.
-        passed: whether every gate is open.
-        fold_errors: ‖e‖² of the whole on each fold, shape (folds,); what a paired comparison with another one needs.
-        share_of_excess: of the motor's squared residual beyond its noise floor; None where that is not known.
-        ambiguity: others whose left-out score cannot be told from this one's.
+        held_out_fall: fall of the whole whitened ‖e‖² on held-out moves; the rank.
+        passed: whether it passes every gate.
+        fold_errors: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons.
+        share_of_excess: of the motor's squared residual beyond its noise floor; None where the floor is not known.
+        ambiguity: other effects that cannot be distinguished from this one by their score on held-out moves.
     """
 
     effect: Effect
@@ -107,26 +112,47 @@ def rank_effects(
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
 ) -> tuple[Finding, ...]:
-    """All families on all axes, the best on left-out moves first.
+    """Test all families on all axes and return them ranked, the best on held-out moves first.
 
     Args:
-        inquiry: the residual.
+        search_problem: the residual.
         rng: of the bootstrap.
-        gates: what a candidate must show.
+        gates: limits for a candidate.
         families: the dictionary.
     """
     tested = [found for axis in range(search_problem.axes) for found in search_problem.test(families, axis)]
     return rank_families(search_problem, tested, rng, gates or Gates())
 
 
-def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
-    """The best that passed; of those as good on the same axis, the one with the fewest parameters.
+def rank_families(
+    search_problem: SearchProblem, tested: Sequence[FamilyTrials], rng: np.random.Generator, gates: Gates
+) -> tuple[Finding, ...]:
+    """Judge each family by the gates and rank all by held-out moves.
 
-    A hinge that begins where the joint never comes is a spring, and is called one.
+    Args:
+        search_problem: the residual.
+        tested: families; they compete for the largest statistic that noise alone would give.
+        rng: of the bootstrap.
+        gates: limits for a candidate.
+    """
+    if not tested:
+        return ()
+    trials = tuple(trial for family in tested for _, trial in family.members)
+    probabilities = iter(_max_t(trials, rng, gates.draws))
+    before = search_problem.folds.square_sum(search_problem.folds.residual)
+    findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
+    ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
+    return tuple(replace(finding, ambiguity=_ambiguity_set(finding, ranked)) for finding in ranked)
+
+
+def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
+    """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
+
+    A hinge that begins where the joint never comes is a spring, and is named so.
 
     Args:
         findings: ranked.
-        taken: what is in the model already, or cannot be added; an effect joins an axis once.
+        taken: places in the model already, or refused; an effect joins an axis once.
     """
     passed = [finding for finding in findings if finding.passed and place_of(finding.effect, finding.axis) not in taken]
     if not passed:
@@ -137,50 +163,50 @@ def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozens
         for finding in passed
         if finding.axis == best.axis and finding.held_out_fall >= AS_GOOD * best.held_out_fall
     ]
-    return min(alike, key=lambda finding: _parameters(finding.effect))
+    return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(finding.effect.settings))
 
 
 def place_of(effect: Effect, axis: int) -> Place:
-    """What makes two effects the same whatever their real settings are: two orders of a ripple are two effects."""
+    """Identify an effect on an axis whatever its real settings are: two orders of a ripple are two effects."""
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 
-def rank_families(
-    search_problem: SearchProblem, tested: Sequence[TestedFamily], rng: np.random.Generator, gates: Gates
-) -> tuple[Finding, ...]:
-    """What the data say of each family, ranked by left-out moves.
-
-    Args:
-        inquiry: the residual.
-        tested: on it; they compete for the largest statistic that noise alone would give.
-        rng: of the bootstrap.
-        gates: what a candidate must show.
-    """
-    if not tested:
-        return ()
-    trials = tuple(trial for family in tested for _, trial in family.members)
-    probabilities = iter(_max_t(trials, rng, gates.draws))
-    before = search_problem.folds.square_sum(search_problem.folds.residual)
-    findings = [_judge(search_problem, before, family, probabilities, gates) for family in tested]
-    ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
-    return tuple(replace(finding, ambiguity=_alike(finding, ranked)) for finding in ranked)
-
-
 def is_better(one: Finding, other: Finding) -> bool:
-    """Whether a paired comparison over folds tells that one explains more than another."""
+    """Whether one finding explains more than another by a paired comparison over folds."""
     gain = other.fold_errors - one.fold_errors
     error = float(np.std(gain, ddof=1)) * float(np.sqrt(len(gain)))
     return float(gain.sum()) > float(special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
 
 
-def _parameters(effect: Effect) -> int:
-    return len(effect.coefficients) + len(effect.settings)
+def refine_setting(
+    search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]
+) -> Effect:
+    """Refine the first real setting by golden section on the squared residual, between its neighbours in the family.
+
+    The search is over the logarithm. An effect without a positive real setting, or at the end of its family, is
+    returned unchanged.
+
+    Args:
+        search_problem: the residual.
+        effect, axis: accepted.
+        families: the dictionary that it came from.
+    """
+    family = next((members for members in families if effect in members), ())
+    for name, value in effect.settings.items():
+        if not isinstance(value, float):
+            continue
+        grid = sorted(member.settings[name] for member in family if member.with_settings({name: value}) == effect)
+        place = grid.index(value) if value in grid else 0
+        if 0 < place < len(grid) - 1 and grid[0] > 0:
+            lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
+            return _golden_section(search_problem, effect, axis, name, lower, upper)
+    return effect
 
 
 def _judge(
     search_problem: SearchProblem,
     before: FloatArray,
-    family: TestedFamily,
+    family: FamilyTrials,
     probabilities: Iterator[float],
     gates: Gates,
 ) -> Finding:
@@ -190,7 +216,7 @@ def _judge(
     effect, trial = members[best]
     after = family.nested()
     fall = before.sum(axis=1) - after.sum(axis=1)
-    # A joint's torque may be another motor's to give (R): the drive in question is the one whose residual falls most.
+    # Another motor may supply a joint's torque (R): the drive in question is the one whose residual falls most.
     motor = int(np.argmax(trial.fallen))
     rows = problem.motor == motor
     own, size = float(np.sum(problem.residual[rows] ** 2)), float(np.sum(problem.current[rows] ** 2))
@@ -258,9 +284,9 @@ def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
 
 
 def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
-    """The Wald statistic of each draw, with a scatter of its own: few moves would else look surer than they are.
+    """Wald statistic of each draw, with a scatter of its own; with one for all, few moves would look too certain.
 
-    In a draw, x_m becomes s_m x_m; its sum S is taken for an effect β = G⁻¹S, and what is left in move m is
+    In a draw, x_m becomes s_m x_m; its sum S is taken for an effect β = G⁻¹S, and the rest in move m is
     s_m x_m − G_m β (the studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
     """
     x, gram = trial.scatter, trial.gram
@@ -277,8 +303,8 @@ def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
     return np.asarray(np.sum(sums * np.linalg.solve(left, sums[:, :, None])[:, :, 0], axis=1))
 
 
-def _alike(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedEffect, ...]:
-    """The others that a paired comparison over folds cannot tell from it."""
+def _ambiguity_set(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedEffect, ...]:
+    """Other findings that a paired comparison over folds cannot distinguish from this one."""
     return tuple(
         PlacedEffect(other.effect, other.axis)
         for other in ranked
@@ -289,65 +315,27 @@ def _alike(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedEffect, .
     )
 
 
-# The setting of an accepted effect, found between those that the dictionary tries.
-
-
-STEPS = 6
-"""Of the golden section: the bracket between two neighbours becomes an eighteenth."""
-DECLARED = {"exponent": (0.8, 1.25)}
-"""Settings between which an effect is nearly one that is declared: friction with exponent one is viscous."""
-GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
-
-
-def refine_setting(
-    search_problem: SearchProblem, effect: Effect, axis: int, families: Iterable[Sequence[Effect]]
-) -> Effect:
-    """Golden section on the squared residual, over the logarithm of a setting, between its neighbours in the family.
-
-    An effect without a positive real setting, or at the end of its family, is returned as it is.
-
-    Args:
-        inquiry: the residual.
-        effect, axis: accepted.
-        families: the dictionary that it came from.
-    """
-    family = next((members for members in families if effect in members), None)
-    if family is None:
-        return effect
-    for name, value in effect.settings.items():
-        if not isinstance(value, float) or not is_dataclass(effect):
-            continue
-        others = {key: setting for key, setting in effect.settings.items() if key != name}
-        grid = sorted(
-            member.settings[name]
-            for member in family
-            if {key: setting for key, setting in member.settings.items() if key != name} == others
-        )
-        place = grid.index(value)
-        if grid[0] > 0 and 0 < place < len(grid) - 1:
-            lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
-            return _golden(search_problem, effect, axis, name, lower, upper)
-    return effect
-
-
 def _one_side(name: str, value: float, lower: float, upper: float) -> tuple[float, float]:
-    """The part of a bracket on whose side of DECLARED the value lies."""
+    """Part of a bracket on the value's side of DECLARED."""
     if name not in DECLARED:
         return lower, upper
     below, above = DECLARED[name]
     return (lower, min(upper, below)) if value < below else (max(lower, above), upper)
 
 
-def _golden(search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float) -> Effect:
+def _golden_section(
+    search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float
+) -> Effect:
     a, b = float(np.log(lower)), float(np.log(upper))
 
     def fall(x: float) -> float:
-        (trial,) = search_problem.trials([search_problem.torque(_with(effect, name, float(np.exp(x))), axis)])
+        changed = effect.with_settings({name: float(np.exp(x))})
+        (trial,) = search_problem.trials([search_problem.torque(changed, axis)])
         return -np.inf if trial is None else float(trial.fallen.sum())
 
     inner, outer = b - GOLDEN * (b - a), a + GOLDEN * (b - a)
     at_inner, at_outer = fall(inner), fall(outer)
-    for _ in range(STEPS):
+    for _ in range(GOLDEN_STEPS):
         if at_inner > at_outer:
             b, outer, at_outer = outer, inner, at_inner
             inner = b - GOLDEN * (b - a)
@@ -357,11 +345,5 @@ def _golden(search_problem: SearchProblem, effect: Effect, axis: int, name: str,
             outer = a + GOLDEN * (b - a)
             at_outer = fall(outer)
     best = float(f"{np.exp((a + b) / 2.0):.4g}")
-    return _with(effect, name, best) if fall(np.log(best)) > fall(np.log(effect.settings[name])) else effect
-
-
-def _with(effect: Effect, name: str, value: float) -> Effect:
-    if not is_dataclass(effect) or name not in {part.name for part in fields(effect)}:
-        return effect
-    changed: Effect = replace(effect, **{name: value})
-    return changed
+    better = fall(np.log(best)) > fall(np.log(effect.settings[name]))
+    return effect.with_settings({name: best}) if better else effect

@@ -1,7 +1,7 @@
-"""What no named effect explains: is the residual a function of something all the same?
+"""Structure of the residual that no named effect explains.
 
 The terms are smooth functions of one variable, or periodic ones of the motor's angle, and pass the same gates as named
-effects. Silence is told with its size: what would have been found.
+effects. Where nothing is found, the detection limit gives the size of an effect that would have been.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ VARIABLES = (
 )
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
 MUCH_MORE = 0.15
+"""Share by which a term must explain more than a named effect to call the name wrong."""
 MIN_MOVES = 5 * (INTERVALS + 1)
-"""Five for each coefficient of a term."""
+"""Five moves for each coefficient of a term."""
 TAIL = 0.005
-"""Of the samples at either end of a variable's range: there a spline would rest on a handful of them."""
+"""Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
 
 
 def find_structure(
     search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
-    """What the residual of some axes depends on, the best on left-out moves first.
+    """Find variables that the residual of some axes depends on, the best on held-out moves first.
 
     Args:
-        inquiry: the residual.
-        axes: to look at.
+        search_problem: the residual.
+        axes: indices.
         rng: of the bootstrap.
-        gates: what a term must show.
+        gates: limits for a term.
     """
     if search_problem.folds.moves < MIN_MOVES:
-        return ()  # a term of many coefficients would fit the few moves that there are
+        return ()  # a term of many coefficients would fit the few moves
     tested = [
         found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
     ]
@@ -59,22 +60,20 @@ def find_structure(
 
 
 def is_inadequate(named: Finding, structure: Finding) -> bool:
-    """Whether a term that fits anything explains clearly and much more than an effect with a name.
+    """Whether a term that fits anything explains clearly and much more than a named effect.
 
-    Then the name is that of something similar, and the residual is called unexplained rather than explained wrongly.
+    Then the true effect is only similar to the named one, and the residual counts as unexplained.
     """
     more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
     return structure.passed and more and is_better(structure, named)
 
 
 def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
-    """Torque (root mean square over the moving rows) that an effect must have at each motor to be found, shape (n,).
+    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (n,).
 
-    It is torque that the declared model cannot mimic: of an effect that looks much like gravity or viscous friction
-    most is taken up by those.
-
-    It is what opens the gates on the size of an effect whose shape the dictionary or a spline can follow; on a short
-    recording noise asks for more.
+    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
+    absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
+    recording noise raises it.
     """
     problem = search_problem.folds.problem
     noise_a = np.array(
@@ -87,10 +86,11 @@ def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArr
 
 
 def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, ...], ...]:
-    """A family a variable, with the range that it has in these runs."""
+    """One family a variable, with the range that it has in these runs."""
     families: list[tuple[Effect, ...]] = []
+    has_session = any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
     for variable, signs in VARIABLES:
-        if variable is Abscissa.SESSION and not _has_session(search_problem):
+        if variable is Abscissa.SESSION and not has_session:
             continue
         term = _ranged(search_problem, Smooth(variable), axis)
         families.append(tuple(replace(term, signed=sign) for sign in signs))
@@ -100,10 +100,6 @@ def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, .
             term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
             families.append((replace(term, signed=1), replace(term, signed=0)))
     return tuple(families)
-
-
-def _has_session(search_problem: SearchProblem) -> bool:
-    return any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
 
 
 def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.discovery.before_after import Account, account, assess, before_after, declared, floor_on
+from ident.discovery.before_after import Account, account, assess, before_after, floor_on
 from ident.discovery.current_error import CurrentError, error_left_out, error_on, left_out_runs
-from ident.discovery.loop import Evidence, Step, gather, with_effects
+from ident.discovery.loop import Evidence, Step, gather, with_effects, without_effects
 from ident.discovery.noise_floor import NoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Saturation
@@ -126,7 +126,7 @@ def test_what_is_taken_out_again_is_reported(start: Evidence, after: Evidence) -
 
 
 def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, after: Evidence) -> None:
-    again = declared(after, start.estimate)
+    again = without_effects(after, start.estimate)
     assert np.array_equal(again.training.robot, start.training.robot)
     assert again.holdout is not None
     assert start.holdout is not None

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.discovery import candidates as inquiries
-from ident.discovery.candidates import SearchProblem, Trial, score_candidates
+from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial, score_candidates
 from ident.discovery.loop import Evidence
 from ident.discovery.search import Gates, rank_effects, rank_families
 from ident.effects.dictionary import EFFECTS
@@ -188,6 +187,6 @@ def test_the_bootstrap_keeps_its_size(
     false = 0
     for _ in range(400):
         trial = replace(_noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3))
-        (finding,) = rank_families(search_problem, [inquiries.TestedFamily(0, ((effect, trial),))], rng, GATES)
+        (finding,) = rank_families(search_problem, [FamilyTrials(0, ((effect, trial),))], rng, GATES)
         false += finding.probability <= 0.05
     assert least <= false <= most
