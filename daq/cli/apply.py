@@ -1,15 +1,15 @@
-"""`drivegain apply`: the identified gains into the controller's file, shown first and written only on --yes."""
+"""`drivegain apply`: write the identified gains to the controller's file or to its drives; a dry run without --yes."""
 
 from __future__ import annotations
 
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -23,8 +23,7 @@ from daq.cli.writing import (
     SaveUnknownOption,
     applier,
     audit_of,
-    on_the_bus,
-    outcome,
+    drives_on_the_bus,
     query_history,
     record_in_history,
     saving_of,
@@ -37,135 +36,25 @@ from daq.errors import CalibrationRefused, OutputFailed, UsageError
 from daq.files import sha256
 from daq.ledger.audit import find_write_entry
 from daq.ledger.entry import Event, WriteAction
-from daq.ledger.judgement import Known
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import enter_applied
-from daq.report.proposal import describe, show, show_changes
+from daq.report.proposal import describe, show
 from daq.workflow.calibration_file import decode, read
-from daq.writeback.drive_proposal import DriveProposal, drives_of, propose_to_drives
-from daq.writeback.drive_proposal import refused as drives_refused
-from daq.writeback.drive_record import record_folder
-from daq.writeback.drive_target import DrivesWritten, apply_to_drives
-from daq.writeback.file_access import resolve_links
-from daq.writeback.file_proposal import Proposal, apply, propose_for, refused
-from daq.writeback.file_target import Written
-from daq.writeback.gates.table import Gate
+from daq.writeback.drive_target import DriveTarget
+from daq.writeback.file_target import FileTarget
+from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
-from drivers.canopen.parameters import Saving
+from daq.writeback.target import E, Proposal, Target, Written, apply, propose
 from ident.calibration import Calibration
-
-# Gains into the drives themselves: what `drivegain apply --drives` does.
-
-
-def apply_drives(
-    declared: Cell,
-    cell_file: Path,
-    request: Request,
-    *,
-    actor: Applier,
-    saving: Saving,
-    audit: Path | None,
-    yes: bool,
-    json: bool,
-) -> None:
-    """Show what a calibration changes in the drives of a cell, and write it with `yes`; nothing moves.
-
-    Args:
-        declared, cell_file: the cell, and where it is.
-        request: what is to be written.
-        doer: who writes it.
-        saving: whether the drives keep it.
-        audit: where it is written down, None for nowhere.
-        yes: write.
-        json: tell it to a program.
-    """
-    written: DrivesWritten | None = None
-    with on_the_bus(declared) as network:
-        proposal = propose_to_drives(declared, request, network)
-        if not json:
-            _show(proposal, query_history(declared, drives_of(declared.name), request, proposal.changes), Console())
-        if yes and proposal.refusals and json:
-            print_json(_described(proposal, None))
-        if yes:
-            try:
-                written = apply_to_drives(proposal, network, request.now, saving=saving, audit=audit, who=str(actor))
-            except OSError as error:
-                raise OutputFailed.of(record_folder(declared), error) from error
-    if written is not None:
-        _enter_drives(declared, request, actor, written)
-    if json:
-        print_json(_described(proposal, written))
-    if proposal.refusals:
-        raise drives_refused(proposal)
-    if not json:
-        _say_drives_outcome(proposal, written, saving, cell_file)
-
-
-def _show(proposal: DriveProposal, known: Known, console: Console) -> None:
-    show_changes(proposal.changes, console, known, "in the drive")
-    for change, value in zip(proposal.changes, proposal.base, strict=True):
-        console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}", markup=False, highlight=False)
-
-
-def _described(proposal: DriveProposal, written: DrivesWritten | None) -> dict[str, Any]:
-    return {
-        "cell": proposal.cell,
-        "base_sha256": proposal.base_sha256,
-        "base": proposal.looked_at,
-        "applied": written is not None,
-        **({} if written is None else outcome(written)),
-        "changes": [
-            {
-                "axis": change.axis,
-                "object": change.key,
-                "old": change.old,
-                "new": change.new,
-                "std": change.std,
-                "nameplate": change.nameplate,
-                "unit": change.unit,
-            }
-            for change in proposal.changes
-        ],
-        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals],
-    }
-
-
-def _enter_drives(declared: Cell, request: Request, actor: Applier, written: DrivesWritten) -> None:
-    digest = sha256(request.signed)
-
-    def enter(store: HistoryStore) -> None:
-        store.add(request.calibration, digest=digest, at=request.now)
-        told, after = written.audit_sha256, written.sha256_after
-        enter_applied(
-            declared, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), written.target, told, after)
-        )
-
-    record_in_history(declared, enter)
-
-
-def _say_drives_outcome(
-    proposal: DriveProposal, written: DrivesWritten | None, saving: Saving, cell_file: Path
-) -> None:
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    if written is not None:
-        console.print(
-            f"Written to the drives and read back; {written.record} has the values before. {saving_text(saving)}"
-        )
-        console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell_file))} --drives")
-        return
-    if proposal.unchanged:
-        console.print("The drives have these gains already; --yes would only let them save.")
-    console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
-    console.print(f"  --yes --base {proposal.looked_at}")
 
 
 def apply_verb(
     calibration: Annotated[Path, typer.Argument(help="calibration.yaml of `drivegain fit`.")],
-    cell: Annotated[Path, typer.Option(help="Cell file; it says which controller file and which keys.")],
+    cell: Annotated[Path, typer.Option(help="Cell file; it names the controller file and its keys.")],
     to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
     base: Annotated[
-        str | None, typer.Option("--base", help="Write only the change of the dry run that tells this BEFORE-AFTER.")
+        str | None, typer.Option("--base", help="Write only the change whose dry run printed this BEFORE-AFTER.")
     ] = None,
     by: ByOption = None,
     payload_mass: Annotated[
@@ -190,9 +79,9 @@ def apply_verb(
     save_unknown: SaveUnknownOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Write identified gains into the controller file: dry run and diff first, --yes to write, with a backup.
+    """Write identified gains to the controller file: dry run and diff first, --yes to write, with a backup.
 
-    The gates are those of the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
+    The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
     declared, actor = load_cell(cell), applier(by)
     content = read(calibration)
@@ -203,50 +92,128 @@ def apply_verb(
         policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
         configuration_changed=configuration_changed,
         entered_kg=entered_masses(payload_mass or (), fitted),
-        looked_at=base,
+        base=base,
         appliers=actor.names,
         file=calibration,
         content=content,
     )
-    book = audit_of(declared, (cell, calibration, to))
+    audit = audit_of(declared, (cell, calibration, to))
+    undo = f"drivegain rollback --cell {shlex.quote(str(cell))}"
     if drives:
         if to is not None:
             raise UsageError(
                 "--drives", found="--to beside it", expected="one target", remedy="leave out one of the two"
             )
-        saving = saving_of(ram_only, save_unknown)
-        apply_drives(declared, cell, request, actor=actor, saving=saving, audit=book, yes=yes, json=json)
+        opening = drives_on_the_bus(declared, saving_of(ram_only, save_unknown))
+        apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
         return
-    proposal = propose_for(declared, request, to)
-    known = query_history(declared, str(resolve_links(proposal.file)), request, proposal.changes)
-    if not json:
-        show(proposal, Console(), known)
-    try:
-        written = _write(proposal, request.now, book, actor) if yes else None
-    except CalibrationRefused:
-        if json:
-            print_json({**describe(proposal, None, known), "base": proposal.looked_at})
-        raise
+    undo += "" if to is None else f" --to {shlex.quote(str(to))}"
+    file = nullcontext(FileTarget.of(declared, to))
+    apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json)
+
+
+def apply_to(
+    opening: AbstractContextManager[Target[E]],
+    declared: Cell,
+    request: Request,
+    *,
+    actor: Applier,
+    audit: Path | None,
+    undo: str,
+    yes: bool,
+    json: bool,
+) -> None:
+    """Show what a calibration changes in a target of a cell, and write it with `yes`.
+
+    Args:
+        opening: opens the target.
+        declared: the cell.
+        request: what is to be written.
+        actor: the operator.
+        audit: file of the audit, None for none.
+        undo: command that undoes the write.
+        yes: write.
+        json: print a document instead of text.
+    """
+    written: Written | None = None
+    with opening as target:
+        proposal = propose(target, request)
+        edit = proposal.edit
+        known = query_history(declared, edit.subject, request, edit.changes)
+        if not json:
+            show(proposal, Console(), known)
+        try:
+            if yes:
+                written = apply(proposal, request.now, audit=audit, who=str(actor))
+        except CalibrationRefused:
+            if json:
+                print_json(describe(proposal, None, known))
+            raise
+        except OSError as error:
+            raise OutputFailed.of(edit.place, error) from error
     if yes and not proposal.refusals:
-        record_in_history(declared, partial(_enter, declared, proposal, written, request, actor, book))
+        record_in_history(declared, lambda store: _enter(store, declared, proposal, written, request, actor, audit))
     if json:
-        print_json({**describe(proposal, written, known), "base": proposal.looked_at})
+        print_json(describe(proposal, written, known))
+    else:
+        _show_outcome(proposal, written, audit, undo, yes=yes)
     if proposal.refusals:
-        if not yes and not json:
-            _show_next_command(proposal)
-        raise refused(proposal)
-    if not json:
-        _say_outcome(proposal, written, yes, cell, to, book)
+        raise proposal.error
+
+
+def _enter(
+    store: HistoryStore,
+    cell: Cell,
+    proposal: Proposal[E],
+    written: Written | None,
+    request: Request,
+    actor: Applier,
+    audit: Path | None,
+) -> None:
+    """Enter the write into the history; also one of an earlier command that was killed before it could."""
+    digest, subject, after = sha256(request.signed), proposal.edit.subject, sha256(proposal.edit.after)
+    store.add(request.calibration, digest=digest, at=request.now)
+    if written is None and store.in_force(subject) == digest:
+        return
+    entry = None if written is None else written.audit_sha256
+    if written is None and audit is not None:
+        entry = find_write_entry(audit, subject, after)
+    enter_applied(cell, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), subject, entry, after))
+
+
+def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | None, undo: str, *, yes: bool) -> None:
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    edit, target = proposal.edit, proposal.target
+    if proposal.refusals:
+        # The review of a changed base is all that is missing, and this dry run is that review.
+        if not yes and {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
+            console.print("Nothing was written. If this change of the present content is right, repeat with:")
+            console.print(f"  --yes --base {edit.base}")
+    elif written is not None and isinstance(target, DriveTarget):
+        console.print(f"Written to the drives and read back; {written.backup} has the values before.", end=" ")
+        console.print(saving_text(target.saving))
+        console.print(f"To undo: {undo}")
+    elif written is not None:
+        backup = "none" if written.backup is None else written.backup.name
+        console.print(f"Written to {edit.subject}, backup {backup}; the audit is {audit}.")
+        console.print(f"To undo: {undo}")
+    elif not edit.has_effect:
+        console.print("Nothing to write: the controller file has these gains already.")
+    else:
+        if edit.before == edit.after:
+            console.print("The drives have these gains already; --yes would only let them save.")
+        console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
+        console.print(f"  --yes --base {edit.base}")
 
 
 def tightened(
     policy: ApplyPolicy, change_percent: float | None, nameplate_percent: float | None, std_percent: float | None
 ) -> ApplyPolicy:
-    """The cell's policy with bounds of the command line, which may be tighter and not wider.
+    """Take bounds of the command line into the cell's policy; they may be tighter and not wider.
 
     Args:
         policy: of the cell.
-        change_percent, nameplate_percent, std_percent: bounds asked for [%]; None leaves the cell's.
+        change_percent, nameplate_percent, std_percent: requested bounds [%]; None leaves the cell's.
 
     Raises:
         UsageError: one is wider.
@@ -266,12 +233,12 @@ def _tighter(name: str, asked: float | None, allowed: float) -> float:
         f"--{name.replace('_', '-')} {asked:g}",
         found="a bound that is wider than the cell's",
         expected=f"at most {allowed:g}",
-        remedy=f"whoever answers for the cell may widen it in its file: `policy: {{apply: {{{name}: ...}}}}`",
+        remedy=f"the person responsible for the cell may widen it in its file: `policy: {{apply: {{{name}: ...}}}}`",
     )
 
 
 def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str, float]:
-    """Masses that were entered a second time, by payload [kg].
+    """Parse the values of --payload-mass: masses by payload [kg].
 
     Raises:
         UsageError: not NAME=KG, or no log of the calibration had that payload.
@@ -288,62 +255,11 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
             raise UsageError(
                 f"--payload-mass {text}",
                 found="no mass in kg" if name in mounted else f"no payload {name!r}",
-                expected=f"NAME=KG with one of {', '.join(mounted) or 'none: the calibration tells of no payload'}",
+                expected=f"NAME=KG with one of {', '.join(mounted) or 'none: the calibration has no payload'}",
                 remedy="correct the option",
             )
         found[name] = mass_kg
     return found
-
-
-def _write(proposal: Proposal, now: datetime, audit: Path | None, actor: Applier) -> Written | None:
-    try:
-        return apply(proposal, now, audit=audit, who=str(actor))
-    except OSError as error:
-        raise OutputFailed.of(proposal.file, error) from error
-
-
-def _enter(
-    cell: Cell,
-    proposal: Proposal,
-    written: Written | None,
-    request: Request,
-    actor: Applier,
-    audit: Path | None,
-    store: HistoryStore,
-) -> None:
-    """The controller has these gains; also where an earlier command wrote them and was killed before it told so."""
-    digest, target = sha256(request.signed), str(resolve_links(proposal.file))
-    store.add(request.calibration, digest=digest, at=request.now)
-    if written is None and store.in_force(target) == digest:
-        return
-    after = sha256(proposal.after_content)
-    audit_digest = None if written is None else written.audit_sha256
-    if written is None and audit is not None:
-        audit_digest = find_write_entry(audit, target, after)
-    enter_applied(cell, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), target, audit_digest, after))
-
-
-def _show_next_command(proposal: Proposal) -> None:
-    """Where nothing but a look at the changed file is wanted: this was the look."""
-    if {refusal.gate for refusal in proposal.refusals} == {Gate.BASE}:
-        console = Console(soft_wrap=True, highlight=False, markup=False)
-        console.print("Nothing was written. If this change of the file as it is now is right, repeat the command with:")
-        console.print(f"  --yes --base {proposal.looked_at}")
-
-
-def _say_outcome(
-    proposal: Proposal, written: Written | None, yes: bool, cell: Path, to: Path | None, audit: Path | None
-) -> None:
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    if proposal.before_content == proposal.after_content:
-        console.print("Nothing to write: the controller file has these gains already.")
-    elif written is not None:
-        console.print(f"Written to {written.file}, backup {written.backup.name}; the audit is {audit}.")
-        other = "" if to is None else f" --to {shlex.quote(str(to))}"
-        console.print(f"To undo: drivegain rollback --cell {shlex.quote(str(cell))}{other}")
-    elif not yes:
-        console.print("Dry run, nothing was written. To write exactly this, repeat the command with:")
-        console.print(f"  --yes --base {proposal.looked_at}")
 
 
 APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells/demo.yaml --yes")

@@ -72,7 +72,7 @@ def show(outcome: Outcome, out: Path, console: Console) -> None:
     console.print()
     show_proposal(outcome.proposal, console)
     if outcome.written is not None:
-        console.print(f"Written to the copy {outcome.written.file}.")
+        console.print(f"Written to the copy {outcome.written.edit.subject}.")
     console.print(f"\nLogs, calibration.yaml, pictures and summary.json are in {out}.")
 
 

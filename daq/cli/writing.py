@@ -1,4 +1,4 @@
-"""Who writes to a controller, and where that is written down: what `apply` and `rollback` share."""
+"""Shared by `apply` and `rollback`: the operator, the audit and the history, and the drives on their bus."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -21,20 +21,19 @@ from daq.files import sha256
 from daq.ledger.judgement import NOTHING, Known, known_of
 from daq.ledger.store import HistoryStore
 from daq.workflow.safeguards import bus_lock
-from daq.writeback.drive_target import DrivesWritten
-from daq.writeback.gates.target import GainChange
-from daq.writeback.request import Request
+from daq.writeback.drive_target import DriveTarget
+from daq.writeback.request import GainChange, Request
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import Saving
 
 _LOG = logging.getLogger("drivegain")
 
-ByOption = Annotated[str | None, typer.Option("--by", help="Who does it, for the audit; you, by default.")]
+ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator for the audit; by default the login.")]
 
 
 @dataclass(frozen=True, slots=True)
 class Applier:
-    """Whoever runs the command.
+    """The operator.
 
     Attributes:
         name: as given, or the login.
@@ -46,7 +45,7 @@ class Applier:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """All that may be theirs: no second person has one of them."""
+        """Every name that is the operator's: none of them is a second person."""
         return tuple(dict.fromkeys((self.name, self.login)))
 
     def __str__(self) -> str:
@@ -54,10 +53,10 @@ class Applier:
 
 
 def applier(by: str | None) -> Applier:
-    """Whoever runs this, by the name given.
+    """Return the operator, by the name given.
 
     Raises:
-        UsageError: the name cannot be written down.
+        UsageError: the name has characters that cannot be printed.
     """
     user = login()
     if by is not None and not by.isprintable():
@@ -68,14 +67,14 @@ def applier(by: str | None) -> Applier:
 
 
 def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
-    """Where the writes of a cell are written down; None only for a cell that was read from a log.
+    """Return the audit file of a cell; None only for a cell that was read from a log.
 
     Args:
-        cell: whose writes.
+        cell: the cell.
         others: files that take part, besides the cell's history and its controller's file.
 
     Raises:
-        AuditUnusable: it is one of them.
+        AuditUnusable: the audit is one of them.
     """
     if cell.history is None:
         return None
@@ -84,7 +83,7 @@ def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
 
 
 def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
-    """Refuse an audit that is another file which takes part, by whatever name, there already or not.
+    """Refuse an audit that is another file of the command, by any name, whether it exists or not.
 
     Raises:
         AuditUnusable: it is.
@@ -107,7 +106,7 @@ def _is_same(audit: Path, other: Path) -> bool:
 
 
 def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
-    """What the cell's history knows that a change is judged by; one that cannot be read knows nothing."""
+    """Return the figures of the cell's history that a change is judged by; none where it cannot be read."""
     if cell.history is None:
         return NOTHING
     try:
@@ -119,32 +118,30 @@ def query_history(cell: Cell, target: str, request: Request, changes: Sequence[G
 
 
 def record_in_history(cell: Cell, record: Callable[[HistoryStore], object]) -> None:
-    """Let the cell's history know of what is done already; where it cannot take it, that is told and no more."""
+    """Enter a write into the cell's history; a history that cannot take it is only warned about."""
     if cell.history is None:
         return
     try:
         with HistoryStore(cell.history.store) as store:
             record(store)
-    except Exception as error:  # noqa: BLE001 - whatever it is, the controller has its gains: not to be called undone
+    except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
         _LOG.warning("the history does not know of this: %s", error)
 
 
-# What `drivegain apply --drives` and `drivegain rollback --drives` have in common.
-
-
 DrivesOption = Annotated[
-    bool, typer.Option("--drives", help="The objects in the drives that the cell names, not the controller's file.")
+    bool,
+    typer.Option("--drives", help="The drives' objects that the cell names, not the controller's file."),
 ]
 RamOnlyOption = Annotated[
-    bool, typer.Option("--ram-only", help="Do not let the drives save: the gains are gone with their power.")
+    bool, typer.Option("--ram-only", help="Do not let the drives save: the gains are lost when they lose power.")
 ]
 SaveUnknownOption = Annotated[
-    bool, typer.Option("--save-unknown", help="Let drives save of which nobody knows what that keeps.")
+    bool, typer.Option("--save-unknown", help="Let drives save even if it is unknown what they save.")
 ]
 
 
 def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
-    """What the two options mean together.
+    """Combine the two options.
 
     Raises:
         UsageError: both.
@@ -160,8 +157,8 @@ def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
 
 
 @contextmanager
-def on_the_bus(declared: Cell) -> Iterator[CanopenNetwork]:
-    """The drives of a cell, its buses locked; Ctrl-C and SIGTERM put back what was written until then."""
+def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
+    """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
     address, axes = cell_address(declared), drive_axes(declared)
     try:
         with (
@@ -169,24 +166,15 @@ def on_the_bus(declared: Cell) -> Iterator[CanopenNetwork]:
             interruptible() as block_signals,
             CanopenNetwork(address, axes, block_signals=block_signals) as network,
         ):
-            yield network
+            yield DriveTarget(declared, network, saving)
     except KeyboardInterrupt as interrupt:
         said = "; ".join(getattr(interrupt, "__notes__", ())) or "nothing was written to the drives"
         typer.echo(f"interrupted: {said}", err=True)
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 
 
-def outcome(written: DrivesWritten) -> dict[str, Any]:
-    """What was done, for --json."""
-    return {
-        "record": str(written.record),
-        "source": None if written.source is None else str(written.source),
-        "saved": all(change.saved for change in written.changes),
-    }
-
-
 def saving_text(saving: Saving) -> str:
-    """Whether it stays, for a person."""
+    """Say whether the gains are saved."""
     if saving is Saving.RAM:
-        return "The drives have NOT saved: the gains are gone with their power."
+        return "The drives have NOT saved: the gains are lost when they lose power."
     return "The drives have saved."

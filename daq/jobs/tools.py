@@ -14,8 +14,8 @@ from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
 from daq.workflow.record import Recorded, record
 from daq.workflow.safeguards import FreeBytes, free_bytes
-from daq.writeback.file_proposal import Proposal, apply, propose_for
-from daq.writeback.file_target import Written
+from daq.writeback.file_target import FileEdit
+from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.network import SignalBlocker
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
@@ -30,8 +30,7 @@ class Tools:
     Attributes:
         save_report: writes the report of a fit into a folder.
         drives: looks at the drives before anything moves.
-        plan, record, fit, close_loop, calibration, account, propose, apply: of daq.plan, daq.record, daq.fit,
-            ident.before_after and daq.write_back.apply.
+        plan, record, fit, close_loop, calibration, account, propose, apply: steps of the workflow and the write-back.
         run: runs a command of the cell's.
         free: tells the room on a disk.
         now: wall clock with time zone.
@@ -46,7 +45,7 @@ class Tools:
     close_loop: Callable[..., Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
     account: Callable[..., Account] = account
-    propose: Callable[..., Proposal] = propose_for
+    propose: Callable[..., Proposal[FileEdit]] = propose
     apply: Callable[..., Written | None] = apply
     run: Runner = run_command
     free: FreeBytes = free_bytes

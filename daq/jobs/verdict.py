@@ -28,11 +28,10 @@ from daq.ledger.verify import enter_applied
 from daq.ledger.watch import alarm_text, watch
 from daq.workflow.calibration_file import read
 from daq.writeback.file_access import resolve_links
-from daq.writeback.file_proposal import Proposal
-from daq.writeback.file_target import Written
-from daq.writeback.gates.table import Gate
-from daq.writeback.gates.target import GainChange
-from daq.writeback.request import Request
+from daq.writeback.file_target import FileEdit, FileTarget
+from daq.writeback.gates.gate import Gate
+from daq.writeback.request import GainChange, Request
+from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 from ident.drift.change import FALSE_ALARM
 
@@ -118,26 +117,26 @@ def decide_outcome(
 
     Raises:
         CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
-        ControllerChanged, CalibrationRefused, ControllerUnfit, AuditUnusable, OutputFailed: see
-        `daq.writeback.file_proposal`.
+        AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
     session = _written_before(context, session, gain_history, journal)
     if session.state.outcome is not None:
         return session
     path, now = session.folder / CALIBRATION, context.tools.now()
     request = Request(calibration, now, file=path, content=read(path))
-    proposal = context.tools.propose(context.cell, request)
+    proposal = context.tools.propose(FileTarget.of(context.cell), request)
+    edit = proposal.edit
     decision = decision_of(proposal, gain_history)
     differs, touched = any(gain.differs for gain in decision.gains), _written_since(context, session)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
     journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
-    after = sha256(proposal.after_content)
+    after = sha256(edit.after)
     target = Target(
-        file=str(proposal.file),
-        base_sha256=proposal.base_sha256,
+        file=str(edit.file),
+        base_sha256=edit.base_sha256,
         after_sha256=after,
-        looked_at=proposal.looked_at,
+        looked_at=edit.base,
         unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
     )
     _write_proposal(session, proposal, after)
@@ -149,25 +148,23 @@ def decide_outcome(
             journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
         sessions.save(_with_outcome(session, Outcome.REFUSED))
         _apply(context, proposal, now)  # which refuses it, and writes that down
-    if proposal.after_content == proposal.before_content or not differs:
+    if not edit.has_effect or not differs:
         return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
     if proposal.refusals or needs_person(context) or touched:
         _propose(context, session, target, journal)
         return sessions.save(_with_outcome(session, Outcome.PROPOSED))
     written = _apply(context, proposal, now)
     if written is not None:
-        journal.say(
-            Level.NOTICE, "written to the controller's file", file=str(written.file), backup=str(written.backup)
-        )
+        journal.say(Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup))
     _note(context, gain_history, after, journal)
     return sessions.save(_with_outcome(session, Outcome.APPLIED))
 
 
-def _apply(context: JobContext, proposal: Proposal, now: datetime) -> Written | None:
+def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
     try:
         return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
     except OSError as error:
-        raise OutputFailed.of(proposal.file, error) from error
+        raise OutputFailed.of(proposal.edit.file, error) from error
 
 
 def _note(context: JobContext, gain_history: GainHistory, after_sha256: str, journal: Journal) -> None:
@@ -183,14 +180,14 @@ def needs_person(context: JobContext) -> bool:
     return context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
 
 
-def decision_of(proposal: Proposal, gain_history: GainHistory) -> Decision:
+def decision_of(proposal: Proposal[FileEdit], gain_history: GainHistory) -> Decision:
     """Whether any gain differs from the controller's by more than chance (`daq.ledger.judgement`).
 
     An axis differs by itself where its probability among all of them says so.
     """
-    known = gain_history.known(proposal.changes)
-    found = judge(proposal.changes, known)
-    changes = {change.axis: change for change in proposal.changes}
+    known = gain_history.known(proposal.edit.changes)
+    found = judge(proposal.edit.changes, known)
+    changes = {change.axis: change for change in proposal.edit.changes}
     gains = tuple(
         JudgedGain(
             axis=axis,
@@ -255,11 +252,11 @@ def _propose(context: JobContext, session: Session, target: Target, journal: Jou
     journal.say(Level.NOTICE, "proposed: a person must apply it", folder=str(session.folder))
 
 
-def _write_proposal(session: Session, proposal: Proposal, after_sha256: str) -> None:
+def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
     """The change as a person and a program read it, beside the calibration."""
     document = {
-        "file": str(proposal.file),
-        "base_sha256": proposal.base_sha256,
+        "file": str(proposal.edit.file),
+        "base_sha256": proposal.edit.base_sha256,
         "after_sha256": after_sha256,
         "changes": [
             {
@@ -271,13 +268,13 @@ def _write_proposal(session: Session, proposal: Proposal, after_sha256: str) -> 
                 "unit": change.unit,
                 "change_percent": _finite(change.change_percent),
             }
-            for change in proposal.changes
+            for change in proposal.edit.changes
         ],
         "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
     }
     try:
         replace_file(session.folder / PROPOSAL, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode())
-        replace_file(session.folder / DIFF, proposal.diff.encode())
+        replace_file(session.folder / DIFF, proposal.edit.diff.encode())
     except OSError as error:
         raise OutputFailed.of(session.folder / PROPOSAL, error) from error
 

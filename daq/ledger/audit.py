@@ -39,7 +39,7 @@ from daq.ledger.audit_chain import (
     lines_of,
     torn_details,
 )
-from daq.writeback.gates.table import Refusal
+from daq.writeback.gates.gate import Refusal
 
 __all__ = [
     "AuditAction",

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from daq.ledger.entry import Entry, Event
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import dispersions_of
-from daq.writeback.gates.target import GainChange
+from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION, ChangeDecision, decide
 
 # What the history knows of the gains that a controller has now.

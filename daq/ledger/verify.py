@@ -12,7 +12,7 @@ from daq.config.policy import HistoryPlace
 from daq.ledger.audit import AuditAction, AuditEntry, verify
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, iso, utc
 from daq.ledger.store import HistoryStore
-from daq.writeback.drive_proposal import drives_of
+from daq.writeback.drive_record import drives_of
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
 _BEGINS = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)

@@ -18,7 +18,7 @@ from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.history import rows
-from daq.writeback.drive_proposal import drives_of
+from daq.writeback.drive_record import drives_of
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import Scalar, rewrite_gain

@@ -1,8 +1,10 @@
-"""A proposed change of a controller's file: for a person as a table and a diff, for a program as a document."""
+"""A proposed change of a controller's file or of the drives: tables for the operator, documents for `--json`."""
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,38 +16,36 @@ from rich.table import Table
 from daq.ledger.judgement import NOTHING, Known, judge
 from daq.report.gains import with_deviation
 from daq.report.text import terminal_lines, terminal_text
-from daq.writeback.file_proposal import Proposal
-from daq.writeback.file_target import Written
-from daq.writeback.gates.target import GainChange
+from daq.writeback.drive_target import DriveEdit
+from daq.writeback.file_target import FileEdit
+from daq.writeback.request import Edit, GainChange
+from daq.writeback.target import E, Proposal, Written
 from ident.drift.change import FALSE_ALARM
 
 
-def show(proposal: Proposal, console: Console, known: Known = NOTHING) -> None:
-    """The change as a table and as a diff, judged by what a history knows."""
-    show_changes(proposal.changes, console, known)
-    if proposal.diff:
-        console.print(Syntax(terminal_lines(proposal.diff), "diff", background_color="default", word_wrap=True))
-
-
-def show_changes(
-    changes: tuple[GainChange, ...], console: Console, known: Known = NOTHING, place: str = "in the file"
-) -> None:
-    """The table of `change_table`, and what its stars say."""
-    console.print(change_table(changes, known, place))
-    exact = [change.axis for change in changes if not known.stds.get(change.axis)]
-    whose = "all axes" if len(exact) == len(changes) else ", ".join(exact)
-    taken = f"the number {place} taken as exact ({whose})" if exact else "σ of both"
+def show(proposal: Proposal[E], console: Console, known: Known = NOTHING) -> None:
+    """Print the change as a table and as a diff, judged by the history."""
+    edit = proposal.edit
+    console.print(change_table(edit.changes, known, _place(edit)))
+    exact = [change.axis for change in edit.changes if not known.stds.get(change.axis)]
+    whose = "all axes" if len(exact) == len(edit.changes) else ", ".join(exact)
+    taken = f"the number {_place(edit)} taken as exact ({whose})" if exact else "σ of both"
     note = f"* more than noise: probability below {100 * FALSE_ALARM:g} % among all axes, {taken}"
     console.print(terminal_text(note), style="dim")
     console.print()
+    if isinstance(edit, DriveEdit):
+        for change, value in zip(edit.changes, edit.values, strict=True):
+            console.print(f"{change.key}: {value.value:.9g} -> {change.spelling}", markup=False, highlight=False)
+    if isinstance(edit, FileEdit) and edit.diff:
+        _show_diff(terminal_lines(edit.diff), console)
 
 
 def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place: str = "in the file") -> Table:
-    """Old and new gain of each axis with what there is to judge the change by; fits a terminal of 80 columns.
+    """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns.
 
     Args:
-        changes: one an axis.
-        known: by a history.
+        changes: one for each axis.
+        known: from the history.
         place: heading of the gains that are in the controller now.
     """
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
@@ -70,45 +70,139 @@ def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place:
     return table
 
 
-def significant(changes: tuple[GainChange, ...], known: Known = NOTHING) -> frozenset[str]:
+def describe(proposal: Proposal[E], written: Written | None, known: Known = NOTHING) -> dict[str, Any]:
+    """Make the document of a proposal and its outcome for `--json`."""
+    edit = proposal.edit
+    refusals = [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals]
+    base = {"base_sha256": edit.base_sha256, "base": edit.base, "applied": written is not None}
+    if isinstance(edit, DriveEdit):
+        changes = [_drive_change(change) for change in edit.changes]
+        cell = None if proposal.target.cell is None else proposal.target.cell.name
+        return {"cell": cell, **base, **_outcome(written), "changes": changes, "refusals": refusals}
+    judged = _by_axis(edit.changes, known)
+    return {
+        "file": str(edit.place),
+        **base,
+        "backup": None if written is None else str(written.backup),
+        "changes": [_file_change(change, *judged.get(change.axis, (None, False))) for change in edit.changes],
+        "refusals": refusals,
+        "diff": edit.diff if isinstance(edit, FileEdit) else "",
+    }
+
+
+def _drive_change(change: GainChange) -> dict[str, Any]:
+    return {
+        "axis": change.axis,
+        "object": change.key,
+        "old": change.old,
+        "new": change.new,
+        "std": change.std,
+        "nameplate": change.nameplate,
+        "unit": change.unit,
+    }
+
+
+def _file_change(change: GainChange, sigmas: float | None, significant: bool) -> dict[str, Any]:
+    return {
+        "axis": change.axis,
+        "key": change.key,
+        "line": change.line,
+        "old": change.old,
+        "new": change.new,
+        "change_percent": change.change_percent,
+        "change_sigmas": sigmas,
+        "significant": significant,
+        "std_percent": change.std_percent,
+        "nameplate": change.nameplate,
+        "nameplate_percent": change.nameplate_percent,
+        "unit": change.unit,
+    }
+
+
+def _outcome(written: Written | None) -> dict[str, Any]:
+    """Describe a write to drives."""
+    if written is None:
+        return {}
+    source = written.edit.source
+    return {
+        "record": str(written.backup),
+        "source": None if source is None else str(source),
+        "saved": all(change.saved for change in written.parameters),
+    }
+
+
+def show_drive_rollback(edit: DriveEdit, console: Console) -> None:
+    """Print a planned rollback of the drives."""
+    for value, write in zip(edit.values, edit.writes, strict=True):
+        new = value.parameter.value(write.word)
+        console.print(f"{value.axis.name}, {value.parameter}: {value.value:.9g} -> {new:.9g}")
+    if edit.record is not None:
+        console.print(
+            f"These are the values before the write of {edit.record.at} by {terminal_text(edit.record.who).plain}."
+        )
+
+
+def describe_drive_rollback(edit: DriveEdit, written: Written | None) -> dict[str, Any]:
+    """Make the document of a rollback of the drives for `--json`."""
+    return {
+        "drives": edit.subject,
+        "source": str(edit.source),
+        "restored": written is not None,
+        "changes": [
+            {
+                "axis": value.axis.name,
+                "object": str(value.parameter),
+                "old": value.value,
+                "new": value.parameter.value(write.word),
+            }
+            for value, write in zip(edit.values, edit.writes, strict=True)
+        ],
+        **_outcome(written),
+    }
+
+
+def show_file_rollback(written: Written, console: Console) -> None:
+    """Print a rollback of the controller's file as a diff and a line."""
+    edit, backup = written.edit, written.backup
+    _show_diff(_rollback_diff(edit), console)
+    replaced = "the file was gone" if backup is None else f"the content before is now {backup.name}"
+    source = "" if edit.source is None else edit.source.name
+    console.print(f"Restored {source} to {edit.subject}; {replaced}.", markup=False)
+
+
+def describe_file_rollback(written: Written) -> dict[str, Any]:
+    """Make the document of a rollback of the controller's file for `--json`."""
+    return {
+        "file": written.edit.subject,
+        "restored": str(written.edit.source),
+        "backup": None if written.backup is None else str(written.backup),
+        "diff": _rollback_diff(written.edit),
+    }
+
+
+def _rollback_diff(edit: Edit) -> str:
+    name = edit.place.resolve().name
+    before, after = (content.decode(errors="replace").splitlines() for content in (edit.before or b"", edit.after))
+    return "\n".join(difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1))
+
+
+def _show_diff(diff: str, console: Console) -> None:
+    console.print(Syntax(diff, "diff", background_color="default", word_wrap=True))
+
+
+def _place(edit: Edit) -> str:
+    return "in the drive" if isinstance(edit, DriveEdit) else "in the file"
+
+
+def significant(changes: Sequence[GainChange], known: Known = NOTHING) -> frozenset[str]:
     """Axes whose gain differs from the controller's by more than noise."""
     return frozenset(axis for axis, (_, beyond_noise) in _by_axis(changes, known).items() if beyond_noise)
 
 
-def _by_axis(changes: tuple[GainChange, ...], known: Known) -> dict[str, tuple[float, bool]]:
-    """Change in σ of both as calibrations scatter, and whether it is more than noise; of axes that can be compared."""
+def _by_axis(changes: Sequence[GainChange], known: Known) -> dict[str, tuple[float, bool]]:
+    """Change in σ of both as calibrations scatter, and whether it is more than noise; of comparable axes."""
     found = judge(changes, known)
     return {
         axis: (abs(change.sigmas), probability <= FALSE_ALARM)
         for axis, change, probability in zip(found.axes, found.changes, found.adjusted, strict=True)
-    }
-
-
-def describe(proposal: Proposal, written: Written | None, known: Known = NOTHING) -> dict[str, Any]:
-    """The proposal and its outcome for --json."""
-    judged = _by_axis(proposal.changes, known)
-    return {
-        "file": str(proposal.file),
-        "base_sha256": proposal.base_sha256,
-        "applied": written is not None,
-        "backup": None if written is None else str(written.backup),
-        "changes": [
-            {
-                "axis": change.axis,
-                "key": change.key,
-                "line": change.line,
-                "old": change.old,
-                "new": change.new,
-                "change_percent": change.change_percent,
-                "change_sigmas": judged.get(change.axis, (None, False))[0],
-                "significant": judged.get(change.axis, (None, False))[1],
-                "std_percent": change.std_percent,
-                "nameplate": change.nameplate,
-                "nameplate_percent": change.nameplate_percent,
-                "unit": change.unit,
-            }
-            for change in proposal.changes
-        ],
-        "refusals": [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals],
-        "diff": proposal.diff,
     }

@@ -26,9 +26,9 @@ from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan
 from daq.workflow.record import Recorded, network_of, record
-from daq.writeback.file_proposal import Proposal, apply, propose_for
-from daq.writeback.file_target import Written
+from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
+from daq.writeback.target import Proposal, Written, apply, propose
 from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode
 from drivers.simulation.spec import CellSpec
@@ -102,7 +102,7 @@ class Outcome:
     fitted: Fit
     calibration: Calibration
     truth: dict[str, float]
-    proposal: Proposal
+    proposal: Proposal[FileEdit]
     written: Written | None
 
 
@@ -185,7 +185,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
             }
             for run in outcome.recorded
         ],
-        "controller_diff": outcome.proposal.diff,
+        "controller_diff": outcome.proposal.edit.diff,
         "applied": outcome.written is not None,
     }
 
@@ -280,13 +280,15 @@ def _record(
         )
 
 
-def _write_back(cell: Cell, calibration: Calibration, out: Path, now: datetime) -> tuple[Proposal, Written | None]:
+def _write_back(
+    cell: Cell, calibration: Calibration, out: Path, now: datetime
+) -> tuple[Proposal[FileEdit], Written | None]:
     source = cell.controller_path
     if source is None:
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
     target = out / "controller.yaml"
     shutil.copyfile(source, target)
-    proposal = propose_for(cell, Request(calibration, now), target)
+    proposal = propose(FileTarget.of(cell, target), Request(calibration, now))
     return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
 
 

@@ -1,7 +1,7 @@
-"""What stood in the drives of a cell before a write: a file that is on the disk before the first drive is touched.
+"""Records of writes to the drives of a cell: the backup, on the disk before the first drive is touched.
 
-A record is called <time>.json and is never changed. It carries the digest of what is in it: its numbers go back into
-drives.
+A record is called <time>.json and is never changed. It carries the digest of its content: a rollback writes its numbers
+back into the drives.
 """
 
 from __future__ import annotations
@@ -9,12 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.yaml_file import StrictModel
@@ -28,47 +27,16 @@ _MAX_BYTES = 2**20
 _U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
-@dataclass(frozen=True, slots=True)
-class DriveNote:
-    """What stood in one drive, and what was to be written.
+class DriveNote(StrictModel):
+    """One drive in a record.
 
     Attributes:
         axis, node_id: which.
-        vendor_id, product_code, serial: of the drive, as it told (1018h).
-        parameter: that was to be written.
-        old, new: its bits.
+        vendor_id, product_code, serial: identity that the drive reported (1018h).
+        index, subindex, type: the object that was to be written.
+        old, new: its bits before the write, and as they were to be.
     """
 
-    axis: str
-    node_id: int
-    vendor_id: int
-    product_code: int
-    serial: int | None
-    parameter: Parameter
-    old: int
-    new: int
-
-
-@dataclass(frozen=True, slots=True)
-class DriveRecord:
-    """One write to the drives of a cell.
-
-    Attributes:
-        path: of the file.
-        cell: its name.
-        at: when, ISO 8601.
-        who: the person or the job.
-        drives: one for each axis.
-    """
-
-    path: Path
-    cell: str
-    at: str
-    who: str
-    drives: tuple[DriveNote, ...]
-
-
-class _NoteModel(StrictModel):
     axis: str
     node_id: Annotated[int, Field(ge=1, le=127)]
     vendor_id: _U32
@@ -80,21 +48,46 @@ class _NoteModel(StrictModel):
     old: _U32
     new: _U32
 
+    @property
+    def parameter(self) -> Parameter:
+        """The object."""
+        return Parameter(self.index, self.subindex, self.type)
 
-class _RecordModel(StrictModel):
-    format: Literal["drivegain drive record 1"]
+
+class DriveRecord(StrictModel):
+    """One write to the drives of a cell.
+
+    Attributes:
+        cell: name of the cell.
+        at: time, ISO 8601.
+        who: the operator or the job.
+        drives: one for each axis.
+    """
+
+    format: Literal["drivegain drive record 1"] = "drivegain drive record 1"
     cell: str
     at: str
     who: str
-    drives: tuple[_NoteModel, ...]
+    drives: tuple[DriveNote, ...]
+
+
+class _RecordFile(DriveRecord):
+    """The record as it is on the disk, with its own digest."""
+
+    format: Literal["drivegain drive record 1"]
     sha256: str
 
 
+def drives_of(cell: str) -> str:
+    """Return the name of a cell's drives in audit and history."""
+    return f"drives of cell {cell}"
+
+
 def record_folder(cell: Cell) -> Path:
-    """Where the records of a cell are: beside its history, `demo.drives` beside `demo.history.sqlite`.
+    """Return the folder of a cell's records: `demo.drives` beside `demo.history.sqlite`.
 
     Raises:
-        ConfigurationInconsistent: the cell was read from a log, and has no place.
+        ConfigurationInconsistent: the cell was read from a log, and has no folder.
     """
     if cell.history is None:
         raise ConfigurationInconsistent(
@@ -120,66 +113,33 @@ def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple
         # A clock set back, or two writes in one second, must not make an older record look newer.
         stamp, count = taken[-1][0], taken[-1][1] + 1
     path = folder / f"{stamp}{f'-{count}' if count else ''}.json"
-    body = {
-        "format": "drivegain drive record 1",
-        "cell": cell,
-        "at": now.isoformat(),
-        "who": who,
-        "drives": [
-            {
-                "axis": note.axis,
-                "node_id": note.node_id,
-                "vendor_id": note.vendor_id,
-                "product_code": note.product_code,
-                "serial": note.serial,
-                "index": note.parameter.index,
-                "subindex": note.parameter.subindex,
-                "type": note.parameter.kind.value,
-                "old": note.old,
-                "new": note.new,
-            }
-            for note in drives
-        ],
-    }
+    body = DriveRecord(cell=cell, at=now.isoformat(), who=who, drives=drives).model_dump(mode="json")
     text = json.dumps({**body, "sha256": _digest(body)}, indent=1, ensure_ascii=False)
     replace_file(path, (text + "\n").encode())
     return path
 
 
 def read_records(folder: Path) -> tuple[Path, ...]:
-    """The records of a folder, oldest first; none where there is no folder."""
+    """List the records of a folder, oldest first; none where there is no folder."""
     return tuple(path for _, _, path in _names(folder))
 
 
 def read_record(path: Path) -> DriveRecord:
-    """A record.
+    """Read a record.
 
     Raises:
-        ControllerUnfit: it cannot be read, is none, or somebody has changed it.
+        ControllerUnfit: it cannot be read, is no record, or was changed.
     """
     try:
         content = read_regular(path, _MAX_BYTES)
-        model = _RecordModel.model_validate_json(content)
+        record = _RecordFile.model_validate_json(content)
         body: dict[str, Any] = json.loads(content)
-    except (OSError, ValueError, ValidationError) as error:
+    except (OSError, ValueError) as error:
         raise _unfit(path, str(error).splitlines()[0][:200]) from error
-    recorded_digest = body.pop("sha256")
-    if recorded_digest != _digest(body):
-        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {recorded_digest[:12]}… as it says")
-    notes = tuple(
-        DriveNote(
-            note.axis,
-            note.node_id,
-            note.vendor_id,
-            note.product_code,
-            note.serial,
-            Parameter(note.index, note.subindex, note.type),
-            note.old,
-            note.new,
-        )
-        for note in model.drives
-    )
-    return DriveRecord(path, model.cell, model.at, model.who, notes)
+    del body["sha256"]
+    if record.sha256 != _digest(body):
+        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {record.sha256[:12]}… as it says")
+    return record
 
 
 def _names(folder: Path) -> list[tuple[str, int, Path]]:

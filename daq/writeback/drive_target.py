@@ -1,108 +1,306 @@
-"""The drives of a cell written with the gains of a calibration, and back again.
+"""The drives of a cell as a target: one object in each drive holds the gain of its axis.
 
-The drives are written by drivers/canopen/parameters.py: without power, read back, saved, all of them or none. What
-stood there is on the disk before the first is touched (drive_record.py).
+`drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. The values before are on
+the disk before the first drive is touched (`daq.writeback.drive_record`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import contextlib
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit
-from daq.files import sha256
-from daq.ledger.audit import AuditAction, AuditRecorder
-from daq.writeback.drive_proposal import DriveProposal, canonical, digest, drives_of, refused
-from daq.writeback.drive_record import DriveNote, DriveRecord, read_record, read_records, record_folder, write_record
-from daq.writeback.file_access import exclusive_writer
-from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.parameters import (
-    ParameterChange,
-    ParameterValue,
-    ParameterWrite,
-    Saving,
-    read_parameters,
-    write_parameters,
+from daq.config.controller import GainObject
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.writeback.drive_record import (
+    DriveNote,
+    DriveRecord,
+    drives_of,
+    read_record,
+    read_records,
+    record_folder,
+    write_record,
 )
+from daq.writeback.file_access import exclusive_writer
+from daq.writeback.request import Edit, Finding, GainChange
+from daq.writeback.target import Written
+from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
 from drivers.profiles.profile import Axis, Parameter
+from ident.calibration import Calibration, Gain
 
-# From the records of writes to the drives back: what would be put back, and whether that loses somebody's work.
+_REVIEW = "take a dry run, review it, and repeat it with the --base that it prints"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveEdit(Edit):
+    """Planned change of the drives of a cell.
+
+    Attributes:
+        folder: of the records.
+        values: in the drives now.
+        writes: values to be written.
+        record: of the write that a rollback undoes; None for a calibration.
+    """
+
+    folder: Path
+    values: tuple[ParameterValue, ...]
+    writes: tuple[ParameterWrite, ...]
+    record: DriveRecord | None = None
+
+    @property
+    def place(self) -> Path:
+        """The folder of the records."""
+        return self.folder
+
+    @property
+    def has_effect(self) -> bool:
+        """Always: drives that have these gains in RAM are made to save them, and lose what they had saved."""
+        return True
 
 
 @dataclass(frozen=True, slots=True)
-class DriveRollback:
-    """A way back that has been worked out and not gone.
+class DriveTarget:
+    """The drives of a cell.
 
     Attributes:
-        cell: its name.
-        folder: of the records.
-        record: of the write that is taken back.
-        base: what stands in the drives.
-        writes: what would stand there.
-    """
-
-    cell: str
-    folder: Path
-    record: DriveRecord
-    base: tuple[ParameterValue, ...]
-    writes: tuple[ParameterWrite, ...]
-
-
-def plan_drive_rollback(declared: Cell, network: CanopenNetwork) -> DriveRollback:
-    """What stood in the drives before the last write that changed them, whole or cut off by a kill; reads only.
-
-    Args:
-        declared: the cell.
+        cell: as it is now, with `controller.objects`.
         network: of all axes of the cell, open, and not prepared for recording.
-
-    Raises:
-        CalibrationRefused: there is no record of such a write.
-        ControllerUnfit: its record was changed, or is of another cell.
-        ControllerChanged: a drive was exchanged, or somebody has changed a gain since.
-        DriverError: see `drivers.canopen.parameters.read_parameters`.
+        saving: whether the drives save what is written.
     """
-    folder = record_folder(declared)
-    paths = read_records(folder)
-    for path in reversed(paths):
-        record = read_record(path)
-        base = read_parameters(network, _recorded(declared, network, record))
-        # A writer that was killed before its first write leaves a record of what still stands.
-        if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
-            continue
-        _check_untouched(record, base)
-        writes = tuple(
-            ParameterWrite(value.axis, note.parameter, note.old)
-            for value, note in zip(base, record.drives, strict=True)
+
+    cell: Cell
+    network: CanopenNetwork
+    saving: Saving = Saving.KNOWN
+
+    @property
+    def subject(self) -> str:
+        """The drives, as audit and history name them."""
+        return drives_of(self.cell.name)
+
+    def plan(self, calibration: Calibration) -> DriveEdit:
+        """See `Target.plan`.
+
+        Raises:
+            ConfigurationInconsistent: the cell has no objects for the gains.
+            CalibrationRefused: the calibration has other axes than the cell.
+            ControllerUnfit: an object cannot hold a gain to within its σ.
+            DriverError: see `drivers.canopen.parameters.read_parameters`.
+        """
+        objects, names = self._objects(), self.cell.axis_names
+        gains = {gain.axis: gain for gain in calibration.gains}
+        if sorted(gains) != sorted(names) or len(gains) != len(calibration.gains):
+            raise CalibrationRefused(
+                "calibration",
+                found=f"gains of {', '.join(gain.axis for gain in calibration.gains) or 'no axis'}",
+                expected=f"one for each axis of the cell: {', '.join(names)}",
+                remedy="give the calibration and the configuration of the same cell",
+            )
+        pairs = [(axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)]
+        base = read_parameters(self.network, pairs)
+        planned = [_change(gains[value.axis.name], value, one) for value, one in zip(base, objects, strict=True)]
+        folder = record_folder(self.cell)
+        return DriveEdit(
+            subject=self.subject,
+            before=content_of(base),
+            after=content_of(base, tuple(write for _, write in planned)),
+            changes=tuple(change for change, _ in planned),
+            unexpected=_changed_since_record(base, folder),
+            folder=folder,
+            values=base,
+            writes=tuple(write for _, write in planned),
         )
-        return DriveRollback(declared.name, folder, record, base, writes)
-    raise CalibrationRefused(
-        drives_of(declared.name),
-        found=f"{len(paths)} records of what stands there now" if paths else f"no record in {folder}",
-        expected="the record of a write that changed them",
-        remedy="nothing was written",
+
+    def plan_rollback(self) -> DriveEdit:
+        """See `Target.plan_rollback`: undo the last write that changed the drives, whole or cut off by a kill.
+
+        Raises:
+            CalibrationRefused: there is no record of such a write.
+            ControllerUnfit: its record was changed, or is of another cell.
+            ControllerChanged: a drive was exchanged, or a gain was changed since.
+            DriverError: see `drivers.canopen.parameters.read_parameters`.
+        """
+        folder = record_folder(self.cell)
+        paths = read_records(folder)
+        for path in reversed(paths):
+            record = read_record(path)
+            base = read_parameters(self.network, self._recorded(path, record))
+            # A writer that was killed before its first write leaves a record of the present values.
+            if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
+                continue
+            _check_untouched(path, record, base)
+            writes = tuple(
+                ParameterWrite(value.axis, note.parameter, note.old)
+                for value, note in zip(base, record.drives, strict=True)
+            )
+            return DriveEdit(
+                subject=self.subject,
+                before=content_of(base),
+                after=content_of(base, writes),
+                source=path,
+                folder=folder,
+                values=base,
+                writes=writes,
+                record=record,
+            )
+        raise CalibrationRefused(
+            self.subject,
+            found=f"{len(paths)} records of the present values" if paths else f"no record in {folder}",
+            expected="the record of a write that changed them",
+            remedy="nothing was written",
+        )
+
+    @contextlib.contextmanager
+    def lock(self, edit: DriveEdit) -> Iterator[None]:
+        """See `Target.lock`; the drives are compared when they are written."""
+        edit.folder.parent.mkdir(parents=True, exist_ok=True)
+        with exclusive_writer(edit.folder):
+            yield
+
+    def details(self, edit: DriveEdit) -> Mapping[str, object]:
+        """See `Target.details`; values as bits, which are finite."""
+        drives = [
+            {
+                "axis": value.axis.name,
+                "node_id": value.axis.node_id,
+                "serial": value.identity.serial,
+                "object": str(value.parameter),
+                "type": value.parameter.kind.value,
+                "old": value.word,
+                "new": write.word,
+            }
+            for value, write in zip(edit.values, edit.writes, strict=True)
+        ]
+        restored = {} if edit.source is None else {"restored": str(edit.source)}
+        return {"saving": self.saving.value, "drives": drives, **restored}
+
+    def write(self, edit: DriveEdit, now: datetime, who: str) -> Written:
+        """See `Target.write` and `drivers.canopen.parameters.write_parameters`."""
+        records: list[Path] = []
+
+        def begin(found: tuple[ParameterValue, ...]) -> None:
+            if content_of(found) != edit.before:
+                raise ControllerChanged(
+                    edit.subject,
+                    found="other values in the drives, or other drives",
+                    expected="those that the change was planned for",
+                    remedy="take a new dry run; nothing was written",
+                )
+            records.append(write_record(edit.folder, self.cell.name, now, who, _notes(found, edit.writes)))
+
+        parameters = write_parameters(self.network, edit.writes, self.saving, begin)
+        return Written(edit, records[0], parameters)
+
+    def _objects(self) -> tuple[GainObject, ...]:
+        objects = () if self.cell.controller is None else self.cell.controller.objects
+        if not objects:
+            raise ConfigurationInconsistent(
+                f"cell {self.cell.name!r}: controller",
+                found="no objects in the drives",
+                expected="the object of each axis's gain",
+                remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: ...}, ...]}` to the "
+                "cell file, one for each axis (docs/how-to/write-gains.md)",
+            )
+        return objects
+
+    def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
+        axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
+        unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
+        if record.cell != self.cell.name or unknown_axes:
+            raise ControllerUnfit(
+                str(path),
+                found=f"a write to cell {record.cell!r}"
+                + (f", with {', '.join(unknown_axes)} that this cell does not have" if unknown_axes else ""),
+                expected=f"one to the drives of cell {self.cell.name!r}",
+                remedy="nothing was written; has the cell file been changed since?",
+            )
+        return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
+
+
+def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...] | None = None) -> bytes:
+    """Encode drives and their values, or the values to be written, as the bytes that digests are taken of."""
+    words = [value.word for value in base] if writes is None else [write.word for write in writes]
+    listed = [
+        [value.axis.name, value.axis.node_id, value.identity.serial, str(value.parameter), word]
+        for value, word in zip(base, words, strict=True)
+    ]
+    return json.dumps(listed).encode()
+
+
+def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
+    """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
+    parameter, factor = gain_object.parameter, gain_object.factor
+    key = f"node {value.axis.node_id}, {parameter}"
+    writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
+    word = _word(key, gain, gain_object) if writable else value.word
+    change = GainChange(
+        axis=gain.axis,
+        key=key,
+        line=0,
+        old=value.value / factor,
+        new=parameter.value(word) / factor if writable else gain.value,
+        std=gain.std,
+        unit=gain.unit,
+        nameplate=gain.nameplate,
+        spelling=f"{parameter.value(word):.9g}" if writable else "",
     )
+    return change, ParameterWrite(value.axis, parameter, word)
 
 
-def _recorded(declared: Cell, network: CanopenNetwork, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
-    axes = {(axis.name, axis.node_id): axis for axis in network.axes}
-    unknown_axes = [note.axis for note in record.drives if (note.axis, note.node_id) not in axes]
-    if record.cell != declared.name or unknown_axes:
+def _word(key: str, gain: Gain, gain_object: GainObject) -> int:
+    wanted, std = gain_object.factor * gain.value, abs(gain_object.factor) * gain.std
+    try:
+        word = gain_object.parameter.word(wanted)
+    except ValueError as error:
         raise ControllerUnfit(
-            str(record.path),
-            found=f"a write to cell {record.cell!r}"
-            + (f", with {', '.join(unknown_axes)} that this cell has not" if unknown_axes else ""),
-            expected=f"one to the drives of cell {declared.name!r}",
-            remedy="nothing was written; has the cell file been changed since?",
+            key,
+            found=str(error),
+            expected="a gain that fits",
+            remedy="check `type` and `factor` in `controller.objects` of the cell file; nothing was written",
+        ) from error
+    held = gain_object.parameter.value(word)
+    if held == 0 or 0 < std < abs(held - wanted):
+        raise ControllerUnfit(
+            key,
+            found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
+            expected="a rounding below σ",
+            remedy="this object is too coarse for the gain: use another one, or another factor in "
+            "`controller.objects`; nothing was written",
         )
-    return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
+    return word
 
 
-def _check_untouched(record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
-    """Refuse where going back would lose what somebody else did."""
+def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tuple[Finding, ...]:
+    """Compare the drives with the newest record, as logs do not carry their values.
+
+    A drive has the written value, or the one before it, where the write was rolled back or never saved. Before the
+    first write there is no record, and nothing to compare with.
+    """
+    records = read_records(folder)
+    if not records:
+        return ()
+    try:
+        notes = {(note.axis, note.parameter): note for note in read_record(records[-1]).drives}
+    except ControllerUnfit as error:
+        return ((error.subject, error.found, error.expected, _REVIEW),)
+    found = []
+    for value in base:
+        note = notes.get((value.axis.name, value.parameter))
+        if note is not None and value.word not in {note.old, note.new}:
+            new, old = value.parameter.value(note.new), value.parameter.value(note.old)
+            expected = f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as before"
+            remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
+            found.append((f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy))
+    return tuple(found)
+
+
+def _check_untouched(path: Path, record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
+    """Refuse a rollback that would lose a change by another hand."""
     for value, note in zip(base, record.drives, strict=True):
         identity = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
         if identity != (note.vendor_id, note.product_code, note.serial):
@@ -118,177 +316,23 @@ def _check_untouched(record: DriveRecord, base: tuple[ParameterValue, ...]) -> N
                 found=f"{value.value:.9g}",
                 expected=f"{note.parameter.value(note.new):.9g} as drivegain wrote it, or "
                 f"{note.parameter.value(note.old):.9g} as before",
-                remedy=f"nothing was written: somebody has changed it since; {record.path} has the old values",
+                remedy=f"nothing was written: the gain was changed since; {path} has the old values",
             )
-
-
-_BEGINS_AND_ENDS = {
-    AuditAction.APPLY_BEGUN: AuditAction.APPLIED,
-    AuditAction.ROLLBACK_BEGUN: AuditAction.ROLLED_BACK,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class DrivesWritten:
-    """What was done to the drives.
-
-    Attributes:
-        target: what the audit calls them.
-        record: file with what stood there before.
-        changes: one a drive.
-        sha256_after: digest of what stands in the drives now, and of which drives they are.
-        source: record that was gone back to; None for a calibration.
-        audit_sha256: of the audit's entry that tells of it, for whoever keeps it elsewhere; None without an audit.
-    """
-
-    target: str
-    record: Path
-    changes: tuple[ParameterChange, ...]
-    sha256_after: str
-    source: Path | None = None
-    audit_sha256: str | None = None
-
-
-def apply_to_drives(
-    proposal: DriveProposal,
-    network: CanopenNetwork,
-    now: datetime,
-    *,
-    saving: Saving = Saving.KNOWN,
-    audit: Path | None = None,
-    who: str = "",
-) -> DrivesWritten:
-    """Make a proposed change.
-
-    Drives that have these gains already are told to save them: that they stand in RAM does not say that they stay.
-
-    Args:
-        proposal: without refusals.
-        network: as in `propose_to_drives`.
-        now: for the record's name and the audit.
-        saving: whether the drives keep it.
-        audit, who: as in `daq.writeback.file_proposal.apply`.
-
-    Raises:
-        CalibrationRefused: a gate is closed, with every one of them.
-        ControllerChanged: something else stands in the drives than when the change was worked out.
-        CalibrationRefused: another drivegain writes them.
-        AuditUnusable: what is done could not be written down.
-        DriverError: see `drivers.canopen.parameters.write_parameters`.
-        OSError: the record could not be written; nothing was written to the drives.
-    """
-    if proposal.refusals:
-        AuditRecorder(audit, who, now).record_refusal(
-            Path(drives_of(proposal.cell)), proposal.refusals, proposal.evidence
-        )
-        raise refused(proposal)
-    details = {"drives": _documented(proposal.base, proposal.writes), **proposal.evidence}
-    with exclusive_writer(_made(proposal.folder)):
-        return _write(
-            network, proposal.cell, proposal.folder, proposal.base, proposal.writes, saving, now,
-            begun=AuditAction.APPLY_BEGUN, audit=audit, who=who, details=details,
-        )  # fmt: skip
-
-
-def roll_back_drives(
-    rollback: DriveRollback,
-    network: CanopenNetwork,
-    now: datetime,
-    *,
-    saving: Saving = Saving.KNOWN,
-    audit: Path | None = None,
-    who: str = "",
-) -> DrivesWritten:
-    """Put back what stood in the drives before a write.
-
-    What it replaces is recorded too, so that a second way back undoes the first.
-
-    Args:
-        rollback: as it was worked out.
-        network, now, saving, audit, who: as in `apply_to_drives`.
-
-    Raises:
-        ControllerChanged: something else stands in the drives than when the way was worked out.
-        CalibrationRefused, AuditUnusable, DriverError, OSError: see `apply_to_drives`.
-    """
-    details = {"drives": _documented(rollback.base, rollback.writes), "restored": str(rollback.record.path)}
-    with exclusive_writer(_made(rollback.folder)):
-        written = _write(
-            network, rollback.cell, rollback.folder, rollback.base, rollback.writes, saving, now,
-            begun=AuditAction.ROLLBACK_BEGUN, audit=audit, who=who, details=details,
-        )  # fmt: skip
-    return replace(written, source=rollback.record.path)
-
-
-def _write(
-    network: CanopenNetwork,
-    cell: str,
-    folder: Path,
-    base: tuple[ParameterValue, ...],
-    writes: tuple[ParameterWrite, ...],
-    saving: Saving,
-    now: datetime,
-    *,
-    begun: AuditAction,
-    audit: Path | None,
-    who: str,
-    details: Mapping[str, object],
-) -> DrivesWritten:
-    records: list[Path] = []
-
-    def begin(found: tuple[ParameterValue, ...]) -> None:
-        if digest(found) != digest(base):
-            raise ControllerChanged(
-                drives_of(cell),
-                found="other values in the drives, or other drives",
-                expected="those that the change was worked out for",
-                remedy="look at a new dry run; nothing was written",
-            )
-        records.append(write_record(folder, cell, now, who, _notes(found, writes)))
-
-    target = Path(drives_of(cell))
-    before, after = canonical(base), canonical(base, tuple(write.word for write in writes))
-    ended = _BEGINS_AND_ENDS[begun]
-    changes, audit_digest = AuditRecorder(audit, who, now).record_write(
-        begun, ended, target, before, after, {"saving": saving.value, **details},
-        partial(write_parameters, network, writes, saving, begin),
-    )  # fmt: skip
-    return DrivesWritten(str(target), records[0], changes, sha256(after), audit_sha256=audit_digest)
 
 
 def _notes(found: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> tuple[DriveNote, ...]:
     return tuple(
         DriveNote(
-            value.axis.name,
-            value.axis.node_id,
-            value.identity.vendor_id,
-            value.identity.product_code,
-            value.identity.serial,
-            value.parameter,
-            value.word,
-            write.word,
+            axis=value.axis.name,
+            node_id=value.axis.node_id,
+            vendor_id=value.identity.vendor_id,
+            product_code=value.identity.product_code,
+            serial=value.identity.serial,
+            index=value.parameter.index,
+            subindex=value.parameter.subindex,
+            type=value.parameter.kind,
+            old=value.word,
+            new=write.word,
         )
         for value, write in zip(found, writes, strict=True)
     )
-
-
-def _documented(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> list[dict[str, object]]:
-    """For the audit, which takes finite numbers only: the bits are whole."""
-    return [
-        {
-            "axis": value.axis.name,
-            "node_id": value.axis.node_id,
-            "serial": value.identity.serial,
-            "object": str(value.parameter),
-            "type": value.parameter.kind.value,
-            "old": value.word,
-            "new": write.word,
-        }
-        for value, write in zip(base, writes, strict=True)
-    ]
-
-
-def _made(folder: Path) -> Path:
-    """The folder of the records; its lock is beside it."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    return folder

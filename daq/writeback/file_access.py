@@ -1,11 +1,15 @@
-"""Symbolic and hard links to a controller's file, and which of them a write may follow."""
+"""Access to a controller's file: which links may be followed, one writer at a time, and backups beside it.
+
+A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first digits of SHA-256: of the backup's
+content, and of the content that replaced it. So a backup shows by itself whether it was changed, and whether the
+controller file was changed since; there is no other file that could be lost or disagree.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import fcntl
-import hashlib
 import os
 import re
 import shlex
@@ -18,6 +22,7 @@ from pathlib import Path
 from daq.errors import CalibrationRefused, ControllerUnfit
 from daq.files import fsync_folder, replace_file
 from daq.writeback.formats.document import read_bytes
+from daq.writeback.request import short_digest
 
 
 def resolve_links(file: Path) -> Path:
@@ -30,7 +35,7 @@ def resolve_links(file: Path) -> Path:
 
     Raises:
         ControllerUnfit: the links form a circle, one of them belongs to another user, or they lead into a folder in
-            which everybody may exchange the file.
+            which every user may exchange the file.
     """
     try:
         target, links = file.resolve(), _links(file)
@@ -57,7 +62,7 @@ def resolve_links(file: Path) -> Path:
         raise ControllerUnfit(
             str(file),
             found=f"a symbolic link into {target.parent}, a folder that everybody may write",
-            expected="a folder in which nobody else can exchange the file",
+            expected="a folder in which no other user can exchange the file",
             remedy="take that right away (`chmod o-w`), or name the file itself",
         )
     return target
@@ -77,7 +82,7 @@ def _links(file: Path) -> tuple[Path, ...]:
 
 
 def _status(file: Path) -> os.stat_result | None:
-    """Status of a file, None where it is gone or may not be looked at."""
+    """Status of a file, None where it is gone or access is denied."""
     try:
         return file.lstat()
     except OSError:
@@ -85,13 +90,12 @@ def _status(file: Path) -> os.stat_result | None:
 
 
 def require_existing(file: Path) -> None:
-    """Refuse a symbolic link that leads nowhere, by that name: "no such file" would be hard to believe.
+    """Refuse a symbolic link that leads nowhere, by that name, and a file of several names (hard links).
 
-    A file of several names (hard links) is refused too: a new file takes the place of one name, and whoever reads the
-    others goes on with the old gains.
+    A new file takes the place of one name; a controller that reads another one would keep the old gains.
 
     Raises:
-        ControllerUnfit: for either; and see `resolve_links`.
+        ControllerUnfit: for either; see also `resolve_links`.
     """
     target = resolve_links(file)
     if file.is_symlink() and not target.exists():
@@ -121,22 +125,19 @@ def _circle(file: Path) -> ControllerUnfit:
     )
 
 
-# One writer of a controller file at a time.
-
-
 _MODE = 0o644
-"""Everybody may read it, and that is enough to lock it (not on NFS, which wants it writable)."""
+"""Every user may read it, and that is enough to lock it (not on NFS, which requires write access)."""
 
 
 @contextlib.contextmanager
 def exclusive_writer(target: Path) -> Iterator[None]:
-    """Hold the file's lock; the system gives it back even after a kill.
+    """Hold the file's lock; the system releases it even after a kill.
 
     The lock file is removed at the end. A second writer may have opened it just before: its lock is then on a file
-    that has no name any more, which it sees by the inode, and takes the lock anew.
+    without a name, which it detects by the inode, and it takes the lock anew.
 
     Raises:
-        CalibrationRefused: somebody else holds it.
+        CalibrationRefused: another drivegain holds it.
         OSError: from the file system.
     """
     lock = target.parent / f".{target.name}.lock"
@@ -148,7 +149,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 try:
                     yield
                 finally:
-                    # Another user's may stay, where only they may remove it: nobody holds it.
+                    # Another user's may stay, where only they may remove it: it is not held.
                     with contextlib.suppress(PermissionError):
                         lock.unlink(missing_ok=True)
                 return
@@ -157,7 +158,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
 
 
 def _opened(lock: Path) -> int:
-    """The lock's file, made where there is none; one that another user has left does not keep anybody out."""
+    """Open the lock file, made where there is none; one that another user has left excludes no other writer."""
     flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     while True:
         with contextlib.suppress(FileExistsError):
@@ -185,7 +186,7 @@ def _take(descriptor: int, target: Path) -> None:
             str(target),
             found="another drivegain writing it",
             expected="one writer at a time",
-            remedy="wait until it has finished, then look at a new dry run",
+            remedy="wait until it has finished, then take a new dry run",
         ) from error
 
 
@@ -195,29 +196,18 @@ def _is_at(descriptor: int, path: Path) -> bool:
     return False
 
 
-# Backups beside a controller file.
-#
-# A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first of SHA-256: of what is in the backup,
-# and
-# of what took its place. So a backup says by itself whether somebody has changed it, and whether somebody has changed
-# the
-# controller file since; no other file could be lost, or disagree.
-
-
 _STAMP = "%Y%m%dT%H%M%SZ"
-_DIGEST = 12
-"""Hexadecimal digits of SHA-256 in a backup's name: 48 bits tell a few hundred contents apart."""
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup beside a controller file, as its name tells.
+    """A backup beside a controller file; all but its content is in its name.
 
     Attributes:
-        path: of it.
+        path: file.
         stamp, count: its place in the order of time.
-        was: digest of what is in it.
-        became: digest of what took its place in the controller file.
+        was: digest of its content.
+        after_digest: digest of the content that replaced it in the controller file.
     """
 
     path: Path
@@ -227,10 +217,10 @@ class Backup:
     after_digest: str
 
     def content(self) -> bytes:
-        """What is in it.
+        """Read the backup.
 
         Raises:
-            ControllerUnfit: it is not what was put there, or cannot be read.
+            ControllerUnfit: it was changed, or cannot be read.
         """
         content = read_bytes(self.path)
         if short_digest(content) != self.was:
@@ -256,7 +246,7 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
     Args:
         target: the controller file; mode and owner are taken from it.
         before: its content.
-        after: what will take its place.
+        after: the content that will replace it.
         now: time for the name.
 
     Raises:
@@ -269,7 +259,7 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
         stamp, count = taken[-1].stamp, taken[-1].count + 1
     order = f"{stamp}-{count}" if count else stamp
     backup = target.with_name(f"{target.name}.{order}.{short_digest(before)}-{short_digest(after)}.bak")
-    # The lock keeps every other drivegain out, and time and count are beyond every backup: nobody has this name.
+    # The lock excludes every other drivegain, and time and count are beyond every backup: the name is free.
     try:
         replace_file(backup, before, like=target)
     except BaseException:
@@ -279,23 +269,18 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
 
 
 def put_back(backup: Path, target: Path) -> None:
-    """Give a backup the name of the file again that took its place; it is none any more.
+    """Rename a backup back to the file that replaced it.
 
     Raises:
-        OSError: from the file system; a failing fsync of the folder is passed over, as the name is there.
+        OSError: from the file system; a failing fsync of the folder is ignored, as the name is there.
     """
     backup.replace(target)
     with contextlib.suppress(OSError):
         fsync_folder(target.parent)
 
 
-def short_digest(content: bytes) -> str:
-    """The digest of a content as it stands in a backup's name."""
-    return hashlib.sha256(content).hexdigest()[:_DIGEST]
-
-
 def _backup(target: Path, path: Path) -> Backup | None:
-    """A backup by its name, None for any other file."""
+    """Parse the name of a backup; None for any other file."""
     match = re.fullmatch(
         re.escape(target.name) + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak", path.name
     )

@@ -1,245 +1,326 @@
-"""The controller file on the disk: one writer at a time, written down, a backup first, replaced whole; and back."""
+"""The controller's file as a target: only the numbers of the gains change, and the file is replaced whole.
+
+The order of a write: lock, the file is still the reviewed one, backup, temporary file, read back and compared, the file
+is still the same, rename. A kill at any point leaves the old file or the new one.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import difflib
+import math
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import datetime
-from functools import partial
+from itertools import combinations
 from pathlib import Path
 
+from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
-from daq.errors import CalibrationRefused, ControllerChanged
+from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.files import replace_file, sha256
-from daq.ledger.audit import AuditAction, AuditRecorder
-from daq.writeback.file_access import Backup, back_up, backups, exclusive_writer, put_back, resolve_links, short_digest
-from daq.writeback.formats.document import decode, read_bytes
+from daq.writeback.file_access import (
+    Backup,
+    back_up,
+    backups,
+    exclusive_writer,
+    put_back,
+    require_existing,
+    resolve_links,
+)
+from daq.writeback.formats.document import ControllerDocument, decode, read_bytes
+from daq.writeback.formats.scalar import Scalar, rewrite_gain
+from daq.writeback.request import Edit, Finding, GainChange, short_digest
+from daq.writeback.target import Written, audited_change
+from ident.calibration import Calibration, Gain
 
 
-@dataclass(frozen=True, slots=True)
-class Written:
-    """What a replacement did.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileEdit(Edit):
+    """Planned change of a controller's file.
 
     Attributes:
-        file: the file that was replaced, symbolic links followed.
-        backup: where its former content is.
-        before, after: content.
-        audit_sha256: of the audit's entry that tells of it, for whoever keeps it elsewhere; None without an audit.
+        file: as it was named; `subject` is the file behind its symbolic links.
+        format: of the file; None where its name says it.
     """
 
     file: Path
-    backup: Path
-    before: bytes
-    after: bytes
-    audit_sha256: str | None = None
+    format: ControllerFormat | None = None
+
+    @property
+    def place(self) -> Path:
+        """The file as it was named."""
+        return self.file
+
+    @property
+    def diff(self) -> str:
+        """The change as a unified diff, empty where there is none."""
+        before, after = (self.document(content or b"").text for content in (self.before, self.after))
+        lines = difflib.unified_diff(
+            before.splitlines(keepends=True),
+            after.splitlines(keepends=True),
+            f"{self.file.name} (now)",
+            f"{self.file.name} (calibrated)",
+            n=1,
+        )
+        return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
+
+    def document(self, content: bytes) -> ControllerDocument:
+        """Parse a content in the file's format."""
+        return decode(content, str(self.source or self.file), self.format)
 
 
 @dataclass(frozen=True, slots=True)
-class Restored:
-    """What a way back did.
+class FileTarget:
+    """A controller's file.
 
     Attributes:
-        file: the controller file, symbolic links followed.
-        source: the backup that it was restored from.
-        backup: where its former content is, None where the file was gone.
-        before, after: content; before is empty where the file was gone.
-        audit_sha256: as of `Written`.
+        file: as it was named; a symbolic link stays one, and the file behind it is replaced.
+        keys: key of each axis's gain, by the axis's name; not needed for a rollback.
+        format: of the file; None where its name says it.
+        factors: number in the file = gain × factor, by the axis's name; 1 where it is missing.
+        cell: that the controller drives; None where nothing is compared with it.
     """
 
     file: Path
-    source: Path
-    backup: Path | None
-    before: bytes
-    after: bytes
-    audit_sha256: str | None = None
+    keys: Mapping[str, str] = field(default_factory=dict)
+    format: ControllerFormat | None = None
+    factors: Mapping[str, float] = field(default_factory=dict)
+    cell: Cell | None = None
 
+    @classmethod
+    def of(cls, cell: Cell, file: Path | None = None) -> FileTarget:
+        """The controller's file of a cell.
 
-def write(
-    file: Path,
-    after: bytes,
-    base_sha256: str,
-    check: Callable[[bytes], None],
-    now: datetime,
-    *,
-    audit: Path | None = None,
-    who: str = "",
-    details: Mapping[str, object] | None = None,
-) -> Written:
-    """Replace a controller file, if it is still the one that was looked at.
+        Args:
+            cell: as it is now.
+            file: another file than the one that the cell names.
 
-    Args:
-        file: the controller file, or a symbolic link to it.
-        after: its new content.
-        base_sha256: digest of the content that the change was worked out for.
-        check: called with what the disk gives back before anything is replaced.
-        now: time for the backup's name and the audit.
-        audit: where it is written down, before anything is replaced and after; None for nowhere.
-        who: in whose name.
-        details: what else the audit shall know.
+        Raises:
+            ConfigurationInconsistent: the cell names no controller file, or no keys in it.
+        """
+        controller, chosen = cell.controller, file or cell.controller_path
+        if controller is None or not controller.gains or chosen is None:
+            raise ConfigurationInconsistent(
+                f"cell {cell.name!r}: controller",
+                found="none" if controller is None else "no file, or no key of each gain in it",
+                expected="the controller's file and the key of each gain",
+                remedy="add `controller: {file: ..., gains: [...]}` to the cell file",
+            )
+        keys = dict(zip(cell.axis_names, controller.gains, strict=True))
+        factors = dict(zip(cell.axis_names, controller.factors, strict=True)) if controller.factors else {}
+        return cls(chosen, keys, controller.format, factors, cell)
 
-    Raises:
-        ControllerChanged: somebody has changed the file since, or saves it while it is written.
-        CalibrationRefused: somebody is writing it.
-        ControllerUnfit: from `check`, or it cannot be read.
-        AuditUnusable: it could not be written down; the old content stands.
-        OSError: from the file system; the old content stands, and neither backup nor temporary file is left.
-    """
-    target = resolve_links(file)
-    recorder, known = AuditRecorder(audit, who, now), details or {}
-    with contextlib.ExitStack() as lock:
-        with recorder.record_refusal_of(target, known):
-            lock.enter_context(exclusive_writer(target))
-            before = read_bytes(target)
-            found = sha256(before)
-            if found != base_sha256:
+    @property
+    def subject(self) -> str:
+        """The file behind all symbolic links.
+
+        Raises:
+            ControllerUnfit: a link that must not be followed.
+        """
+        return str(resolve_links(self.file))
+
+    def plan(self, calibration: Calibration) -> FileEdit:
+        """See `Target.plan`."""
+        self._check_axes(calibration)
+        require_existing(self.file)
+        content = read_bytes(self.file)
+        now = decode(content, str(self.file), self.format)
+        scalars = now.locate(tuple(self.keys[gain.axis] for gain in calibration.gains))
+        changes = tuple(
+            _change(gain, scalar, self.factors.get(gain.axis, 1.0))
+            for gain, scalar in zip(calibration.gains, scalars, strict=True)
+        )
+        self._check_apart(scalars)
+        after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
+        return FileEdit(
+            subject=self.subject,
+            before=content,
+            after=after.content,
+            changes=changes,
+            unexpected=_changed_since_recording(calibration, str(self.file), sha256(content)),
+            file=self.file,
+            format=self.format,
+        )
+
+    def plan_rollback(self) -> FileEdit:
+        """See `Target.plan_rollback`: the newest backup that differs from the file."""
+        target = Path(self.subject)
+        before = read_bytes(target) if target.exists() else None
+        backup = self._backup_to_restore(target, before)
+        after = backup.content()
+        if before is not None and short_digest(before) != backup.after_digest:
+            one, other = shlex.quote(str(backup.path)), shlex.quote(str(self.file))
+            raise ControllerChanged(
+                str(self.file),
+                found=f"content {short_digest(before)}…",
+                expected=f"{backup.after_digest}…, as drivegain wrote it when it made {backup.path.name}",
+                remedy="the file was edited since, and a rollback would lose that; compare with "
+                f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
+            )
+        return FileEdit(
+            subject=str(target), before=before, after=after, source=backup.path, file=self.file, format=self.format
+        )
+
+    @contextlib.contextmanager
+    def lock(self, edit: FileEdit) -> Iterator[None]:
+        """See `Target.lock`."""
+        target = resolve_links(self.file)
+        with exclusive_writer(target):
+            found = None if edit.before is None and not target.exists() else read_bytes(target)
+            if (str(target), found) != (edit.subject, edit.before):
                 raise ControllerChanged(
-                    str(file),
-                    found=f"content {found[:12]}…",
-                    expected=f"{base_sha256[:12]}…, for which the change was shown",
-                    remedy="somebody has changed the file: look at a new dry run",
+                    str(self.file),
+                    found="another file" if found is None else f"content {short_digest(found)}…",
+                    expected="no file, as planned"
+                    if edit.before is None
+                    else f"{short_digest(edit.before)}…, as shown",
+                    remedy="the file has changed in between: take a new dry run",
                 )
-        written, audit_digest = recorder.record_write(
-            AuditAction.APPLY_BEGUN, AuditAction.APPLIED, target, before, after, known,
-            partial(_replace, target, before, after, check, now),
-        )  # fmt: skip
-        return replace(written, audit_sha256=audit_digest)
+            yield
 
+    def details(self, edit: FileEdit) -> Mapping[str, object]:
+        """See `Target.details`."""
+        if edit.source is not None:
+            return {"restored": edit.source.name}
+        return {"changes": [audited_change(change) for change in edit.changes]}
 
-def roll_back(
-    file: Path,
-    now: datetime,
-    *,
-    audit: Path | None = None,
-    who: str = "",
-    format: ControllerFormat | None = None,  # noqa: A002 - as the cell file calls it
-) -> Restored:
-    """Take the last write back: put the newest backup that differs from the file in its place.
+    def write(self, edit: FileEdit, now: datetime, who: str) -> Written:
+        """See `Target.write`; `who` is in the audit alone."""
+        target = Path(edit.subject)
+        if edit.before is None:
+            _restore_deleted(target, edit)
+            return Written(edit, None)
+        backup = back_up(target, edit.before, edit.after, now)
+        try:
+            replace_file(target, edit.after, check=_last_check(target, edit))
+        except ControllerChanged:
+            backup.unlink()
+            raise
+        except BaseException:
+            # Before the rename the old file is in place; after it (the folder's fsync failed) the backup replaces it.
+            # A file that was saved by another program in between stays, and so does the backup.
+            found = _content(target)
+            if found == edit.before:
+                backup.unlink()
+            elif found == edit.after:
+                put_back(backup, target)
+            raise
+        return Written(edit, backup)
 
-    What it replaces becomes a backup too, so that a second way back undoes the first. A file that was deleted comes
-    back as it was before the last write.
+    def _check_axes(self, calibration: Calibration) -> None:
+        axes = [gain.axis for gain in calibration.gains]
+        if sorted(axes) != sorted(self.keys):
+            raise CalibrationRefused(
+                "calibration",
+                found=f"gains of {', '.join(axes) or 'no axis'}",
+                expected=f"one for each axis of the controller file: {', '.join(self.keys) or 'none'}",
+                remedy="give the calibration and the configuration of the same cell",
+            )
+        keys = list(self.keys.values())
+        doubled = sorted({key for key in keys if keys.count(key) > 1})
+        if doubled:
+            raise ControllerUnfit(
+                "controller.gains",
+                found=f"{', '.join(doubled)} for more than one axis",
+                expected="a key of its own for each axis",
+                remedy="correct the cell configuration",
+            )
 
-    Args:
-        file: the controller file, or a symbolic link to it.
-        now: time for the backup's name and the audit.
-        audit, who: as in `write`.
-        format: of the file; None where its name tells.
+    def _check_apart(self, scalars: Sequence[Scalar]) -> None:
+        """Refuse two keys that name one number: an axis would get the gain of the other."""
+        for one, other in combinations(scalars, 2):
+            if one.start < other.end and other.start < one.end:
+                raise ControllerUnfit(
+                    f"{self.file}, line {one.line}",
+                    found=f"{one.key} and {other.key}, which name the same number",
+                    expected="a number of its own for each axis",
+                    remedy="correct `controller.gains` of the cell configuration; nothing was written",
+                )
 
-    Raises:
-        CalibrationRefused: there is none.
-        CalibrationRefused: somebody is writing the file.
-        ControllerChanged: the file is not what was written when that backup was made: somebody has edited it since.
-        ControllerUnfit: the file cannot be read; the backup was changed, or does not parse.
-        AuditUnusable: it could not be written down; the file stands as it was.
-        OSError: from the file system; the file stands as it was.
-    """
-    target = resolve_links(file)
-    recorder = AuditRecorder(audit, who, now)
-    with contextlib.ExitStack() as lock:
-        with recorder.record_refusal_of(target, {"asked": "rollback"}):
-            lock.enter_context(exclusive_writer(target))
-            before = read_bytes(target) if target.exists() else None
-            backup = _backup_to_restore(file, target, before)
-            after = backup.content()
-            if before is not None:
-                _check_unedited(file, before, backup)
-        details = {"restored": backup.path.name}
-        check = partial(_check_parses, name=str(backup.path), format=format)
-        restored, audit_digest = recorder.record_write(
-            AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK, target, before, after, details,
-            partial(_restore, target, before, after, backup, check, now),
-        )  # fmt: skip
-        return replace(restored, audit_sha256=audit_digest)
-
-
-def _backup_to_restore(file: Path, target: Path, before: bytes | None) -> Backup:
-    found = backups(target)
-    for backup in reversed(found):
-        # A writer that was killed before it replaced the file leaves a backup of what is still there.
-        if before is None or backup.was != short_digest(before):
-            return backup
-    raise CalibrationRefused(
-        str(file),
-        found=f"{len(found)} backups with the same content" if found else "no backup beside it",
-        expected=f"{target.name}.<time>.<digests>.bak with another content",
-        remedy="nothing was changed",
-    )
-
-
-def _check_unedited(file: Path, before: bytes, backup: Backup) -> None:
-    if short_digest(before) != backup.after_digest:
-        one, other = shlex.quote(str(backup.path)), shlex.quote(str(file))
-        raise ControllerChanged(
-            str(file),
-            found=f"content {short_digest(before)}…",
-            expected=f"{backup.after_digest}…, as drivegain wrote it when it made {backup.path.name}",
-            remedy="somebody has edited the file since, and going back would lose that; look at the difference with "
-            f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
+    def _backup_to_restore(self, target: Path, before: bytes | None) -> Backup:
+        found = backups(target)
+        for backup in reversed(found):
+            # A writer that was killed before it replaced the file leaves a backup of the present content.
+            if before is None or backup.was != short_digest(before):
+                return backup
+        raise CalibrationRefused(
+            str(self.file),
+            found=f"{len(found)} backups with the same content" if found else "no backup beside it",
+            expected=f"{target.name}.<time>.<digests>.bak with another content",
+            remedy="nothing was changed",
         )
 
 
-def _restore(
-    target: Path, before: bytes | None, after: bytes, source: Backup, check: Callable[[bytes], None], now: datetime
-) -> Restored:
-    if before is not None:
-        written = _replace(target, before, after, check, now)
-        return Restored(target, source.path, written.backup, before, after)
+def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
+    writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
+    put = rewrite_gain(scalar, gain.value, gain.std, factor) if writable else None
+    return GainChange(
+        axis=gain.axis,
+        key=scalar.key,
+        line=scalar.line,
+        old=scalar.value / factor,
+        new=gain.value if put is None else put.new,
+        std=gain.std,
+        unit=gain.unit,
+        nameplate=gain.nameplate,
+        spelling="" if put is None else put.spelling,
+    )
+
+
+def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[Finding, ...]:
+    """Compare with the first log that was recorded with another content of the file."""
+    for log in calibration.sources:
+        recorded = None if log.recording is None else log.recording.controller_sha256
+        if recorded is not None and recorded != base_sha256:
+            remedy = (
+                "the file was changed since, by hand or by an earlier write: review its gains and the diff of this dry "
+                f"run, and where both are right, repeat it with --base {base_sha256}"
+            )
+            expected = f"{recorded[:12]}…, as when {log.name} was recorded"
+            return ((file, f"content {base_sha256[:12]}…", expected, remedy),)
+    return ()
+
+
+def _restore_deleted(target: Path, edit: FileEdit) -> None:
     try:
-        replace_file(target, after, check=_last_look(target, None, check), like=source.path)
-    except BaseException:  # an interrupt too: what is restored is there whole, or not at all
-        if _content(target) == after:  # and not what somebody else has put there
+        replace_file(target, edit.after, check=_last_check(target, edit), like=edit.source)
+    except BaseException:  # an interrupt too: the file comes back whole, or not at all
+        if _content(target) == edit.after:  # and not one that another program has made
             target.unlink()
         raise
-    return Restored(target, source.path, None, b"", after)
 
 
-def _replace(target: Path, before: bytes, after: bytes, check: Callable[[bytes], None], now: datetime) -> Written:
-    backup = back_up(target, before, after, now)
-    try:
-        replace_file(target, after, check=_last_look(target, before, check))
-    except ControllerChanged:
-        backup.unlink()
-        raise
-    except BaseException:
-        # Before the rename the old file still stands; after it (the folder's fsync failed) the backup takes its place.
-        # What somebody else has put there meanwhile stays, and so does the backup.
-        found = _content(target)
-        if found == before:
-            backup.unlink()
-        elif found == after:
-            put_back(backup, target)
-        raise
-    return Written(target, backup, before, after)
+def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
+    """Make the check right before the rename; the lock excludes every drivegain, and no editor.
 
-
-def _last_look(target: Path, before: bytes | None, check: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    """What is asked right before the rename: the lock keeps every drivegain out, and no editor.
-
-    Between the question and the rename are two calls of the system; whoever saves just then still loses it.
+    Between the check and the rename are two system calls; a file that is saved in between is still lost.
     """
 
-    def look(written: bytes) -> None:
-        check(written)
+    def check(written: bytes) -> None:
+        document = edit.document(written)
+        if edit.before is None or edit.source is not None:
+            document.locate(())
+        else:
+            document.check_against(edit.document(edit.before), {one.key: one.spelling for one in edit.changes})
         found = _content(target)
-        if found != before:
+        if found != edit.before:
             raise ControllerChanged(
                 str(target),
-                found="no file any more" if found is None else f"content {sha256(found)[:12]}…",
-                expected="no file, as before" if before is None else f"{sha256(before)[:12]}…, as before this write",
-                remedy="somebody has saved the file meanwhile, and it stands as they did: look at a new dry run",
+                found="no file any more" if found is None else f"content {short_digest(found)}…",
+                expected="no file, as before"
+                if edit.before is None
+                else f"{short_digest(edit.before)}…, as before this write",
+                remedy="the file was saved meanwhile, and stays as it was saved: take a new dry run",
             )
 
-    return look
+    return check
 
 
 def _content(target: Path) -> bytes | None:
-    """Of the file as it is now, None where it is gone."""
+    """Content of the file now, None where it is gone."""
     try:
         return target.read_bytes()
     except FileNotFoundError:
         return None
-
-
-def _check_parses(content: bytes, name: str, format: ControllerFormat | None) -> None:  # noqa: A002
-    decode(content, name, format).locate(())

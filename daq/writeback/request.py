@@ -1,7 +1,13 @@
-"""That somebody wants a calibration to be applied, and what they say of it."""
+"""A request to write a calibration to a controller, and the planned change that it leads to.
+
+`--base` ties the two together. A dry run prints the digests of the content before and after the change; the write
+repeats them, and only that change is made: not another one because the calibration, the keys or the file have changed
+in between.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -11,9 +17,10 @@ from daq.config.policy import ApplyPolicy
 from daq.errors import UsageError
 from daq.files import sha256
 from daq.workflow.calibration_file import encode
-from daq.writeback.file_access import short_digest
-from daq.writeback.gates.table import Gate, Refusal
 from ident.calibration import Calibration
+
+_DIGITS = 12
+"""Hexadecimal digits of SHA-256 in the name of a backup and in --base: 48 bits distinguish a few hundred contents."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,16 +28,16 @@ class Request:
     """The same for a controller's file and for the drives.
 
     Attributes:
-        calibration: with the identified gains.
-        now: for the age of the logs.
-        policy: bounds; the cell's when None.
-        configuration_changed: they have looked at what changed in the cell's configuration since the recording.
-        entered_kg: masses that were read off the scale once more, by the payload's name [kg].
-        looked_at: `Proposal.looked_at` of the change that they have looked at, or the digest of the controller file
-            alone: then whatever the calibration changes in it.
-        appliers: names of whoever applies it, the login last; their signatures do not count.
-        file: of the calibration, where signatures are looked for; None where it is in no file.
-        content: of that file, as it was read; None where it is in no file.
+        calibration: the identified gains.
+        now: wall-clock time, for the age of the logs.
+        policy: bounds; those of the cell when None.
+        configuration_changed: the operator accepts that the cell's configuration changed since the recording.
+        entered_kg: masses weighed again for this write, by the payload's name [kg].
+        base: value of --base: `Edit.base` of the reviewed change, or the SHA-256 of the reviewed content alone, for any
+            change of it.
+        appliers: names of the operator, the login last; their own signatures do not count.
+        file: calibration file, beside which signatures are searched; None without one.
+        content: bytes of that file as they were read; None without one.
     """
 
     calibration: Calibration
@@ -38,47 +45,154 @@ class Request:
     policy: ApplyPolicy | None = None
     configuration_changed: bool = False
     entered_kg: Mapping[str, float] = field(default_factory=dict)
-    looked_at: str | None = None
+    base: str | None = None
     appliers: Collection[str] = ()
     file: Path | None = None
     content: bytes | None = None
 
     @property
     def signed(self) -> bytes:
-        """What a signature must be of."""
+        """The bytes that a signature must cover."""
         return encode(self.calibration) if self.content is None else self.content
 
+    @property
+    def evidence(self) -> dict[str, object]:
+        """Digests of calibration, configuration and logs as plain JSON, for the audit."""
+        calibration = self.calibration
+        return {
+            "calibration": {
+                "file": None if self.file is None else str(self.file.absolute()),
+                "sha256": sha256(self.signed),
+                "cell": calibration.cell,
+                "created": calibration.created,
+                "software": calibration.software,
+            },
+            "configuration_sha256": calibration.configuration_sha256,
+            "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
+        }
 
-# What somebody has looked at before a write: what stood there, and what would stand there in its place.
-#
-# Both as the first digits of their SHA-256, before-after, as a backup is named. Who repeats it at the write gets the
-# change that was shown: not another one because the calibration, the keys or the file have become others meanwhile.
+
+@dataclass(frozen=True, slots=True)
+class GainChange:
+    """One gain before and after.
+
+    Attributes:
+        axis: name of the axis.
+        key: place of the number: its key in the controller file, or the drive's object.
+        line: of the number in the file, from 1; 0 in a drive.
+        old, new: gain now, and as it will be read back [unit]; new is NaN where there is none to write.
+        std: standard deviation of the identified gain [unit].
+        unit: Nm at the joint per unit of the current-loop reference.
+        nameplate: the manufacturer's gain [unit].
+        spelling: the new number as written, in the controller's own unit; empty where none can be written.
+    """
+
+    axis: str
+    key: str
+    line: int
+    old: float
+    new: float
+    std: float
+    unit: str
+    nameplate: float
+    spelling: str
+
+    @property
+    def change_percent(self) -> float:
+        """Change from the gain in the controller [%]; inf from zero."""
+        return _percent(self.new - self.old, self.old)
+
+    @property
+    def nameplate_percent(self) -> float:
+        """Distance from the nameplate [%]; inf from zero."""
+        return _percent(self.new - self.nameplate, self.nameplate)
+
+    @property
+    def std_percent(self) -> float:
+        """Relative standard deviation [%]; inf for a gain of zero."""
+        return _percent(self.std, abs(self.new))
+
+
+Finding = tuple[str, str, str, str]
+"""Reason to refuse a write: subject, found, expected, remedy."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Edit:
+    """Planned change of a target; nothing is written yet.
+
+    Attributes:
+        subject: the target, as audit and history name it.
+        before: its content now; None where the file is gone.
+        after: its content after the change.
+        changes: one for each gain, in the order of the calibration; none in a rollback.
+        unexpected: where the content now is not the one that drivegain expects there.
+        source: backup or record that a rollback restores; None for a calibration.
+    """
+
+    subject: str
+    before: bytes | None
+    after: bytes
+    changes: tuple[GainChange, ...] = ()
+    unexpected: tuple[Finding, ...] = ()
+    source: Path | None = None
+
+    @property
+    def place(self) -> Path:
+        """File or folder that an error of the file system is reported for."""
+        return Path(self.subject)
+
+    @property
+    def has_effect(self) -> bool:
+        """Whether there is anything to write."""
+        return self.before != self.after
+
+    @property
+    def keeps_all(self) -> bool:
+        """Whether the controller has exactly these gains already, so that a write would lose nothing."""
+        return not self.has_effect and all(change.spelling for change in self.changes)
+
+    @property
+    def base_sha256(self) -> str:
+        """SHA-256 of the content now."""
+        return sha256(self.before or b"")
+
+    @property
+    def base(self) -> str:
+        """The value of --base that approves exactly this change."""
+        return change_digest(self.before or b"", self.after)
+
+
+def short_digest(content: bytes) -> str:
+    """First digits of the SHA-256 of a content."""
+    return sha256(content)[:_DIGITS]
+
+
+def change_digest(before: bytes, after: bytes) -> str:
+    """Identify a change by the digests of its two contents."""
+    return f"{short_digest(before)}-{short_digest(after)}"
 
 
 @dataclass(frozen=True, slots=True)
 class ReviewedChange:
-    """What somebody says that they have looked at.
+    """The change that the operator has reviewed.
 
     Attributes:
-        base_sha256: digest of what stood there; None where they say nothing.
-        became: first digits of the digest of what would take its place; None where that is not told.
+        base_sha256: digest of the content before it; None where nothing was reviewed.
+        after_digest: first digits of the digest of the content after it; None where any is accepted.
     """
 
     base_sha256: str | None
     after_digest: str | None
 
 
-def change_digest(before: bytes, after: bytes) -> str:
-    """By which a change is recognised, for --base."""
-    return f"{short_digest(before)}-{short_digest(after)}"
-
-
 def parse_base(base: str | None, before: bytes) -> ReviewedChange:
-    """Read what --base says.
+    """Read the value of --base.
 
     Args:
-        base: `change_digest` a change, or the whole SHA-256 of what stood there; None where nobody has looked.
-        before: what stands there now. Where its digest begins with the digits that were told, it is what was meant.
+        base: `change_digest` of a change, or the whole SHA-256 of the content before it; None where nothing was
+            reviewed.
+        before: content now; a short digest that fits it means this content.
 
     Raises:
         UsageError: it is neither.
@@ -86,64 +200,21 @@ def parse_base(base: str | None, before: bytes) -> ReviewedChange:
     if base is None:
         return ReviewedChange(None, None)
     was, joined, after_digest = base.strip().lower().partition("-")
-    digits = len(short_digest(before))
     if not joined and len(was) == len(sha256(before)) and _is_hex(was):
         return ReviewedChange(was, None)
-    if not (len(was) == len(after_digest) == digits and _is_hex(was + after_digest)):
+    if not (len(was) == len(after_digest) == _DIGITS and _is_hex(was + after_digest)):
         raise UsageError(
             f"--base {base}",
             found="no digest",
-            expected=f"what a dry run tells: {digits} digits, a hyphen, {digits} digits",
+            expected=f"the value that a dry run prints: {_DIGITS} digits, a hyphen, {_DIGITS} digits",
             remedy="copy it from the last line of the dry run",
         )
     return ReviewedChange(sha256(before) if was == short_digest(before) else was, after_digest)
-
-
-def changed_since_review(reviewed: ReviewedChange, subject: str, before: bytes, after: bytes) -> tuple[Refusal, ...]:
-    """Closed where another content would be written than the one that was shown.
-
-    Args:
-        looked: what somebody has looked at.
-        subject: what would be written to.
-        before, after: what stands there, and what would stand there. Where something else stands there than was shown,
-            the gate of the base says so, and this one says nothing.
-    """
-    if reviewed.after_digest in {None, short_digest(after)} or reviewed.base_sha256 != sha256(before):
-        return ()
-    return (
-        Refusal(
-            Gate.BASE,
-            subject,
-            f"a change to {short_digest(after)}…",
-            f"to {reviewed.after_digest}…, as --base says",
-            "the calibration, the keys or the factors have changed since the dry run: look at a new one",
-        ),
-    )
 
 
 def _is_hex(text: str) -> bool:
     return set(text) <= set("0123456789abcdef")
 
 
-# What a write rests on, for the audit: digests of calibration, configuration and logs.
-
-
-def evidence_of(calibration: Calibration, content: bytes, file: Path | None) -> dict[str, object]:
-    """As plain JSON.
-
-    Args:
-        calibration: whose gains are written.
-        content: of its file.
-        file: where that is, None where there is none.
-    """
-    return {
-        "calibration": {
-            "file": None if file is None else str(file.absolute()),
-            "sha256": sha256(content),
-            "cell": calibration.cell,
-            "created": calibration.created,
-            "software": calibration.software,
-        },
-        "configuration_sha256": calibration.configuration_sha256,
-        "logs": [{"name": one.name, "sha256": one.sha256, "role": one.role} for one in calibration.sources],
-    }
+def _percent(part: float, whole: float) -> float:
+    return 100.0 * part / whole if whole else math.inf

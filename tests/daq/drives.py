@@ -11,8 +11,8 @@ from pathlib import Path
 
 import can
 
-from daq.cli.apply import apply_drives
-from daq.cli.writing import Applier
+from daq.cli.apply import apply_to
+from daq.cli.writing import Applier, drives_on_the_bus
 from daq.config.bus import drive_axes
 from daq.config.cell import Bus, Cell
 from daq.config.cell_file import load_cell
@@ -140,22 +140,22 @@ def apply_in_drives(
     """As `drivegain apply --drives` does it, in Kim's name."""
     calibration = calibration or demo_calibration()
     assert cell.history is not None
-    apply_drives(
+    apply_to(
+        drives_on_the_bus(cell, saving),
         cell,
-        Path("cells/demo.yaml"),
         Request(
             calibration,
             NOW,
             policy=cell.apply,
             configuration_changed=True,
-            looked_at=base,
+            base=base,
             appliers=ACTOR.names,
             file=Path("calibration.yaml"),
             content=encode(calibration),
         ),
         actor=ACTOR,
-        saving=saving,
         audit=cell.history.audit,
+        undo="drivegain rollback --cell cells/demo.yaml --drives",
         yes=yes,
         json=as_json,
     )

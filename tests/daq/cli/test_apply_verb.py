@@ -25,7 +25,7 @@ from daq.ledger.judgement import Known
 from daq.ledger.store import HistoryStore
 from daq.report.proposal import significant
 from daq.workflow.calibration_file import decode, save
-from daq.writeback.gates.target import GainChange
+from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
 
@@ -203,10 +203,10 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
-    assert "Not written down" in capsys.readouterr().out
+    assert "Not in an audit" in capsys.readouterr().out
     audit = tmp_path / "elsewhere.jsonl"
     assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
-    assert "Not written down" not in capsys.readouterr().out
+    assert "Not in an audit" not in capsys.readouterr().out
     assert [entry.action for entry in read(audit)] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert main(["rollback"]) == ExitCode.USAGE
 

@@ -23,8 +23,9 @@ from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document
 from daq.report.history import csv_text, plot_history
 from daq.report.proposal import show
 from daq.report.text import inert, terminal_lines, terminal_text
-from daq.writeback.file_proposal import Proposal, propose
+from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
+from daq.writeback.target import Proposal, propose
 from ident.calibration import Gain
 from tests.daq.calibrations import AXES, demo_calibration, recorded
 from tests.daq.histories import calibration_of, enter
@@ -103,13 +104,13 @@ def test_a_history_that_ends_with_the_calendar_is_drawn(times: tuple[datetime, .
     assert out.read_bytes().startswith(b"<?xml")
 
 
-def _proposal(folder: Path, unit: str) -> Proposal:
+def _proposal(folder: Path, unit: str) -> Proposal[FileEdit]:
     file = folder / "robot.yaml"
     file.write_text("".join(f"{axis}: 30.0  # tab\t[/]\n" for axis in AXES))
     demo = demo_calibration()
     made = replace(demo, gains=tuple(replace(gain, unit=unit) for gain in demo.gains))
     return propose(
-        Request(made, datetime(2025, 1, 2, tzinfo=UTC)), file, dict(zip(AXES, AXES, strict=True)), cell="demo"
+        FileTarget(file, dict(zip(AXES, AXES, strict=True))), Request(made, datetime(2025, 1, 2, tzinfo=UTC))
     )
 
 

@@ -18,7 +18,8 @@ from daq.jobs.session import Outcome
 from daq.jobs.tools import Tools
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
-from daq.writeback.file_target import roll_back
+from daq.writeback.file_target import FileTarget
+from daq.writeback.target import rollback
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 
@@ -142,7 +143,7 @@ def test_what_a_person_took_back_behind_a_killed_write_is_not_written_again(
     assert rig.session.state.outcome is None
     (backup,) = rig.backups
     if way == "rollback":
-        roll_back(rig.controller, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="a person")
+        rollback(FileTarget(rig.controller), rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="a person")
     else:
         shutil.copyfile(backup, rig.controller)
     if way == "edited":

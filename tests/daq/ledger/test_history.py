@@ -32,10 +32,10 @@ from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watc
 from daq.report.history import COLUMNS
 from daq.report.history_view import describe_actions
 from daq.workflow.calibration_file import save
-from daq.writeback.drive_proposal import drives_of
+from daq.writeback.drive_record import drives_of
 from daq.writeback.formats.document import decode as read_controller
 from daq.writeback.formats.scalar import rewrite_gain
-from daq.writeback.gates.target import GainChange
+from daq.writeback.request import GainChange
 from ident.calibration import Calibration, Gain
 from ident.drift.change import DISPERSION, dispersions
 from tests.daq.calibrations import AXES, recorded, with_recordings

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.config.policy import ApplyPolicy
 from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, UsageError
 from daq.log.conversion import load_run
 from daq.log.metadata import SEAL, sealed, unsealed
@@ -26,8 +26,9 @@ from daq.log.salvage import salvage
 from daq.log.writer import LogWriter
 from daq.workflow.calibration_file import as_document, decode, encode, save
 from daq.workflow.fit import Reading
-from daq.writeback.gates.logs import source_refusals
-from daq.writeback.gates.table import Gate, GateContext
+from daq.writeback.gates.gate import Gate, GateContext
+from daq.writeback.gates.table import closed_gates
+from daq.writeback.request import Edit, Request
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
@@ -244,9 +245,9 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     partial = replace(good, sources=(good.sources[0], replace(good.sources[1], partial=True)))
     again = decode(encode(partial), "calibration.yaml")
     assert again == partial
-    policy = ApplyPolicy()
-    assert not source_refusals(good, policy, GateContext())
-    assert [refusal.gate for refusal in source_refusals(again, policy, GateContext())] == [Gate.PARTIAL]
+    edit, now = Edit(subject="", before=b"", after=b""), datetime(2025, 1, 2, tzinfo=UTC)
+    assert not closed_gates(GateContext(Request(good, now), edit))
+    assert [refusal.gate for refusal in closed_gates(GateContext(Request(again, now), edit))] == [Gate.PARTIAL]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
 
 

@@ -22,9 +22,9 @@ from daq.cli.app import main
 from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read
 from daq.writeback.file_access import backups, exclusive_writer
-from daq.writeback.file_proposal import Proposal, apply, propose
-from daq.writeback.file_target import roll_back
+from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
+from daq.writeback.target import Proposal, apply, propose, rollback
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, KEYS, demo_calibration
 
@@ -41,18 +41,18 @@ def controller(tmp_path: Path) -> Path:
     return path
 
 
-def _propose(calibration: Calibration, controller: Path) -> Proposal:
-    return propose(Request(calibration, NOW), controller, KEYS, cell="demo")
+def _propose(calibration: Calibration, controller: Path) -> Proposal[FileEdit]:
+    return propose(FileTarget(controller, KEYS), Request(calibration, NOW))
 
 
 def test_a_dry_run_shows_and_writes_nothing(controller: Path) -> None:
     before = controller.read_bytes()
     proposal = _propose(demo_calibration(), controller)
     assert proposal.refusals == ()
-    assert [change.axis for change in proposal.changes] == list(AXES)
-    assert "-    gain: -11.52       # Nm at the joint per A, from the data sheet\n" in proposal.diff
-    assert "+    gain: -9.2100       # Nm at the joint per A, from the data sheet\n" in proposal.diff
-    assert proposal.diff.count("\n+ ") == proposal.diff.count("\n- ") == 6
+    assert [change.axis for change in proposal.edit.changes] == list(AXES)
+    assert "-    gain: -11.52       # Nm at the joint per A, from the data sheet\n" in proposal.edit.diff
+    assert "+    gain: -9.2100       # Nm at the joint per A, from the data sheet\n" in proposal.edit.diff
+    assert proposal.edit.diff.count("\n+ ") == proposal.edit.diff.count("\n- ") == 6
     assert controller.read_bytes() == before
     assert list(controller.parent.iterdir()) == [controller]
 
@@ -78,7 +78,7 @@ def test_applying_changes_the_six_numbers_and_keeps_a_backup(controller: Path) -
 def test_applying_twice_changes_nothing_the_second_time(controller: Path) -> None:
     apply(_propose(demo_calibration(), controller), NOW)
     again = _propose(demo_calibration(), controller)
-    assert again.diff == ""
+    assert again.edit.diff == ""
     assert apply(again, NOW) is None
     assert len(backups(controller)) == 1
 
@@ -88,7 +88,7 @@ def test_other_axes_than_the_cell_has_are_refused(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="J1, J2, J3, J4, J5; expected"):
         _propose(fewer, controller)
     with pytest.raises(ControllerUnfit, match=r"drives\.J1\.gain for more than one axis"):
-        propose(Request(demo_calibration(), NOW), controller, {**KEYS, "J2": "drives.J1.gain"}, cell="demo")
+        propose(FileTarget(controller, {**KEYS, "J2": "drives.J1.gain"}), Request(demo_calibration(), NOW))
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_two_names_of_one_number_are_refused(tmp_path: Path, name: str, content:
     file.write_text(content)
     two = replace(demo_calibration(), gains=demo_calibration().gains[:2])
     with pytest.raises(ControllerUnfit, match="which name the same number"):
-        propose(Request(two, NOW), file, dict(zip(("J1", "J2"), keys, strict=True)), cell="demo")
+        propose(FileTarget(file, dict(zip(("J1", "J2"), keys, strict=True))), Request(two, NOW))
 
 
 def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
@@ -197,11 +197,12 @@ def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
     link.symlink_to(controller)
     written = apply(_propose(demo_calibration(), link), NOW)
     assert written is not None
+    assert written.backup is not None
     assert link.is_symlink()
-    assert written.file == controller
+    assert written.edit.subject == str(controller)
     assert written.backup.parent == controller.parent
     assert b"-9.2100" in controller.read_bytes()
-    assert roll_back(link, NOW).file == controller
+    assert rollback(FileTarget(link), NOW).edit.subject == str(controller)
     assert b"-11.52" in controller.read_bytes()
 
 
@@ -298,7 +299,7 @@ def test_a_file_that_someone_makes_during_a_rollback_stays(controller: Path, mon
 
     monkeypatch.setattr(os, "fsync", meanwhile)
     with pytest.raises(ControllerChanged, match="meanwhile"):
-        roll_back(controller, NOW)
+        rollback(FileTarget(controller), NOW)
     assert controller.read_bytes() == b"by: hand\n"
 
 
@@ -308,13 +309,13 @@ def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
     assert first is not None
     calibrated = controller.read_bytes()
 
-    back = roll_back(controller, NOW + timedelta(minutes=1))
+    back = rollback(FileTarget(controller), NOW + timedelta(minutes=1))
     assert controller.read_bytes() == original
-    assert back.source == first.backup
+    assert back.edit.source == first.backup
     assert back.backup is not None
     assert back.backup.read_bytes() == calibrated
 
-    roll_back(controller, NOW + timedelta(minutes=2))
+    rollback(FileTarget(controller), NOW + timedelta(minutes=2))
     assert controller.read_bytes() == calibrated
     assert len(backups(controller)) == 3
 
@@ -322,7 +323,7 @@ def test_rollback_restores_and_a_second_one_undoes_it(controller: Path) -> None:
 def test_no_backup_is_ever_overwritten_even_by_a_clock_set_back(controller: Path) -> None:
     apply(_propose(demo_calibration(), controller), NOW)
     for step in (0, -3600, 0, -7200):
-        roll_back(controller, NOW + timedelta(seconds=step))
+        rollback(FileTarget(controller), NOW + timedelta(seconds=step))
     assert [(one.stamp, one.count) for one in backups(controller)] == [("20250102T030405Z", k) for k in range(5)]
     contents = [one.path.read_bytes() for one in backups(controller)]
     assert all(a != b for a, b in itertools.pairwise(contents))
@@ -337,23 +338,23 @@ def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str =
 
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="no backup beside it"):
-        roll_back(controller, NOW)
+        rollback(FileTarget(controller), NOW)
     # What a writer leaves that was killed before it replaced the file is no way back either.
     _make_backup(controller, controller.read_bytes(), b"never written")
     with pytest.raises(CalibrationRefused, match="same content"):
-        roll_back(controller, NOW)
+        rollback(FileTarget(controller), NOW)
     controller.with_name("demo.yaml.bak").write_text("a human's own")
     controller.unlink()
     controller.parent.joinpath("other.yaml").write_text("x: 1\n")
     with pytest.raises(CalibrationRefused, match="no backup beside it"):
-        roll_back(controller.with_name("other.yaml"), NOW)
+        rollback(FileTarget(controller.with_name("other.yaml")), NOW)
 
 
 def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> None:
     original = controller.read_bytes()
     apply(_propose(demo_calibration(), controller), NOW)
     _make_backup(controller, controller.read_bytes(), b"never written", "20250102T040405Z")
-    roll_back(controller, NOW + timedelta(hours=2))
+    rollback(FileTarget(controller), NOW + timedelta(hours=2))
     assert controller.read_bytes() == original
 
 
@@ -361,7 +362,7 @@ def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
     before = controller.read_bytes()
     _make_backup(controller, b"drives: [", before)
     with pytest.raises(ControllerUnfit, match="no YAML"):
-        roll_back(controller, NOW)
+        rollback(FileTarget(controller), NOW)
     assert controller.read_bytes() == before
 
 
@@ -369,15 +370,16 @@ def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
 def test_a_backup_that_was_gutted_is_not_restored(controller: Path, content: bytes) -> None:
     written = apply(_propose(demo_calibration(), controller), NOW)
     assert written is not None
+    assert written.backup is not None
     written.backup.write_bytes(content)
     calibrated = controller.read_bytes()
     for deleted in (False, True):
         if deleted:
             controller.unlink()
         with pytest.raises(ControllerUnfit, match="as its name says"):
-            roll_back(controller, NOW)
+            rollback(FileTarget(controller), NOW)
         assert controller.exists() is not deleted
-    assert written.after == calibrated
+    assert written.edit.after == calibrated
     assert list(controller.parent.iterdir()) == [written.backup]
 
 

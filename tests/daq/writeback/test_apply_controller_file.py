@@ -16,11 +16,12 @@ from ruamel.yaml import YAML
 
 from daq.errors import ControllerUnfit
 from daq.ledger.audit import AuditAction, read
-from daq.writeback.file_proposal import apply, propose
+from daq.writeback.file_target import FileTarget
 from daq.writeback.formats.document import decode
 from daq.writeback.formats.scalar import spell
 from daq.writeback.formats.yaml_document import YamlDocument
 from daq.writeback.request import Request
+from daq.writeback.target import apply, propose
 from ident.calibration import Calibration, Gain
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import demo_calibration, with_recordings
@@ -153,12 +154,13 @@ def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, dat
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
         now = datetime(2025, 1, 2, tzinfo=UTC)
-        proposal = propose(Request(calibration, now, content=b"a calibration"), file, keys, cell="demo")
+        proposal = propose(FileTarget(file, keys), Request(calibration, now, content=b"a calibration"))
         assert proposal.refusals == ()
         written = apply(proposal, now, audit=audit, who="Ada")
         assert file.read_bytes() == case.text(spelt).encode()
         if spelt != case.numbers:
             assert written is not None
+            assert written.backup is not None
             assert written.backup.read_bytes() == case.text(case.numbers).encode()
             assert [entry.action for entry in read(audit)] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
 

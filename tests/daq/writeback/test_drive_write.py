@@ -17,11 +17,11 @@ from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read, verify
-from daq.writeback.drive_proposal import DriveProposal, propose_to_drives
 from daq.writeback.drive_record import read_record, read_records, record_folder
-from daq.writeback.drive_target import DrivesWritten, apply_to_drives, plan_drive_rollback, roll_back_drives
-from daq.writeback.gates.table import Gate
+from daq.writeback.drive_target import DriveEdit, DriveTarget
+from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
+from daq.writeback.target import Proposal, Written, apply, propose, rollback
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.hub import Hub
 from drivers.canopen.network import CanopenNetwork
@@ -64,22 +64,34 @@ def listener(address: BusAddress) -> Iterator[Listener]:
 
 
 def _propose(
-    cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, looked_at: str | None = None
-) -> DriveProposal:
-    request = Request(calibration or demo_calibration(), NOW, configuration_changed=True, looked_at=looked_at)
-    return propose_to_drives(cell, request, network)
+    cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, base: str | None = None
+) -> Proposal[DriveEdit]:
+    request = Request(calibration or demo_calibration(), NOW, configuration_changed=True, base=base)
+    return propose(DriveTarget(cell, network), request)
+
+
+def _apply(proposal: Proposal[DriveEdit], target: DriveTarget, audit: Path | None = None) -> Written:
+    """Write a proposal, in a network that may be another than the one it was planned in."""
+    written = apply(replace(proposal, target=target), NOW, audit=audit, who="T")
+    assert written is not None
+    return written
 
 
 def _write(
     cell: Cell, address: BusAddress, saving: Saving = Saving.KNOWN, mapping: Mapping = Mapping.STORED
-) -> DrivesWritten:
+) -> Written:
     """Look, and then write, each in a network of its own, as two commands do."""
     with network_of(cell, address, mapping) as network:
         proposal = _propose(cell, network)
     assert proposal.refusals == ()
     assert cell.history is not None
     with network_of(cell, address, mapping) as network:
-        return apply_to_drives(proposal, network, NOW, saving=saving, audit=cell.history.audit, who="T")
+        return _apply(proposal, DriveTarget(cell, network, saving), cell.history.audit)
+
+
+def _backup(written: Written) -> Path:
+    assert written.backup is not None
+    return written.backup
 
 
 def _gains(simulation: SimulatedCell) -> list[float]:
@@ -95,8 +107,8 @@ def test_gains_are_written_read_back_and_saved(address: BusAddress, listener: Li
     with simulated(address) as simulation:
         before = [node.saved for node in simulation.nodes]
         written = _write(cell, address)
-        assert [change.parameter.value(change.new) / 1000.0 for change in written.changes] == NEW
-        assert all(change.saved for change in written.changes)
+        assert [change.parameter.value(change.new) / 1000.0 for change in written.parameters] == NEW
+        assert all(change.saved for change in written.parameters)
         assert _gains(simulation) == NEW
         # A drive that loses its power comes back with what it saved: the gain, and the mapping of before.
         for node in simulation.nodes:
@@ -127,10 +139,10 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
         proposal = _propose(cell, network)
     assert listener.downloads() == []
     assert list(tmp_path.iterdir()) == []
-    assert [change.old for change in proposal.changes] == IN_DRIVES
-    assert [change.new for change in proposal.changes] == NEW
-    assert proposal.changes[3].key == "node 4, 2003h:01"
-    assert not proposal.unchanged
+    assert [change.old for change in proposal.edit.changes] == IN_DRIVES
+    assert [change.new for change in proposal.edit.changes] == NEW
+    assert proposal.edit.changes[3].key == "node 4, 2003h:01"
+    assert proposal.edit.before != proposal.edit.after
 
 
 def test_a_real_object_and_another_sign_and_unit(address: BusAddress, tmp_path: Path) -> None:
@@ -140,17 +152,17 @@ def test_a_real_object_and_another_sign_and_unit(address: BusAddress, tmp_path: 
         written = _write(cell, address)
         assert entered_gain(simulation.nodes[3], REAL) == pytest.approx(4.605, rel=1e-6)
         assert entered_gain(simulation.nodes[0], REAL) == pytest.approx(33.9, rel=1e-6)
-    assert written.changes[0].parameter.kind is ParameterKind.F32
+    assert written.parameters[0].parameter.kind is ParameterKind.F32
 
 
 def test_written_to_ram_alone_is_gone_with_the_power(address: BusAddress, tmp_path: Path) -> None:
     with simulated(address) as simulation:
         written = _write(demo_cell(tmp_path), address, Saving.RAM, Mapping.UNKNOWN)
-        assert not any(change.saved for change in written.changes)
+        assert not any(change.saved for change in written.parameters)
         assert _gains(simulation) == NEW
         assert _saved(simulation) == IN_DRIVES
         # What stands in RAM is no reason not to save it the next time.
-        assert all(change.saved for change in _write(demo_cell(tmp_path), address).changes)
+        assert all(change.saved for change in _write(demo_cell(tmp_path), address).parameters)
         assert _saved(simulation) == NEW
 
 
@@ -169,7 +181,7 @@ def test_an_axis_with_power_is_refused_and_nothing_is_written(
             network_of(cell, address) as network,
             pytest.raises(PowerNotOff, match=rf"node {axis + 1}: OPERATION ENABLED"),
         ):
-            apply_to_drives(proposal, network, NOW)
+            _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
         assert _gains(simulation) == IN_DRIVES
     assert read_records(record_folder(cell)) == ()
@@ -245,7 +257,7 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
         simulation.nodes[2].nmt = NmtState.OPERATIONAL
         monkeypatch.undo()
         with network_of(cell, address) as network:
-            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+            rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -282,7 +294,7 @@ def test_whichever_transfer_fails_the_old_values_stay_everywhere(
             with network_of(cell, address) as network:
                 network.bounds = replace(network.bounds, listen_s=0.0)
                 try:
-                    apply_to_drives(proposal, network, NOW)
+                    _apply(proposal, DriveTarget(cell, network))
                 except DriverError:
                     failed += 1
                 else:
@@ -360,12 +372,12 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
             node.lose_guard()  # the mapping alone must be enough
         listener.frames()
         with network_of(cell, address) as network, pytest.raises(SaveRefused, match="TPDO1: COB-ID 00000181h"):
-            apply_to_drives(proposal, network, NOW)
+            _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
         assert _saved(simulation) == IN_DRIVES
         # Categories of their own do not keep the mapping, and RAM keeps nothing.
         with network_of(cell, address, Mapping.SEPARATE) as network:
-            assert apply_to_drives(proposal, network, NOW).changes[0].saved
+            assert _apply(proposal, DriveTarget(cell, network)).parameters[0].saved
         assert _gains(simulation) == NEW
 
 
@@ -380,7 +392,7 @@ def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
         consumer = ObjectEntry(0x1016, 1, 32, signed=False)
         network.link.objects(2).write(consumer, recorder_id << 16 | 500)
         with pytest.raises(SaveRefused, match=rf"node 2: .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"):
-            apply_to_drives(proposal, network, NOW)
+            _apply(proposal, DriveTarget(cell, network))
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -390,7 +402,7 @@ def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(address: B
         with pytest.raises(SaveRefused, match=r"node 1: .*--ram-only.*--save-unknown"):
             _write(cell, address, mapping=Mapping.UNKNOWN)
         assert _gains(simulation) == IN_DRIVES
-        assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).changes)
+        assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters)
         assert _saved(simulation) == NEW
 
 
@@ -399,7 +411,7 @@ def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path
     with simulated(address) as simulation, network_of(cell, address) as network:
         network.axes = tuple(replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes)
         with pytest.raises(SaveRefused, match="is not described in its profile"):
-            apply_to_drives(_propose(cell, network), network, NOW, saving=Saving.ANY)
+            _apply(_propose(cell, network), DriveTarget(cell, network, Saving.ANY))
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -408,14 +420,14 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
     calibration = demo_calibration()
     far = replace(calibration, gains=(replace(calibration.gains[0], value=60.0), *calibration.gains[1:]))
     with simulated(address), network_of(cell, address) as network:
-        proposal = _propose(cell, network, far, looked_at="0" * 64)
+        proposal = _propose(cell, network, far, base="0" * 64)
         assert [refusal.gate for refusal in proposal.refusals] == [Gate.BASE, Gate.CHANGE, Gate.NAMEPLATE]
-        reviewed = _propose(cell, network, looked_at=_propose(cell, network).base_sha256)
+        reviewed = _propose(cell, network, base=_propose(cell, network).edit.base_sha256)
         assert reviewed.refusals == ()
-        with pytest.raises(CalibrationRefused, match="3 closed gates"):
-            apply_to_drives(proposal, network, NOW, audit=tmp_path / "audit", who="T")
+        with pytest.raises(CalibrationRefused, match="3 failed checks"):
+            _apply(proposal, DriveTarget(cell, network), tmp_path / "audit")
         strange = replace(calibration, gains=(*calibration.gains[:5], replace(calibration.gains[5], axis="J9")))
-        with pytest.raises(CalibrationRefused, match="one of each axis of the cell"):
+        with pytest.raises(CalibrationRefused, match="one for each axis of the cell"):
             _propose(cell, network, strange)
         nowhere = replace(cell, controller=None)
         with pytest.raises(ConfigurationInconsistent, match="no objects in the drives"):
@@ -425,11 +437,14 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
 
 
 @pytest.mark.parametrize(
-    ("told", "says"),
+    ("gain_object", "says"),
     [
-        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1.0), "33.7 ± 0.14, which the number 34 does not tell"),
+        (
+            GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1.0),
+            "± 0.14, which the number 34 does not represent",
+        ),
         (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e9), "does not fit i32"),
-        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e-3), "the number 0 does not tell"),
+        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e-3), "the number 0 does not represent"),
         (GainObject(Parameter(0x2003, 1, ParameterKind.U32), -1.0), "does not fit u32"),
     ],
 )
@@ -449,8 +464,8 @@ def test_a_drive_that_someone_changed_since_the_dry_run_is_refused(address: BusA
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
-        with pytest.raises(ControllerChanged, match="look at a new dry run"):
-            apply_to_drives(proposal, network, NOW)
+        with pytest.raises(ControllerChanged, match="take a new dry run"):
+            _apply(proposal, DriveTarget(cell, network))
         assert _gains(simulation)[4] == 18.0
     assert read_records(record_folder(cell)) == ()
 
@@ -460,16 +475,15 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
     assert cell.history is not None
     with simulated(address) as simulation:
         written = _write(cell, address)
-        record = read_record(written.record)
+        record = read_record(_backup(written))
         assert [(note.axis, note.serial, note.old, note.new) for note in record.drives][:2] == [
             ("J1", 1001, 32960, 33900),
             ("J2", 1002, 32960, 32400),
         ]
         for minutes, expected, saved in ((1, IN_DRIVES, IN_DRIVES), (2, NEW, NEW), (2, IN_DRIVES, IN_DRIVES)):
             with network_of(cell, address) as network:
-                roll_back_drives(
-                    plan_drive_rollback(cell, network),
-                    network,
+                rollback(
+                    DriveTarget(cell, network),
                     NOW + timedelta(minutes=minutes),
                     audit=cell.history.audit,
                     who="T",
@@ -494,21 +508,21 @@ def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddr
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         with pytest.raises(CalibrationRefused, match="no record"):
-            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+            rollback(DriveTarget(cell, network), NOW)
         written = _write(cell, address)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
         with pytest.raises(ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"):
-            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+            rollback(DriveTarget(cell, network), NOW)
         network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
-        body = json.loads(written.record.read_text())
+        body = json.loads(_backup(written).read_text())
         body["drives"][0]["old"] = 99999
-        written.record.write_text(json.dumps(body))
+        _backup(written).write_text(json.dumps(body))
         with pytest.raises(ControllerUnfit, match="as it says"):
-            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+            rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == NEW
-        written.record.write_text("{}")
+        _backup(written).write_text("{}")
         with pytest.raises(ControllerUnfit, match="the record of a write to drives"):
-            roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+            rollback(DriveTarget(cell, network), NOW)
 
 
 def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAddress, tmp_path: Path) -> None:
@@ -528,13 +542,13 @@ def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAd
             (Gate.BASE, "J5, 2003h:01", "18000")
         ]
         assert "16300" in changed.refusals[0].expected
-        assert _propose(cell, network, looked_at=changed.base_sha256).refusals == ()
-        assert [one.gate for one in _propose(cell, network, looked_at=first.base_sha256).refusals] == [Gate.BASE]
+        assert _propose(cell, network, base=changed.edit.base_sha256).refusals == ()
+        assert [one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals] == [Gate.BASE]
         network.link.objects(5).write(entry, 16300)
-        written.record.write_text("{}")
+        _backup(written).write_text("{}")
         unread = _propose(cell, network)
-        assert [(one.gate, one.subject) for one in unread.refusals] == [(Gate.BASE, str(written.record))]
-        assert _propose(cell, network, looked_at=unread.base_sha256).refusals == ()
+        assert [(one.gate, one.subject) for one in unread.refusals] == [(Gate.BASE, str(_backup(written)))]
+        assert _propose(cell, network, base=unread.edit.base_sha256).refusals == ()
 
 
 def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path) -> None:
@@ -544,7 +558,7 @@ def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path
     new = replace(cell, axes=(replace(cell.axes[0], identity=None), *cell.axes[1:]))
     with simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 0), entered=IDENTIFIED) as simulation:
         with network_of(new, address) as network, pytest.raises(ControllerChanged, match="serial number 1002"):
-            roll_back_drives(plan_drive_rollback(new, network), network, NOW)
+            rollback(DriveTarget(new, network), NOW)
         assert _gains(simulation) == NEW
 
 
@@ -568,10 +582,10 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Pa
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:
             if writes:
-                roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+                rollback(DriveTarget(cell, network), NOW)
             else:
-                with pytest.raises(CalibrationRefused, match="1 records of what stands there now"):
-                    roll_back_drives(plan_drive_rollback(cell, network), network, NOW)
+                with pytest.raises(CalibrationRefused, match="1 records of the present values"):
+                    rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 

@@ -20,11 +20,13 @@ from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read
 from daq.workflow.calibration_file import encode
-from daq.writeback.file_proposal import Proposal, apply, propose, propose_for, refused
+from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates import fit as fit_gates
-from daq.writeback.gates.table import Gate
+from daq.writeback.gates.gate import Gate
+from daq.writeback.gates.table import GATES
 from daq.writeback.request import Request
 from daq.writeback.signature import generate, sign
+from daq.writeback.target import Proposal, apply, propose
 from ident.calibration import Calibration, Gain, Source
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import AXES, KEYS, RECORDED, demo_calibration, demo_recording, recorded, with_recordings
@@ -44,12 +46,12 @@ class Scene:
     policy: ApplyPolicy
     now: datetime
     entered_kg: dict[str, float]
-    looked_at: str | None
+    base: str | None
     appliers: tuple[str, ...]
     file: Path | None
     signed: tuple[str, ...]
 
-    def propose(self) -> Proposal:
+    def propose(self) -> Proposal[FileEdit]:
         """Sign, and work out the change."""
         content = encode(self.calibration)
         if self.file is not None:
@@ -61,12 +63,12 @@ class Scene:
             self.now,
             policy=self.policy,
             entered_kg=self.entered_kg,
-            looked_at=self.looked_at,
+            base=self.base,
             appliers=self.appliers,
             file=self.file,
             content=content,
         )
-        return propose_for(self.cell, request, self.controller)
+        return propose(FileTarget.of(self.cell, self.controller), request)
 
 
 @pytest.fixture
@@ -86,7 +88,7 @@ def scene(tmp_path: Path) -> Scene:
         policy=ApplyPolicy(signatures=1, signers=keys),
         now=NOW,
         entered_kg={},
-        looked_at=None,
+        base=None,
         appliers=("Ada", "root"),
         file=tmp_path / "calibration.yaml",
         signed=("Bob",),
@@ -184,7 +186,7 @@ def _edited(scene: Scene) -> Scene:
 
 
 def _edited_before_the_dry_run(scene: Scene) -> Scene:
-    return replace(_edited(scene), looked_at="0" * 64)
+    return replace(_edited(scene), base="0" * 64)
 
 
 def _forged(scene: Scene) -> Scene:
@@ -371,11 +373,11 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Ada",), appliers=("ADA ", "root"))),
     (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Ada",), appliers=("\uff21da", "root"))),
     (Gate.SIGNATURE, "calibration.yaml", _scene(signed=("Bob",), appliers=("Ada", " bob"))),
-    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ad\u0430", "root"))),
-    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ada\u200b", "root"))),
-    (Gate.SIGNATURE, "whoever", _scene(appliers=("Ada\x1b[2K", "root"))),
-    (Gate.SIGNATURE, "whoever", _scene(appliers=("", "root"))),
-    (Gate.SIGNATURE, "whoever", _scene(appliers=("Carl", "root"))),
+    (Gate.SIGNATURE, "operator", _scene(appliers=("Ad\u0430", "root"))),
+    (Gate.SIGNATURE, "operator", _scene(appliers=("Ada\u200b", "root"))),
+    (Gate.SIGNATURE, "operator", _scene(appliers=("Ada\x1b[2K", "root"))),
+    (Gate.SIGNATURE, "operator", _scene(appliers=("", "root"))),
+    (Gate.SIGNATURE, "operator", _scene(appliers=("Carl", "root"))),
     (Gate.SIGNATURE, "calibration", _scene(file=None)),
     (Gate.SIGNATURE, "calibration.yaml.Bob.minisig", _forged),
 )
@@ -414,6 +416,11 @@ def test_each_gate_closes_alone(
 
 def test_every_gate_has_such_a_test() -> None:
     assert {gate for gate, _, _ in CLOSED} == set(Gate)
+
+
+def test_the_table_lists_every_gate_once_with_its_description() -> None:
+    assert sorted(row.gate.name for row in GATES) == sorted(gate.name for gate in Gate)
+    assert all(row.closed_when and row.remedy and row.checks for row in GATES)
 
 
 @pytest.mark.parametrize(
@@ -464,7 +471,7 @@ def test_a_reviewed_change_of_a_changed_file_may_go_on(scene: Scene) -> None:
     digest = sha256(scene.controller.read_bytes())
     # In full: this dry run, with a gate closed, ends without the line that a write would need.
     assert (refusal.gate, refusal.remedy.endswith(f"--base {digest}")) == (Gate.BASE, True)
-    assert replace(scene, looked_at=sha256(scene.controller.read_bytes())).propose().refusals == ()
+    assert replace(scene, base=sha256(scene.controller.read_bytes())).propose().refusals == ()
 
 
 def test_the_policy_moves_the_bounds(scene: Scene) -> None:
@@ -525,7 +532,7 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
 def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
     cell = _payload(mass_kg=5.0)(scene).cell
     request = Request(scene.calibration, NOW, policy=ApplyPolicy(), configuration_changed=True)
-    proposal = propose_for(cell, request, scene.controller)
+    proposal = propose(FileTarget.of(cell, scene.controller), request)
     assert {(one.gate, one.found) for one in proposal.refusals} == {(Gate.MASS, "fitted with 4.59 kg")}
 
 
@@ -560,13 +567,13 @@ def test_two_signatures_of_others_are_two(scene: Scene) -> None:
 
 def test_all_failed_checks_are_reported_at_once(scene: Scene) -> None:
     other = replace(scene, policy=ApplyPolicy(max_change_percent=5.0))
-    error = refused(_calibration(cell="other")(other).propose())
+    error = _calibration(cell="other")(other).propose().error
     assert [axis in str(error) for axis in ("cell 'other'", "J3:", "J4:", "J5:", "J6:", "J1:")] == [True] * 5 + [False]
 
 
 def test_a_zero_in_the_file_has_no_sign_to_keep(scene: Scene) -> None:
     scene.controller.write_text(scene.controller.read_text().replace("7.68", "0.0"))
-    reviewed = replace(scene, looked_at=sha256(scene.controller.read_bytes()))
+    reviewed = replace(scene, base=sha256(scene.controller.read_bytes()))
     assert [(one.gate, one.subject) for one in reviewed.propose().refusals] == [(Gate.SIGN, "J6")]
 
 
@@ -578,7 +585,7 @@ def test_an_effect_on_all_axes_is_called_so(scene: Scene) -> None:
 
 def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(scene: Scene) -> None:
     old = replace(scene.calibration, sources=(Source("old", "a" * 64, "fit"),))
-    assert propose(Request(old, NOW), scene.controller, KEYS, cell="demo").refusals == ()
+    assert propose(FileTarget(scene.controller, KEYS), Request(old, NOW)).refusals == ()
     assert {one.gate for one in replace(scene, calibration=old).propose().refusals} == {Gate.SOURCES, Gate.HOLDOUT}
 
 

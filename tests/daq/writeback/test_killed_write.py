@@ -16,10 +16,10 @@ import pytest
 
 from daq.ledger.audit import AuditAction, AuditVerdict, Content, verify
 from daq.writeback.file_access import backups
-from daq.writeback.file_proposal import apply, propose
-from daq.writeback.file_target import roll_back
+from daq.writeback.file_target import FileTarget
 from daq.writeback.formats.document import decode
 from daq.writeback.request import Request
+from daq.writeback.target import apply, propose, rollback
 from ident.calibration import Calibration
 from ident.estimators.estimate import RelativeError
 from tests.daq import killing
@@ -61,18 +61,18 @@ class Place:
 
     def apply(self, gain: float, minutes: int = 0) -> None:
         """Write a gain."""
-        proposal = propose(Request(_calibration(gain), NOW), self.file, KEYS, cell="demo")
+        proposal = propose(FileTarget(self.file, KEYS), Request(_calibration(gain), NOW))
         assert proposal.refusals == ()
         apply(proposal, NOW + timedelta(minutes=minutes), audit=self.audit, who="Ada")
 
     def to_apply(self) -> Callable[[], object]:
         """The write itself, everything before it done: another gain goes in."""
-        proposal = propose(Request(_calibration(33.9), NOW), self.file, KEYS, cell="demo")
+        proposal = propose(FileTarget(self.file, KEYS), Request(_calibration(33.9), NOW))
         return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
 
     def to_roll_back(self) -> Callable[[], object]:
         """The way back from a write before."""
-        return lambda: roll_back(self.file, NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
+        return lambda: rollback(FileTarget(self.file), NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
 
     def content(self) -> bytes | None:
         """Of the file; None where it is gone."""
@@ -207,7 +207,7 @@ def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -
     was = place.content()
     reported = [one.content for one in verify(place.audit).open_writes]
     if was is None:
-        assert roll_back(place.file, NOW + timedelta(minutes=2), audit=place.audit).after == after
+        assert rollback(FileTarget(place.file), NOW + timedelta(minutes=2), audit=place.audit).edit.after == after
         assert [one.content for one in verify(place.audit).open_writes] == reported
         return
     place.apply(31.5, minutes=2)
@@ -215,5 +215,5 @@ def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -
     verdict = verify(place.audit)
     assert verdict.holds
     assert [one.content for one in verdict.open_writes] == reported
-    assert roll_back(place.file, NOW + timedelta(minutes=3), audit=place.audit).after == was
+    assert rollback(FileTarget(place.file), NOW + timedelta(minutes=3), audit=place.audit).edit.after == was
     assert place.file.read_bytes() in {before, after}

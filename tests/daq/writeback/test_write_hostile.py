@@ -14,9 +14,9 @@ import pytest
 from daq.errors import CalibrationMissing, ControllerUnfit
 from daq.ledger.audit import AuditAction, Content, append, read, verify
 from daq.workflow import calibration_file
-from daq.writeback.file_proposal import apply, propose
-from daq.writeback.file_target import roll_back
+from daq.writeback.file_target import FileTarget
 from daq.writeback.request import Request
+from daq.writeback.target import apply, propose, rollback
 from tests.daq.calibrations import KEYS, demo_calibration
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -60,7 +60,7 @@ def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
     path = tmp_path / "x.yaml"
     made(path)
     with pytest.raises(ControllerUnfit):
-        propose(Request(demo_calibration(), NOW), path, KEYS, cell="demo")
+        propose(FileTarget(path, KEYS), Request(demo_calibration(), NOW))
     with pytest.raises(CalibrationMissing):
         calibration_file.load(path)
 
@@ -69,7 +69,7 @@ def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(tmp_path / "gone" / "demo.yaml")
     with pytest.raises(ControllerUnfit, match=r"a symbolic link to .*gone/demo\.yaml, which is not there"):
-        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
 
 
 def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
@@ -77,9 +77,9 @@ def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
     one.symlink_to(other)
     other.symlink_to(one)
     with pytest.raises(ControllerUnfit, match="round in a circle"):
-        propose(Request(demo_calibration(), NOW), one, KEYS, cell="demo")
+        propose(FileTarget(one, KEYS), Request(demo_calibration(), NOW))
     with pytest.raises(ControllerUnfit, match="round in a circle"):
-        roll_back(one, NOW)
+        rollback(FileTarget(one), NOW)
     with pytest.raises(CalibrationMissing):
         calibration_file.load(one)
 
@@ -89,11 +89,11 @@ def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controlle
     link.symlink_to(controller)
     controller.parent.chmod(0o777)
     with pytest.raises(ControllerUnfit, match="everybody may write"):
-        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
     # Whoever names the file itself has chosen it.
-    assert propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo").refusals == ()
+    assert propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)).refusals == ()
     controller.parent.chmod(0o755)
-    assert propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo").refusals == ()
+    assert propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)).refusals == ()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
@@ -102,10 +102,11 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
     link.symlink_to(controller)
     os.lchown(link, 4711, 4711)
     with pytest.raises(ControllerUnfit, match="user 4711 has made"):
-        propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo")
+        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
     os.chown(controller, 4711, 4711)
-    written = apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW)
+    written = apply(propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)), NOW)
     assert written is not None
+    assert written.backup is not None
     assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
 
 
@@ -115,18 +116,18 @@ def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, 
     other.hardlink_to(controller)
     for name in (controller, other):
         with pytest.raises(ControllerUnfit, match=r"2 names \(hard links\)") as caught:
-            propose(Request(demo_calibration(), NOW), name, KEYS, cell="demo")
+            propose(FileTarget(name, KEYS), Request(demo_calibration(), NOW))
     remedy = str(caught.value).rpartition("of its own: ")[2]
     assert subprocess.run(remedy, shell=True, check=False).returncode == 0
     assert controller.stat().st_nlink == 1
     assert other.read_bytes() == controller.read_bytes()
-    assert propose(Request(demo_calibration(), NOW), other, KEYS, cell="demo").refusals == ()
-    assert apply(propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo"), NOW) is not None
+    assert propose(FileTarget(other, KEYS), Request(demo_calibration(), NOW)).refusals == ()
+    assert apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW) is not None
 
 
 def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path, tmp_path: Path) -> None:
     """The lock's name is no way to another file either."""
-    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
     victim = tmp_path / "victim"
     (controller.parent / ".demo.yaml.lock").symlink_to(victim)
     with pytest.raises(OSError, match="symbolic link"):
@@ -138,9 +139,9 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(controller: 
     audit, link = tmp_path / "audit.jsonl", tmp_path / "link.yaml"
     link.symlink_to(controller)
     before = controller.read_bytes()
-    apply(propose(Request(demo_calibration(), NOW), link, KEYS, cell="demo"), NOW, audit=audit, who="Ada")
+    apply(propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit, who="Ada")
     controller.unlink()
-    assert roll_back(link, NOW, audit=audit, who="Bob").file == controller
+    assert rollback(FileTarget(link), NOW, audit=audit, who="Bob").edit.subject == str(controller)
     assert controller.read_bytes() == before
     entries = read(audit)
     assert [entry.action for entry in entries][2:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
@@ -152,7 +153,7 @@ def test_what_fails_within_a_write_is_recorded_as_failed(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     audit, before = tmp_path / "audit.jsonl", controller.read_bytes()
-    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
@@ -179,7 +180,7 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
         return append(path, action, **rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr("daq.ledger.audit.append", full_at_the_end)
-    proposal = propose(Request(demo_calibration(), NOW), controller, KEYS, cell="demo")
+    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
     assert apply(proposal, NOW, audit=audit, who="Ada") is not None
     assert "the audit could not be told that it is applied" in caplog.text
     (left,) = verify(audit).open_writes

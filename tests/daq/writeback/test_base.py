@@ -1,10 +1,11 @@
-"""What --base says: the change that somebody has looked at, of a file or of the drives, and no other."""
+"""--base approves the reviewed change of a file or of the drives, and no other."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -13,19 +14,26 @@ from hypothesis import strategies as st
 
 from daq.config.cell import Cell
 from daq.errors import CalibrationRefused, UsageError
-from daq.writeback.request import ReviewedChange, change_digest, changed_since_review, parse_base
+from daq.writeback.gates.gate import GateContext
+from daq.writeback.gates.target import base as base_gate
+from daq.writeback.request import Edit, Finding, Request, ReviewedChange, change_digest, parse_base
 from drivers.canopen.bus import BusAddress
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
 from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simulated
 
 
+def _findings(base: str | None, before: bytes, after: bytes) -> list[Finding]:
+    request = Request(demo_calibration(), datetime(2025, 1, 2, tzinfo=UTC), base=base)
+    return list(base_gate(GateContext(request, Edit(subject="x", before=before, after=after))))
+
+
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
 def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
     reviewed = parse_base(f" {change_digest(before, after).upper()}\n", before)
     assert reviewed.base_sha256 == hashlib.sha256(before).hexdigest()
-    assert changed_since_review(reviewed, "x", before, after) == ()
-    assert bool(changed_since_review(reviewed, "x", before, another)) == (another != after)
+    assert _findings(change_digest(before, after), before, after) == []
+    assert bool(_findings(change_digest(before, after), before, another)) == (another not in (before, after))
     assert (parse_base(change_digest(another, after), before).base_sha256 == reviewed.base_sha256) == (
         another == before
     )
@@ -35,7 +43,7 @@ def test_the_whole_digest_alone_names_no_change() -> None:
     digest = hashlib.sha256(b"old").hexdigest()
     reviewed = parse_base(digest, b"old")
     assert reviewed == ReviewedChange(digest, None)
-    assert changed_since_review(reviewed, "x", b"old", b"whatever") == ()
+    assert _findings(digest, b"old", b"any") == []
     assert parse_base(None, b"old") == ReviewedChange(None, None)
 
 

@@ -1,0 +1,103 @@
+"""Gate, refusal and the context that every gate reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from daq.config.cell import Cell
+from daq.config.policy import ApplyPolicy
+from daq.errors import CalibrationRefused
+from daq.writeback.request import Edit, Request
+from ident.calibration import Calibration
+
+
+class Gate(Enum):
+    """Why a calibration is refused; the rows of `daq.writeback.gates.table`."""
+
+    NOT_FINITE = "not finite"
+    NOT_IDENTIFIED = "not identified"
+    SIGN = "sign"
+    CHANGE = "change"
+    NAMEPLATE = "nameplate"
+    UNIT = "unit"
+    UNCERTAINTY = "uncertainty"
+    CELL = "cell"
+    CONFIGURATION = "configuration"
+    ERROR = "error"
+    HOLDOUT = "hold-out error"
+    HOLDOUT_STILL = "axis at rest in the hold-out"
+    EFFECT = "effect"
+    SOURCES = "sources"
+    PARTIAL = "partial"
+    LOSSY = "lossy"
+    STALE = "stale"
+    SERIAL = "serial number"
+    SATURATED = "saturated"
+    MASS = "payload mass"
+    BASE = "base file"
+    SIGNATURE = "signature"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """One closed gate: found, expected, and what to do."""
+
+    gate: Gate
+    subject: str
+    found: str
+    expected: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.subject}: found {self.found}; expected {self.expected}; {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class GateContext:
+    """All that the gates compare.
+
+    Attributes:
+        request: calibration, policy, time, and what the operator states.
+        edit: planned change of the target.
+        cell: as it is now; None for a library without one, where nothing is compared with it.
+    """
+
+    request: Request
+    edit: Edit
+    cell: Cell | None = None
+
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration to be written."""
+        return self.request.calibration
+
+    @property
+    def policy(self) -> ApplyPolicy:
+        """Bounds of the request, else those of the cell."""
+        return self.request.policy or (ApplyPolicy() if self.cell is None else self.cell.apply)
+
+    @property
+    def axis_names(self) -> list[str]:
+        """Axes of the calibration, in its order."""
+        return [gain.axis for gain in self.calibration.gains]
+
+
+def refusal_error(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
+    """Make the error for at least one closed gate; several are listed one a line.
+
+    Args:
+        target: what was not written.
+        refusals: the closed gates.
+    """
+    if len(refusals) == 1:
+        only = refusals[0]
+        return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
+    listed = "".join(f"\n  {refusal}" for refusal in refusals)
+    return CalibrationRefused(
+        target,
+        found=f"{len(refusals)} failed checks{listed}\n ",
+        expected="none",
+        remedy="nothing was written",
+    )
