@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import Finding
 from ident.calibration import Calibration
