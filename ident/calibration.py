@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ident.data.run import Recording
+from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError
+from ident.estimators.identify import Identification
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,3 +150,56 @@ class Calibration:
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeError | None = None
     recording_configuration_sha256: str | None = None
+
+
+def calibration_of(
+    found: Identification,
+    axes: Sequence[str],
+    nameplate: Sequence[float] | NDArray[np.float64],
+    *,
+    units: Sequence[str] = (),
+    robot: str = "robot",
+) -> Calibration:
+    """Calibration that an identification amounts to, without effects and without the logs that it came from.
+
+    Args:
+        found: by `ident.identify`.
+        axes: name of each axis.
+        nameplate: the manufacturer's gains, one an axis.
+        units: of each gain; Nm/A where it is left out.
+        robot: name of the robot or cell.
+
+    Raises:
+        ModelError: there is not one name, nameplate gain and unit for each axis.
+    """
+    estimate = found.estimate
+    units = units or ("Nm/A",) * len(axes)
+    if not len(axes) == len(nameplate) == len(units) == len(estimate.gains):
+        raise ModelError(
+            f"{len(axes)} axis names, {len(nameplate)} nameplate gains and {len(units)} units for "
+            f"{len(estimate.gains)} identified gains; expected one of each for each axis"
+        )
+    return Calibration(
+        cell=robot,
+        method=estimate.method.value,
+        gains=tuple(
+            Gain(axis, float(value), float(std), unit, float(entered))
+            for axis, value, std, unit, entered in zip(
+                axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True
+            )
+        ),
+        parameters=tuple(
+            Parameter(column.name, float(value), float(std), column.unit)
+            for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+        ),
+        effects=(),
+        relative_error_percent=found.training_error,
+        holdout_error_percent=found.holdout_error,
+        condition=estimate.condition,
+        rows=estimate.rows,
+        filter=found.conditioning.document(),
+        sources=(),
+        configuration_sha256="",
+        created="",
+        software="",
+    )

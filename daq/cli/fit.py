@@ -318,7 +318,7 @@ def compared(fitted: Fit) -> dict[str, Any]:
 
 def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
     """Gains, errors and what they rest on, for a person."""
-    estimate = fitted.final.estimate
+    estimate = fitted.estimate
     console.print(gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}"))
     if (note := partial_note(calibration)) is not None:
         console.print(note, style="bold", markup=False)
@@ -330,7 +330,7 @@ def show(fitted: Fit, calibration: Calibration, console: Console) -> None:
         console.print(f"For comparison, the paper's total least squares on the same rows: {values}")
     console.print()
     console.print(error_table(fitted, calibration))
-    filter_ = fitted.final.conditioning
+    filter_ = fitted.identification.conditioning
     console.print(
         f"{estimate.rows} rows, {len(fitted.final.columns)} base parameters and effects, condition "
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "

@@ -221,7 +221,7 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
 
 def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
     """What no residual of these data could show, in words."""
-    if fitted.final.estimate.gains_fixed:
+    if fitted.estimate.gains_fixed:
         return ()
     mounted = {payload.mounting for payload in fitted.identification.system.payloads}
     known = [payload for payload in fitted.cell.payloads if payload.payload.mounting in mounted]
@@ -250,7 +250,7 @@ def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
     """By what each gain is seen and what would help, where one is known worse than to a per cent."""
-    if fitted.final.estimate.gains_fixed:
+    if fitted.estimate.gains_fixed:
         return ()
     error = fitted.final.training_error.total
     if error > DOUBTFUL_PERCENT:

@@ -53,7 +53,7 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     return (
         *found,
         f"All axes together: the error {where} {error_change_text(before.total, after.total)}{_of_all(account)}.",
-        *(() if fitted.final.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
+        *(() if fitted.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
         _silence(fitted),
         *_skew_sentence(fitted),
     )

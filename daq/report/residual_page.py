@@ -234,7 +234,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
 
 def _gains(fitted: Fit, account: Account) -> str:
     axes, changes = fitted.cell.axis_names, account.total.gains
-    if fitted.final.estimate.gains_fixed:
+    if fitted.estimate.gains_fixed:
         return section("Drive gains", paragraph("The gains were held at their nameplate values."))
     rows = [
         (
@@ -293,7 +293,7 @@ def _finding_name(finding: Finding, axes: tuple[str, ...]) -> str:
 
 
 def _limits(fitted: Fit) -> tuple[str, ...]:
-    held = fitted.final.estimate.gains_fixed
+    held = fitted.estimate.gains_fixed
     return (
         *identifiability_notes(fitted),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "

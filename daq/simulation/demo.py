@@ -33,7 +33,6 @@ from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration
-from ident.discovery.loop import Evidence
 from ident.estimators.identify import Identification
 
 MARK = ".drivegain-demo"
@@ -292,11 +291,11 @@ def _write_back(
     return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
 
 
-def _total(identification: Identification | Evidence) -> float | None:
+def _total(identification: Identification) -> float | None:
     error = identification.holdout_error
     return None if error is None else error.total
 
 
-def _axes(identification: Identification | Evidence) -> list[float] | None:
+def _axes(identification: Identification) -> list[float] | None:
     error = identification.holdout_error
     return None if error is None else list(error.axes)

@@ -19,14 +19,14 @@ from daq.log.reader import LossyLogs
 from daq.report.effect_names import placed_name
 from daq.workflow.experiment import LAG_ONE, experiment_of
 from daq.workflow.plan import extra_moves
-from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
+from ident.calibration import AcceptedEffect, Calibration, Parameter, Source
+from ident.calibration import calibration_of as identified_calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.loop import Evidence, Step, find_effects, gather
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.signals import session_began_s
-from ident.equations.system import System
 from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
 from ident.estimators.estimate import Estimate, Method, RelativeError, of_squares
@@ -61,9 +61,14 @@ class Fit:
     lossy: LossyLogs = LossyLogs.REFUSED
 
     @property
-    def final(self) -> Identification | Evidence:
-        """With all accepted effects."""
-        return self.steps[-1].after if self.steps else self.identification
+    def estimate(self) -> Estimate:
+        """Estimate with all accepted effects."""
+        return self.steps[-1].after.estimate if self.steps else self.identification.estimate
+
+    @property
+    def final(self) -> Identification:
+        """Identification with all accepted effects; their rows are reduced anew at each call."""
+        return self.steps[-1].after.identification if self.steps else self.identification
 
     def evidence(self) -> Evidence:
         """The rows behind the identification, without effects; the logs are read again."""
@@ -187,7 +192,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     Raises:
         UsageError: its gains were held fixed.
     """
-    if fitted.final.estimate.gains_fixed:
+    if fitted.estimate.gains_fixed:
         raise UsageError(
             "--compare",
             found="--gains fixed",
@@ -282,34 +287,24 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         fitted: with or without effects.
         created: when, with its time zone.
     """
-    final = fitted.final
-    estimate = final.estimate
-    gains = tuple(
-        Gain(axis.name, float(value), float(std), axis.gain_unit, axis.nameplate_gain)
-        for axis, value, std in zip(fitted.cell.axes, estimate.gains, estimate.gains_std, strict=True)
+    cell = fitted.cell
+    found = identified_calibration(
+        fitted.final,
+        cell.axis_names,
+        [axis.nameplate_gain for axis in cell.axes],
+        units=[axis.gain_unit for axis in cell.axes],
+        robot=cell.name,
     )
-    parameters = tuple(
-        Parameter(column.name, float(value), float(std), column.unit)
-        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
-    )
-    return Calibration(
-        cell=fitted.cell.name,
-        method=estimate.method.value,
-        gains=gains,
-        parameters=parameters,
-        effects=_effects(fitted, parameters),
-        relative_error_percent=final.training_error,
-        holdout_error_percent=final.holdout_error,
-        condition=estimate.condition,
-        rows=estimate.rows,
-        filter=final.conditioning.document(),
+    return replace(
+        found,
+        effects=_effects(fitted, found.parameters),
         sources=fitted.sources,
-        configuration_sha256=fitted.cell.digest,
+        configuration_sha256=cell.digest,
         created=created.isoformat(timespec="seconds"),
         software=software(),
-        session_began_s=session_began_s(final.trained) if isinstance(final, Evidence) else None,
+        session_began_s=session_began_s(fitted.steps[-1].after.trained) if fitted.steps else None,
         nameplate_holdout_error_percent=_nameplate_error(fitted),
-        recording_configuration_sha256=fitted.cell.recording_digest,
+        recording_configuration_sha256=cell.recording_digest,
     )
 
 
@@ -321,13 +316,13 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     gain alone makes no total smaller.
     """
     final = fitted.final
-    training, unseen = _systems(final)
+    unseen = final.holdout
     if unseen is None or final.estimate.gains_fixed:
         return None
     nameplate = np.array([axis.nameplate_gain for axis in fitted.cell.axes])
     method = Method.ML if final.estimate.method is Method.TLS else final.estimate.method  # tls corrects gains
     try:
-        held = estimate_with(method, training, nameplate)
+        held = estimate_with(method, final.system, nameplate)
     except (IdentificationError, np.linalg.LinAlgError):
         return None
     axes = held.relative_error(unseen).axes
@@ -338,13 +333,6 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     return RelativeError(axes, of_squares(size, left).total)
 
 
-def _systems(model: Identification | Evidence) -> tuple[System, System | None]:
-    """The equations of the fit, and those that it has not seen; of evidence, with the columns of its effects."""
-    if isinstance(model, Identification):
-        return model.system, model.holdout
-    return model.training.system(), None if model.holdout is None else model.holdout.system()
-
-
 def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
     kept = fitted.steps[-1].after.effects if fitted.steps else ()
     return tuple(_accepted(fitted, placed, parameters) for placed in kept)
@@ -353,7 +341,7 @@ def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEf
 def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
     before, step, finding = _joined(fitted, placed)
     names = {column.name for column in placed.columns}
-    error_before, error_after = _holdout_error(before, placed), _holdout_error(step.after, placed)
+    error_before, error_after = (_holdout_error(error, placed) for error in (before, step.after.holdout_error))
     if error_before is None or error_after is None:
         # Without a run that was held out, the moves that were left out in turn must do.
         error_before, error_after = finding.error_before_percent, finding.error_after_percent
@@ -373,19 +361,21 @@ def axis_of(placed: PlacedEffect, cell: Cell) -> str:
     return ALL_AXES if placed.effect.side is Side.ALL_MOTORS else cell.axes[placed.axis].name
 
 
-def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[Identification | Evidence, Step, Finding]:
-    """The last turn that added an effect, with the model before it: an idle one may have gone and come back."""
-    models: list[Identification | Evidence] = [fitted.identification, *(step.after for step in fitted.steps)]
-    for before, step in zip(reversed(models[:-1]), reversed(fitted.steps), strict=True):
-        had = before.effects if isinstance(before, Evidence) else ()
+def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[RelativeError | None, Step, Finding]:
+    """Return the last turn that added an effect, with the hold-out error before it.
+
+    An idle effect may have gone and come back.
+    """
+    for number, step in reversed(list(enumerate(fitted.steps))):
+        before = fitted.steps[number - 1].after if number else None
+        had = before.effects if before else ()
         if step.accepted is not None and placed in step.after.effects and placed not in had:
-            return before, step, step.accepted
+            return (before or fitted.identification).holdout_error, step, step.accepted
     raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
 
 
-def _holdout_error(model: Identification | Evidence, placed: PlacedEffect) -> float | None:
+def _holdout_error(error: RelativeError | None, placed: PlacedEffect) -> float | None:
     """On the runs held out [%]: of the axis, or in total for what acts on all motors; None where they say nothing."""
-    error: RelativeError | None = model.holdout_error
     if error is None:
         return None
     figure = error.total if placed.effect.side is Side.ALL_MOTORS else error.axes[placed.axis]
@@ -422,13 +412,13 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     )
     design = Design(expectation, system.base)
     judged = verdicts(design, list(_excitations(fitted)), _extras(fitted))
-    true = 100.0 * fitted.final.estimate.gains_std / np.abs(fitted.final.estimate.gains)
+    true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
     return tuple(_scaled(gain, float(std)) for gain, std in zip(judged, true, strict=True))
 
 
 def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """The verdicts, or none where the gains were given or all are known so well that nobody needs to ask by what."""
-    estimate = fitted.final.estimate
+    estimate = fitted.estimate
     good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
     return () if good else gain_verdicts(fitted)
 

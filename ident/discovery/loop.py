@@ -34,7 +34,7 @@ from ident.equations.observation import Observation, observe
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
-from ident.model.model import Column, Model
+from ident.model.model import Model
 
 FloatArray = NDArray[np.float64]
 
@@ -75,9 +75,10 @@ class Evidence:
         return self.datasets[: len(self.datasets) - self.held_out]
 
     @property
-    def columns(self) -> tuple[Column, ...]:
-        """Columns of W: base parameters, then effects."""
-        return self.training.columns
+    def identification(self) -> Identification:
+        """The estimate with its equations reduced, effects among them."""
+        holdout = None if self.holdout is None else self.holdout.system()
+        return Identification(self.model, self.conditioning, self.training.system(), holdout, self.estimate)
 
     @property
     def training_error(self) -> RelativeError:

@@ -5,7 +5,7 @@ the same cell, plan and software. Scoring code calls `record_study` for the same
 
     for logs in study_logs(SEEDS, ("3.5",)):
         fitted = fit(logs.fit, holdout=logs.validation)
-        error = fitted.final.estimate.gains / logs.truth.gains_nm_per_a - 1
+        error = fitted.estimate.gains / logs.truth.gains_nm_per_a - 1
 
 Layout: out/ident-study/<floor>/<seed>/<run>.mcap with truth.json beside, out/ident-study/plans/<seed>-<plan>.yaml.
 """

@@ -130,7 +130,7 @@ def test_a_wrong_drawing_spoils_what_relies_on_it(reduced: ReducedLogs) -> None:
 def test_one_reading_gives_what_fit_gives(reduced: ReducedLogs) -> None:
     other = fit(reduced.logs, holdout=reduced.holdout)
     found = fit_case(reduced, Method.ML, Known.MASS).fitted
-    assert found.final.estimate.gains == pytest.approx(other.final.estimate.gains, rel=1e-9)
+    assert found.estimate.gains == pytest.approx(other.estimate.gains, rel=1e-9)
     assert found.sources == other.sources
     one, two = found.identification.holdout_error, other.identification.holdout_error
     assert one is not None

@@ -189,7 +189,7 @@ def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
 def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -> None:
     """The nameplate is compared in the same model: with its own gains a calibration is no better than it is."""
     nameplate = np.array([axis.nameplate_gain for axis in with_effect.cell.axes])
-    gains = with_effect.final.estimate.gains
+    gains = with_effect.estimate.gains
     same = _with_gains(with_effect, tuple(nameplate / gains))
     held, compared = same.holdout_error_percent, same.nameplate_holdout_error_percent
     assert held is not None
