@@ -90,7 +90,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower))).T
+    postures = np.random.default_rng(0).uniform(lower, upper, (POSTURES, len(lower)))
     apart = Checker(robot, everything).apart(postures) > ALWAYS
     pairs = tuple(pair for pair, kept in zip(candidates, apart, strict=True) if kept)
     together = tuple(

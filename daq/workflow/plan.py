@@ -155,7 +155,7 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     margin = POSITION_MARGIN * (upper - lower)
     low, high = lower + margin, upper - margin
     sampled = np.random.default_rng(0).uniform(low, high, (POSTURES, len(low)))
-    postures = sampled[experiment.scene.checker.margins(sampled.T) > 0.0]
+    postures = sampled[experiment.scene.checker.margins(sampled) > 0.0]
     names = experiment.cell.axis_names
     found = []
     for axis, name in enumerate(names):

@@ -233,7 +233,7 @@ class Search:
     def _clear_start(self) -> PlannedMove:
         for _ in range(MAX_TRIES):
             move = self._random_move()
-            if self._experiment.scene.checker.margins(np.array(move.target_rad)[:, None])[0] > 0.0:
+            if self._experiment.scene.checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
                 return move
         raise self._blocked("posture")
 

@@ -1,9 +1,12 @@
-"""Whether an arm keeps clear of itself, of obstacles and of the walls of its workspace, along a whole move.
+"""Clearance of an arm from itself, from obstacles and from the walls of its workspace, along a whole move.
 
-Links are capsules. A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point
-of a capsule on link b moves relative to link a by more than Σ_k |Δq_k| ℓ_k over the whole of it, with k the joints
-between the two and ℓ_k the longest lever from joint k to the capsule. A stretch of half-width h about s is clear when
-the distance at s is at least h times that; else it is halved. So nothing is jumped over, whatever the speed.
+Links are capsules: a capsule is a segment with a radius, so the distance of two capsules, or of a capsule and a box, is
+that of their segments less the radii. These distances have closed forms (`segment_to_segment`, `segment_to_box`).
+
+A synchronised point-to-point move is a straight line in joint space, q(s) = q₀ + s Δq, so no point of a capsule on link
+b moves relative to link a by more than Σ_k |Δq_k| ℓ_k over the whole of it, with k the joints between the two and ℓ_k
+the longest lever from joint k to the capsule. A stretch of half-width h about s is clear when the distance at s is at
+least h times that; else it is halved. So nothing is jumped over, whatever the speed.
 """
 
 from __future__ import annotations
@@ -18,24 +21,224 @@ from ident.model.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
-# A capsule is a segment with a radius: the distance of two capsules, or of a capsule and a box, is one of the two
-# below less the radii.
+BASE = -1
+"""Index of the link that does not move."""
+RESOLUTION_M = 0.004
+"""A stretch in which nothing moves farther than this, and which is still not known to be clear, counts as blocked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capsule:
+    """All points within a radius of a segment.
+
+    Attributes:
+        name: for messages.
+        link: index of the joint that it moves with, BASE for the base.
+        start_m, end_m: ends of the segment in that joint's frame (3 numbers each).
+        radius_m: above zero.
+    """
+
+    name: str
+    link: int
+    start_m: tuple[float, float, float]
+    end_m: tuple[float, float, float]
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Axis-aligned box in the base frame.
+
+    Attributes:
+        name: for messages.
+        lower_m, upper_m: opposite corners.
+    """
+
+    name: str
+    lower_m: tuple[float, float, float]
+    upper_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Bodies that must keep apart.
+
+    Attributes:
+        capsules: of the arm and its payload.
+        pairs: indices of capsules that must keep apart.
+        boxes: obstacles; capsules of the base may touch them.
+        workspace: box that the confined capsules must not leave, None for no bounds.
+        confined: indices of capsules.
+        minimum_m: distance that must be kept.
+    """
+
+    capsules: tuple[Capsule, ...]
+    pairs: tuple[tuple[int, int], ...]
+    boxes: tuple[Box, ...]
+    workspace: Box | None
+    confined: tuple[int, ...]
+    minimum_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Obstruction:
+    """Reason why a path is not clear.
+
+    Attributes:
+        first, second: names of the two bodies.
+        distance_m: found there; negative when they overlap.
+        position: of the joints there [rad or m].
+    """
+
+    first: str
+    second: str
+    distance_m: float
+    position: tuple[float, ...]
+
+
+class Checker:
+    """Distances of the pairs of bodies in a scene, for many postures of the arm."""
+
+    def __init__(self, robot: Robot, scene: Scene) -> None:
+        self.robot = robot
+        self.scene = scene
+        capsules, boxes = scene.capsules, scene.boxes
+        moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
+        # Bodies are the capsules in their order, then the boxes; the ends of a box are opposite corners.
+        behind = range(len(capsules), len(capsules) + len(boxes))
+        self._pairs = [*scene.pairs, *((index, box) for index in moving for box in behind)]
+        self._confined = scene.confined if scene.workspace is not None else ()
+        self._names = [body.name for bodies in (capsules, boxes) for body in bodies]
+        self._frame = np.array([capsule.link + 1 for capsule in capsules] + [0] * len(boxes), dtype=np.int64)
+        ends = [(c.start_m, c.end_m) for c in capsules] + [(box.lower_m, box.upper_m) for box in boxes]
+        self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
+        self._radius = np.array([capsule.radius_m for capsule in capsules] + [0.0] * len(boxes))
+        self._sphere = self._radius + 0.5 * np.linalg.norm(self._ends[:, :, 1] - self._ends[:, :, 0], axis=1)
+        self._first, self._second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
+
+    def margins(self, position: FloatArray) -> FloatArray:
+        """Compute the smallest distance beyond the minimum in each posture [m], negative where it is not kept.
+
+        Args:
+            position: of the joints [rad or m], shape (k, n).
+
+        Returns:
+            shape (k,); inf where there is nothing to keep away from.
+        """
+        return np.asarray(self._margins(position, self._everywhere).min(axis=0, initial=np.inf))
+
+    def apart(self, position: FloatArray) -> FloatArray:
+        """Share of postures, shape (k, n), in which each of the scene's pairs does not touch, shape (pairs,)."""
+        margins = self._margins(position, self._everywhere)[: len(self.scene.pairs)]
+        return np.asarray((margins + self.scene.minimum_m > 0.0).mean(axis=1))
+
+    def obstruction(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
+        """Find an obstruction on a straight line in joint space, None when all of it is clear.
+
+        Args:
+            start, end: positions of the joints [rad or m], shape (n,).
+        """
+        travel = self._travel(start, end)
+        middles, half = np.array([0.5]), 0.5
+        while len(middles):
+            position = start + (end - start) * middles[:, None]
+            needed = half * travel
+            margins = self._margins(position, needed)
+            unsure = margins < needed[:, None]
+            blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
+            if blocked.any():
+                row, sample = np.argwhere(blocked)[0]
+                return self._obstruction_at(int(row), float(margins[row, sample]), position[sample])
+            half /= 2.0
+            open_ = middles[unsure.any(axis=0)]
+            middles = np.concatenate((open_ - half, open_ + half))
+        return None
+
+    @property
+    def _everywhere(self) -> FloatArray:
+        return np.full(len(self._pairs) + len(self._confined), np.inf)
+
+    def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
+        """Margin of each pair, then of each confined capsule, shape (pairs + confined, k).
+
+        Where spheres around both bodies are farther apart than needed, it is the margin of the spheres.
+        """
+        at = poses(self.robot, position)
+        placed = at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None]
+        start, end = placed[..., 0], placed[..., 1]
+        out = np.empty((len(needed), len(position)))
+        pairs, first, second = len(self._pairs), self._first, self._second
+        middle = 0.5 * (start + end)
+        between = _length(middle[first] - middle[second])
+        out[:pairs] = between - (self._sphere[first] + self._sphere[second] + self.scene.minimum_m)[:, None]
+        row, sample = np.nonzero(out[:pairs] < needed[:pairs, None])
+        to_box = second[row] >= len(self.scene.capsules)
+        for distance, chosen in ((segment_to_segment, ~to_box), (segment_to_box, to_box)):
+            if chosen.any():
+                number, k = row[chosen], sample[chosen]
+                one, other = first[number], second[number]
+                kept = self._radius[one] + self._radius[other] + self.scene.minimum_m
+                out[number, k] = distance(start[one, k], end[one, k], start[other, k], end[other, k]) - kept
+        if self.scene.workspace is not None:
+            lower, upper = np.array(self.scene.workspace.lower_m), np.array(self.scene.workspace.upper_m)
+            for last, index in enumerate(self._confined, start=pairs):
+                inside = [np.minimum(ends[index] - lower, upper - ends[index]).min(axis=1) for ends in (start, end)]
+                out[last] = np.minimum(*inside) - self._radius[index]
+        return out
+
+    def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
+        """Bound on the path of any point of one body relative to the other, for each row of `_margins` [m]."""
+        pairs = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
+        return np.array([self._relative_travel(first, second, start, end) for first, second in pairs])
+
+    def _relative_travel(self, first: int, second: int, start: FloatArray, end: FloatArray) -> float:
+        capsules = self.scene.capsules
+        links = [capsules[index].link if index < len(capsules) else BASE for index in (first, second)]
+        chains = [self._chain(link) for link in links]
+        total = 0.0
+        for index, chain, other in ((first, chains[0], chains[1]), (second, chains[1], chains[0])):
+            if index >= len(capsules):
+                continue
+            lever = max(float(np.linalg.norm(point)) for point in (capsules[index].start_m, capsules[index].end_m))
+            for joint in chain:  # from the capsule towards the base
+                if joint in other:
+                    break
+                declared = self.robot.joints[joint]
+                distance = abs(float(end[joint] - start[joint]))
+                prismatic = declared.kind is JointKind.PRISMATIC
+                total += distance * (1.0 if prismatic else lever)
+                lever += float(np.linalg.norm(declared.translation_m))
+                lever += max(abs(float(start[joint])), abs(float(end[joint]))) if prismatic else 0.0
+        return total
+
+    def _chain(self, link: int) -> list[int]:
+        """Joints from a link to the base."""
+        chain = []
+        while link != BASE:
+            chain.append(link)
+            link = self.robot.joints[link].parent
+        return chain
+
+    def _obstruction_at(self, row: int, margin_m: float, position: FloatArray) -> Obstruction:
+        where = tuple(position.tolist())
+        if row < len(self._pairs):
+            first, second = (self._names[index] for index in self._pairs[row])
+            return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
+        confined = self.scene.capsules[self._confined[row - len(self._pairs)]]
+        return Obstruction(confined.name, "the end of the workspace", margin_m, where)
 
 
 def segment_to_segment(
     start: FloatArray, end: FloatArray, other_start: FloatArray, other_end: FloatArray
 ) -> FloatArray:
-    """Distance of two segments in each sample [m].
+    """Compute the distance of two segments in each sample [m], shape (k,).
 
-    The squared distance of points s and t along the segments is a convex quadratic. Its minimum over s, cut off at the
-    ends, gives the best t, and t, cut off, the best s (Ericson, Real-Time Collision Detection, 5.1.9). For parallel
-    segments any s will do to begin with.
+    The squared distance of points s and t along the segments is a convex quadratic. Its minimum over s, clipped to
+    the segment, gives the best t, and t, clipped, the best s (Ericson, Real-Time Collision Detection, 5.1.9). For
+    parallel segments the first s may be any.
 
     Args:
         start, end, other_start, other_end: ends of the segments [m], shape (k, 3).
-
-    Returns:
-        shape (k,).
     """
     along, other, between = end - start, other_end - other_start, start - other_start
     a, b, e = _dot(along, along), _dot(along, other), _dot(other, other)
@@ -46,17 +249,15 @@ def segment_to_segment(
 
 
 def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Distance of a segment from an axis-aligned box in each sample [m], negative where they overlap.
+    """Compute the distance of a segment from an axis-aligned box in each sample [m], shape (k,).
 
-    Half the derivative of the squared distance along the segment, d · excess(t), is piecewise linear and never falls.
-    It bends where the segment crosses the plane of a face; between two bends its zero follows from a straight line.
+    Where the two overlap it is minus the shortest displacement that separates them. Half the derivative of the squared
+    distance along the segment, d · excess(t), is piecewise linear and never falls. It bends where the segment crosses
+    the plane of a face; between two bends its zero follows from a straight line.
 
     Args:
         start, end: ends of the segment [m], shape (k, 3).
         lower, upper: opposite corners of the box [m], shape (k, 3).
-
-    Returns:
-        shape (k,); where the two overlap, minus the shortest way that separates them.
     """
     along = end - start
     crossings = [_share(plane - start, along) for plane in (lower, upper)]
@@ -75,7 +276,7 @@ def segment_to_box(start: FloatArray, end: FloatArray, lower: FloatArray, upper:
 
 
 def _depth(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Shortest way that takes a segment out of a box that it enters, shape (k,); not positive where they are apart.
+    """Shortest displacement of a segment out of a box that it enters, shape (k,); not positive where they are apart.
 
     It is along a normal of a face of their Minkowski difference: an edge of the box, or the cross product of one with
     the segment.
@@ -86,13 +287,13 @@ def _depth(start: FloatArray, end: FloatArray, lower: FloatArray, upper: FloatAr
     normals = np.concatenate((edges, crosses / np.where(length > 0.0, length, 1.0)[:, :, None]), axis=1)
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     ends = np.einsum("knd,ekd->ekn", normals, np.stack((start - middle, end - middle)))
-    ways = np.einsum("knd,kd->kn", np.abs(normals), half) + np.minimum(ends.max(axis=0), -ends.min(axis=0))
-    ways[:, 3:][length == 0.0] = np.inf
-    return np.asarray(ways.min(axis=1))
+    depths = np.einsum("knd,kd->kn", np.abs(normals), half) + np.minimum(ends.max(axis=0), -ends.min(axis=0))
+    depths[:, 3:][length == 0.0] = np.inf
+    return np.asarray(depths.min(axis=1))
 
 
 def _share(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """The quotient, cut off at 0 and 1; 0 where the denominator is zero."""
+    """Quotient clipped to 0 … 1; 0 where the denominator is zero."""
     quotient = np.zeros_like(numerator)
     with np.errstate(over="ignore"):
         np.divide(numerator, denominator, out=quotient, where=denominator != 0.0)
@@ -105,204 +306,3 @@ def _dot(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _length(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(_dot(vectors, vectors)))
-
-
-BASE = -1
-"""Index of the link that does not move."""
-RESOLUTION_M = 0.004
-"""A stretch in which nothing moves farther than this, and which is still not known to be clear, counts as blocked."""
-
-
-@dataclass(frozen=True, slots=True)
-class Capsule:
-    """All points within a radius of a segment.
-
-    Attributes:
-        name: for messages.
-        link: index of the joint that it moves with, BASE for the base.
-        start_m, end_m: of the segment, in that joint's frame (3 numbers each).
-        radius_m: above zero.
-    """
-
-    name: str
-    link: int
-    start_m: tuple[float, float, float]
-    end_m: tuple[float, float, float]
-    radius_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Box:
-    """Axis-aligned in the base frame.
-
-    Attributes:
-        name: for messages.
-        lower_m, upper_m: opposite corners.
-    """
-
-    name: str
-    lower_m: tuple[float, float, float]
-    upper_m: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What must keep apart.
-
-    Attributes:
-        capsules: of the arm and of what it carries.
-        pairs: indices of capsules that must keep apart.
-        boxes: obstacles; capsules of the base may touch them.
-        workspace: in which the confined capsules must stay, None for no bounds.
-        confined: indices of capsules.
-        minimum_m: distance that must be kept.
-    """
-
-    capsules: tuple[Capsule, ...]
-    pairs: tuple[tuple[int, int], ...]
-    boxes: tuple[Box, ...]
-    workspace: Box | None
-    confined: tuple[int, ...]
-    minimum_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Obstruction:
-    """Why a way is not clear.
-
-    Attributes:
-        first, second: what comes too near to what.
-        distance_m: found there; negative when they overlap.
-        position: of the joints there [rad or m].
-    """
-
-    first: str
-    second: str
-    distance_m: float
-    position: tuple[float, ...]
-
-
-class Checker:
-    """A scene made ready for many questions: each asks for the distance of two things."""
-
-    def __init__(self, robot: Robot, scene: Scene) -> None:
-        self.robot = robot
-        self.scene = scene
-        capsules, boxes = scene.capsules, scene.boxes
-        moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
-        # Capsules are numbered as in the scene, boxes behind them; a box is given by opposite corners on the base.
-        behind = range(len(capsules), len(capsules) + len(boxes))
-        self._questions = [*scene.pairs, *((index, box) for index in moving for box in behind)]
-        self._confined = scene.confined if scene.workspace is not None else ()
-        self._names = [thing.name for things in (capsules, boxes) for thing in things]
-        self._frame = np.array([capsule.link + 1 for capsule in capsules] + [0] * len(boxes), dtype=np.int64)
-        ends = [(c.start_m, c.end_m) for c in capsules] + [(box.lower_m, box.upper_m) for box in boxes]
-        self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
-        self._radius = np.array([capsule.radius_m for capsule in capsules] + [0.0] * len(boxes))
-        self._sphere = self._radius + 0.5 * np.linalg.norm(self._ends[:, :, 1] - self._ends[:, :, 0], axis=1)
-        self._first, self._second = np.array(self._questions, dtype=np.int64).reshape(-1, 2).T
-
-    def margins(self, position: FloatArray) -> FloatArray:
-        """Distance beyond the minimum of the nearest two things; negative where it is not kept [m].
-
-        Args:
-            position: of the joints [rad or m], shape (n, k).
-
-        Returns:
-            shape (k,); inf where there is nothing to be near to.
-        """
-        far = np.full(len(self._questions) + len(self._confined), np.inf)
-        return np.asarray(self._margins(position, far).min(axis=0, initial=np.inf))
-
-    def apart(self, position: FloatArray) -> FloatArray:
-        """Share of the samples in which each of the scene's pairs does not touch, shape (pairs,)."""
-        far = np.full(len(self._questions) + len(self._confined), np.inf)
-        margins = self._margins(position, far)[: len(self.scene.pairs)]
-        return np.asarray((margins + self.scene.minimum_m > 0.0).mean(axis=1))
-
-    def obstruction(self, start: FloatArray, end: FloatArray) -> Obstruction | None:
-        """One that lies on a straight line in joint space, None when all of it is clear.
-
-        Args:
-            start, end: positions of the joints [rad or m], shape (n,).
-        """
-        travel = self._travel(start, end)
-        middles, half = np.array([0.5]), 0.5
-        while len(middles):
-            position = start[:, None] + (end - start)[:, None] * middles
-            needed = half * travel
-            margins = self._margins(position, needed)
-            unsure = margins < needed[:, None]
-            blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
-            if blocked.any():
-                question, sample = np.argwhere(blocked)[0]
-                return self._obstruction_at(int(question), float(margins[question, sample]), position[:, sample])
-            half /= 2.0
-            open_ = middles[unsure.any(axis=0)]
-            middles = np.concatenate((open_ - half, open_ + half))
-        return None
-
-    def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
-        """Of each question, shape (questions, k); where spheres around both are farther apart than needed, theirs."""
-        at = poses(self.robot, position.T)
-        placed = at.rotation[self._frame] @ self._ends[:, None] + at.origin_m[self._frame][..., None]
-        start, end = placed[..., 0], placed[..., 1]
-        out = np.empty((len(needed), position.shape[1]))
-        asked, first, second = len(self._questions), self._first, self._second
-        middle = 0.5 * (start + end)
-        between = _length(middle[first] - middle[second])
-        out[:asked] = between - (self._sphere[first] + self._sphere[second] + self.scene.minimum_m)[:, None]
-        row, sample = np.nonzero(out[:asked] < needed[:asked, None])
-        to_box = second[row] >= len(self.scene.capsules)
-        for distance, those in ((segment_to_segment, ~to_box), (segment_to_box, to_box)):
-            if those.any():
-                number, k = row[those], sample[those]
-                one, other = first[number], second[number]
-                kept = self._radius[one] + self._radius[other] + self.scene.minimum_m
-                out[number, k] = distance(start[one, k], end[one, k], start[other, k], end[other, k]) - kept
-        if self.scene.workspace is not None:
-            lower, upper = np.array(self.scene.workspace.lower_m), np.array(self.scene.workspace.upper_m)
-            for question, index in enumerate(self._confined, start=asked):
-                inside = [np.minimum(ends[index] - lower, upper - ends[index]).min(axis=1) for ends in (start, end)]
-                out[question] = np.minimum(*inside) - self._radius[index]
-        return out
-
-    def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """Bound on the way of any point of one thing as the other sees it, for each question [m]."""
-        pairs = [*self._questions, *((index, len(self.scene.capsules)) for index in self._confined)]
-        return np.array([self._relative_travel(first, second, start, end) for first, second in pairs])
-
-    def _relative_travel(self, first: int, second: int, start: FloatArray, end: FloatArray) -> float:
-        capsules = self.scene.capsules
-        links = [capsules[index].link if index < len(capsules) else BASE for index in (first, second)]
-        chains = [self._chain(link) for link in links]
-        total = 0.0
-        for index, chain, other in ((first, chains[0], chains[1]), (second, chains[1], chains[0])):
-            if index >= len(capsules):
-                continue
-            lever = max(float(np.linalg.norm(point)) for point in (capsules[index].start_m, capsules[index].end_m))
-            for joint in chain:  # from the capsule towards the base
-                if joint in other:
-                    break
-                declared = self.robot.joints[joint]
-                way = abs(float(end[joint] - start[joint]))
-                prismatic = declared.kind is JointKind.PRISMATIC
-                total += way * (1.0 if prismatic else lever)
-                lever += float(np.linalg.norm(declared.translation_m))
-                lever += max(abs(float(start[joint])), abs(float(end[joint]))) if prismatic else 0.0
-        return total
-
-    def _chain(self, link: int) -> list[int]:
-        chain = []
-        while link != BASE:
-            chain.append(link)
-            link = self.robot.joints[link].parent
-        return chain
-
-    def _obstruction_at(self, question: int, margin_m: float, position: FloatArray) -> Obstruction:
-        where = tuple(float(value) for value in position)
-        if question < len(self._questions):
-            first, second = (self._names[index] for index in self._questions[question])
-            return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
-        confined = self.scene.capsules[self._confined[question - len(self._questions)]]
-        return Obstruction(confined.name, "the end of the workspace", margin_m, where)

@@ -1,4 +1,4 @@
-"""What an experiment that has not been made yet would tell of the drive gains (paper §2.3; optimal design).
+"""Predicted information of an experiment about the drive gains (paper §2.3; optimal design).
 
 With T from the drive train the fit's model is v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i, e_i of standard
 deviation σ_i, γ_i = 1/g_i (see ident/estimators/maximum_likelihood.py). Its rows, differentiated by the unknowns and
@@ -6,8 +6,9 @@ divided by σ_i, are
 
     ∂/∂χ = γ_i (T W)_i / σ_i,      ∂/∂χ_uL = γ_i (T W_uL)_i / σ_i,      ∂/∂ ln g_i = −γ_i (T τ)_i / σ_i,
 
-with τ the whole torque that is expected. The information about all unknowns is the sum of JᵀJ over the rows, and the
-covariance of ln g the inverse of its Schur complement: what is left of the gains' columns beside all others.
+with τ the whole expected torque. The information about all unknowns is the sum of JᵀJ over the rows, and the covariance
+of ln g the inverse of its Schur complement: the part of the gains' columns that is independent of all others. The
+expectation before a fit is a nominal robot, made from the URDF: good enough to choose moves, never to fit.
 """
 
 from __future__ import annotations
@@ -32,15 +33,26 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 UNSEEN = 1e-9
-"""Share of a column that counts as nothing when the others are taken from it."""
+"""Share of a column that counts as nothing when the others are projected out of it."""
+LINK_MASS_KG = 5.0
+"""Mass of each link where the URDF has no inertias, as a slender rod to the next joint."""
+ROD_RADIUS_M = 0.05
+STEEL_KG_M3 = 7850.0
+DRY_FRICTION = 0.05
+VISCOUS_FRICTION = 0.10
+ROTOR = 0.03
+"""Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit;
+typical of geared arms (paper, Table 3)."""
+TORQUE_RESERVE = 3.0
+"""Torque limit over the largest rigid-body torque, where the URDF gives none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedPayload:
-    """A mounting as it is expected to be.
+    """Expected payload on one mounting.
 
     Attributes:
-        known: names of LINK_PARAMETERS that are known of it; the others are unknowns of the fit.
+        known: names of its known LINK_PARAMETERS; the others are unknowns of the fit.
         parameters: all ten, guessed or estimated where they are not known, shape (10,).
     """
 
@@ -49,22 +61,22 @@ class ExpectedPayload:
 
     @property
     def unknown(self) -> tuple[int, ...]:
-        """Indices into LINK_PARAMETERS."""
+        """Indices of unknown parameters in LINK_PARAMETERS."""
         return tuple(index for index, name in enumerate(LINK_PARAMETERS) if name not in self.known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expectation:
-    """What is believed of a robot: nominal before a fit, estimated after it.
+    """Expected robot: nominal before a fit, estimated after it.
 
     Attributes:
         model: the declared model.
         gains: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,).
-        parameters: of the model's standard columns, shape (c,); an estimate of base parameters goes to the places of
-            its leading columns, with zeros elsewhere.
+        parameters: of the model's standard columns, shape (c,); an estimate of base parameters is placed at its leading
+            columns, with zeros elsewhere.
         payloads: the mountings.
-        noise_a: standard deviation of one row of each motor in the unit of its current reference, correlation
-            included (``effective_noise``), shape (n,).
+        noise_a: standard deviation of one row of each motor in the unit of its current reference, with correlation
+            (``effective_noise``), shape (n,).
     """
 
     model: Model
@@ -76,7 +88,7 @@ class Expectation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excitation:
-    """Rows that a motion gives, whatever is mounted.
+    """Rows of a motion, for any payload.
 
     Attributes:
         motion: of the n joints at the centres of k rows.
@@ -88,27 +100,27 @@ class Excitation:
 
 
 def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
-    """The rows of a recorded run: its motion where they are centred, and which of them the fit uses."""
+    """Return the rows of a recorded run: its motion at their centres, and which of them the fit uses."""
     centres = row_filter(data, conditioning).centres(len(data.time_s))
     motion = Motion(data.position_rad[centres], data.velocity_rad_s[centres], data.acceleration_rad_s2[centres])
     return Excitation(motion, row_masks(drive_train, data, conditioning)[1])
 
 
 def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
-    """Standard deviation of independent rows that say as much as these, whose residual is correlated.
+    """Standard deviation of independent rows with as much information as these correlated ones.
 
-    Slow signals suffer most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance that independent
-    rows would give it (first-order autoregression). Faster motion suffers less, so this is on the safe side.
+    Slow signals lose most: their mean over a stretch has (1 + ρ)/(1 − ρ) times the variance of independent rows
+    (first-order autoregression). Faster motion loses less, so this is on the safe side.
 
     Args:
-        noise_a: of one row.
+        noise_a: standard deviation of one row.
         lag_one: correlation ρ of a row's residual with the next, from 0 up to below 1.
     """
     return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
 
 
 def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> FloatArray:
-    """Standard columns over a piece of motion, rows of a joint divided by its noise, shape (n k, c).
+    """Standard columns over a motion, rows of a joint divided by its noise, shape (n k, c).
 
     Args:
         model: the declared model.
@@ -116,13 +128,13 @@ def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> Floa
         noise_nm: standard deviation expected at each joint [Nm], shape (n,).
     """
     columns = model.regressor(motion) / noise_nm[:, None, None]
-    # A joint at rest says nothing that can be used: its dry friction is undetermined (see the standstill mask).
+    # The dry friction of a joint at rest is undetermined (see the standstill mask).
     columns *= (motion.velocity_rad_s.T != 0.0)[:, None, :]
     return np.asarray(columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
 
 
 def visible(model: Model, motion: Motion) -> BaseParameters:
-    """Base parameters that a motion shows."""
+    """Return the base parameters that are identifiable from a motion."""
     columns = weighted_columns(model, motion, np.ones(model.robot.joint_count))
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))
     return base_parameters(triangle, tuple(column.name for column in model.columns))
@@ -132,10 +144,10 @@ def visible(model: Model, motion: Motion) -> BaseParameters:
 class Design:
     """The unknowns of an experiment, and the information that excitations give about them.
 
-    The order of the unknowns is base parameters, unknown parameters of each mounting, ln of the gains.
+    The unknowns are, in this order, base parameters, unknown parameters of each mounting, ln of the gains.
 
     Attributes:
-        expectation: of the robot.
+        expectation: the expected robot.
         base: its base parameters.
     """
 
@@ -153,36 +165,30 @@ class Design:
         return self.others + len(self.expectation.gains)
 
     def whitened(self, excitation: Excitation) -> FloatArray:
-        """γ_i (T W)_i / σ_i of the base columns and the ten of a payload, zero where a row does not count.
-
-        Returns:
-            shape (n, b + 10, k).
-        """
-        return self.whitened_from(excitation, self.expectation.model.regressor(excitation.motion))
-
-    def whitened_from(self, excitation: Excitation, regressor: FloatArray) -> FloatArray:
-        """The same from a regressor that is there already, shape (n, c, k)."""
+        """γ_i (T W)_i / σ_i of base columns and the ten of a payload, shape (n, b + 10, k); masked rows are zero."""
         expected = self.expectation
         flange = np.arange(expected.model.flange.start, expected.model.flange.stop)
-        columns = regressor[:, np.concatenate((self.base.independent, flange)).astype(np.intp)]
+        columns = expected.model.regressor(excitation.motion)[
+            :, np.concatenate((self.base.independent, flange)).astype(np.intp)
+        ]
         motors = np.tensordot(expected.model.drive_train.to_motor, columns, axes=1)
         motors *= excitation.use[:, None, :] / (expected.gains * expected.noise_a)[:, None, None]
         return np.asarray(motors)
 
     def information(self, excitation: Excitation, payloads: Sequence[int | None]) -> FloatArray:
-        """Of one motion that is made several times, once with each of these payloads, shape (p, p)."""
+        """Information of one motion, repeated once with each of these payloads, shape (p, p)."""
         return self.information_of(self.whitened(excitation), payloads)
 
     def information_of(
         self, whitened: FloatArray, payloads: Sequence[int | None], blind: int | None = None
     ) -> FloatArray:
-        """The same from ``whitened`` columns.
+        """Information from ``whitened`` columns, shape (p, p).
 
         Args:
             whitened: shape (n, b + 10, k).
-            payloads: what is mounted, each time.
-            blind: motor whose own gain column is made without the known part of the payload's torque: what is left is
-                seen by coupling with the other axes alone.
+            payloads: the mounted payload of each repetition.
+            blind: motor whose own gain column omits the known part of the payload's torque, so that only coupling with
+                the other axes identifies it.
         """
         grams = whitened @ whitened.transpose(0, 2, 1)
         summed = grams.sum(axis=0)
@@ -201,26 +207,26 @@ class Design:
         return out
 
     def others_of(self, whitened: FloatArray, payload: int | None) -> FloatArray:
-        """Columns of J that are not of gains, by motor, shape (n, k, others)."""
+        """Columns of J for all unknowns but the gains, by motor, shape (n, k, others)."""
         place, source = self._columns(payload)
         out = np.zeros((len(whitened), whitened.shape[2], self.others))
         out[:, :, place] = whitened[:, source].transpose(0, 2, 1)
         return out
 
     def expected(self, payload: int | None) -> FloatArray:
-        """Parameters with which the columns of ``whitened`` give the whole torque, shape (b + 10,)."""
+        """Parameters for which the columns of ``whitened`` give the whole torque, shape (b + 10,)."""
         base = self.base.grouping @ self.expectation.parameters
         mounted = np.zeros(10) if payload is None else self.expectation.payloads[payload].parameters
         return np.concatenate((base, mounted))
 
     def known(self, payload: int) -> FloatArray:
-        """The part of ``expected`` that is known of a payload, shape (b + 10,)."""
+        """Known part of ``expected`` for a payload, shape (b + 10,)."""
         mounted = self.expectation.payloads[payload].parameters.copy()
         mounted[list(self.expectation.payloads[payload].unknown)] = 0.0
         return np.concatenate((np.zeros(len(self.base.independent)), mounted))
 
     def _columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
-        """Which unknowns a run has, and the columns of ``whitened`` that they belong to."""
+        """Unknowns of a run, and the columns of ``whitened`` that they belong to."""
         base = len(self.base.independent)
         place, source = list(range(base)), list(range(base))
         if payload is not None:
@@ -231,13 +237,13 @@ class Design:
         return np.array(place, dtype=np.intp), np.array(source, dtype=np.intp)
 
     def condition(self, information: FloatArray) -> float:
-        """Condition number of the observation matrix W, rows weighted by their noise; inf when a column is not seen."""
+        """Condition number of the observation matrix W, rows weighted by their noise; inf for a column without rows."""
         base = len(self.base.independent)
         values = np.linalg.eigvalsh(information[:base, :base])
         return float(np.sqrt(values[-1] / values[0])) if values[0] > 0.0 else float("inf")
 
     def std_percent(self, information: FloatArray) -> FloatArray:
-        """Standard deviation predicted for each gain, shape (n,) [% of it]; inf where nothing is said of it."""
+        """Predicted standard deviation of each gain, shape (n,) [% of it]; inf where it is not identifiable."""
         scale = np.sqrt(np.diag(information))
         scale[scale == 0.0] = 1.0
         scaled = information / np.outer(scale, scale)
@@ -247,13 +253,13 @@ class Design:
         except np.linalg.LinAlgError:
             return self._std_of_singular(scaled) / scale[gains]
         last = factor[gains, gains]
-        if float(np.diag(factor).min()) < 1e-5:  # so near to singular that rounding decides
+        if float(np.diag(factor).min()) < 1e-5:  # nearly singular: rounding decides
             return self._std_of_singular(scaled) / scale[gains]
         inverse = np.linalg.inv(last)
         return np.asarray(100.0 * np.sqrt(np.einsum("ij,ij->j", inverse, inverse)) / scale[gains])
 
     def _std_of_singular(self, scaled: FloatArray) -> FloatArray:
-        """Of a system in which some unknowns are not seen: theirs drop out, and gains that hang on them are inf."""
+        """Predict with unknowns that are not identifiable: they drop out, and gains that depend on them are inf."""
         others, gains = slice(None, self.others), slice(self.others, None)
         values, vectors = np.linalg.eigh(scaled[others, others])
         kept = values > UNSEEN * values[-1]
@@ -266,51 +272,35 @@ class Design:
         return np.asarray(100.0 * np.sqrt(variance))
 
 
-# A robot as it may be expected to be before anything is identified: only to choose moves by, never to fit with.
-
-
-LINK_MASS_KG = 5.0
-"""Of each link where the URDF has no inertias, as a slender rod to the next joint."""
-ROD_RADIUS_M = 0.05
-STEEL_KG_M3 = 7850.0
-DRY_FRICTION = 0.05
-VISCOUS_FRICTION = 0.10
-ROTOR = 0.03
-"""Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit.
-Of the size that geared arms have (paper, Table 3)."""
-TORQUE_RESERVE = 3.0
-"""Torque limit over the largest rigid-body torque, where the URDF gives none."""
-
-
 def nominal_links(robot: Robot, urdf: str) -> tuple[FloatArray, bool]:
-    """Inertial parameters of the links, shape (n, 10), and whether the URDF gave them.
+    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them.
 
     Args:
         robot: of this URDF.
-        urdf: its text; where no link in it has a mass, rods of LINK_MASS_KG are assumed.
+        urdf: its text; if no link has a mass, rods of LINK_MASS_KG are assumed.
     """
     bodies = read_urdf(urdf).bodies
     if any(body.mass_kg > 0.0 for body in bodies):
         return np.array([body.parameters for body in bodies]), True
     links = []
     for index in range(robot.joint_count):
-        ways = [joint.translation_m for joint in robot.joints if joint.parent == index]
-        way = ways[0] if ways else 0.1 * robot.joints[index].axis
-        slender = LINK_MASS_KG / 12.0 * (way @ way * np.eye(3) - np.outer(way, way))
+        offsets = [joint.translation_m for joint in robot.joints if joint.parent == index]
+        rod = offsets[0] if offsets else 0.1 * robot.joints[index].axis
+        slender = LINK_MASS_KG / 12.0 * (rod @ rod * np.eye(3) - np.outer(rod, rod))
         thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
-        links.append(Body(LINK_MASS_KG, 0.5 * way, slender + thick).parameters)
+        links.append(Body(LINK_MASS_KG, 0.5 * rod, slender + thick).parameters)
     return np.array(links), False
 
 
 def side_of_cube(mass_kg: float) -> float:
-    """Of steel [m]."""
+    """Side of a cube of steel [m]."""
     return float((mass_kg / STEEL_KG_M3) ** (1.0 / 3.0))
 
 
 def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
-    """A steel cube of the weighed mass, a side from the last joint's frame in every direction; what is known is kept.
+    """Return a steel cube of the weighed mass, one side away from the last joint's frame; known parameters are kept.
 
-    A body off the last axis is what a technician is asked to mount: on it, no gravity would act about that axis.
+    It is off the last axis, as the technician is asked to mount it: on the axis, gravity would have no lever.
     """
     mass = payload.known.get("m", LINK_MASS_KG)
     side = side_of_cube(mass)
@@ -325,13 +315,13 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
 
 
 def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motion: Motion) -> FloatArray:
-    """Of each joint [Nm or N], shape (n,): the URDF's effort limit, else TORQUE_RESERVE times what rigid links need.
+    """Return the URDF's effort limits, else TORQUE_RESERVE times the rigid-body torque [Nm or N], shape (n,).
 
     Args:
         model: the declared model.
         urdf: its text.
         links: inertial parameters with the payload on the last one, shape (n, 10).
-        lively: motion as fast as the limits allow.
+        fast_motion: motion as fast as the limits allow.
     """
     columns = model.regressor(fast_motion)
     rigid = np.concatenate([columns[:, 14 * index : 14 * index + 10] for index in range(len(links))], axis=1)
@@ -348,7 +338,7 @@ def nominal_parameters(
     velocity_limit: FloatArray,
     acceleration_limit: FloatArray,
 ) -> FloatArray:
-    """Standard parameters of links and drives, shape (c,).
+    """Return standard parameters of links and drives, shape (c,).
 
     Args:
         model: the declared model.

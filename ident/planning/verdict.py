@@ -1,8 +1,8 @@
-"""How well each gain is seen, by what, and which moves would show it better: measured, not guessed.
+"""Verdict on each gain: how well it is identifiable, through what, and which moves would improve it.
 
-A gain can be seen in three ways, and each is judged by what it would give alone:
+A gain is identifiable in three ways, and each is judged by the deviation that it would give alone:
 
-- gravity: the known payload's static torque in the motor's own rows, beside all that is unknown there;
+- gravity: the known payload's static torque in the motor's own rows, beside all unknowns there;
 - inertia: the rest of the known payload's torque in the motor's own rows;
 - coupling: parameters that its rows share with those of other axes, whose gains are known by their own means.
 """
@@ -22,15 +22,15 @@ from ident.planning.excitation import Design, Excitation
 FloatArray = NDArray[np.float64]
 
 GOOD_PERCENT = 1.0
-"""Standard deviation up to which a gain is well seen: drives are sold with gains known to some percent."""
+"""Largest standard deviation of a good gain: drives are sold with gains known to some percent."""
 UNSEEN_PERCENT = 10.0
-"""Above it the nameplate is the better source."""
+"""Standard deviation above which the nameplate is the better source."""
 SHARE_OF_BEST = 3.0
-"""A way of seeing counts when it alone gives at most so many times the deviation of the best one."""
+"""A source counts when it alone gives at most so many times the deviation of the best one."""
 
 
 class Source(Enum):
-    """By what a gain is seen."""
+    """Source of information about a gain."""
 
     GRAVITY = "gravity"
     INERTIA = "inertia"
@@ -38,7 +38,7 @@ class Source(Enum):
 
 
 class Verdict(Enum):
-    """How well a gain is seen."""
+    """How well a gain is identifiable."""
 
     GOOD = "good"
     WEAK = "weak"
@@ -50,8 +50,8 @@ class ExtraMoves:
     """Moves that could be added to an experiment, made once without load and once with each payload.
 
     Attributes:
-        words: what they are, to follow "add": ``fast moves of J1 with the arm stretched``.
-        seconds: how long they take, once.
+        words: description, to follow "add": ``fast moves of J1 with the arm stretched``.
+        seconds: their duration, once.
         excitation: their rows.
     """
 
@@ -62,7 +62,7 @@ class ExtraMoves:
 
 @dataclass(frozen=True, slots=True)
 class Advice:
-    """The extra moves that help a gain most, and its deviation with them [%]."""
+    """Extra moves that improve a gain most, and its deviation with them [%]."""
 
     words: str
     seconds: float
@@ -71,13 +71,13 @@ class Advice:
 
 @dataclass(frozen=True, slots=True)
 class GainVerdict:
-    """Of one gain.
+    """Verdict on one gain.
 
     Attributes:
         axis: index from 0.
-        std_percent: predicted standard deviation [% of the gain]; inf where nothing tells it.
-        alone_percent: what each way of seeing would give alone [%].
-        gravity_acts: on this axis, whatever the last link carries; without it all that is seen is inertia.
+        std_percent: predicted standard deviation [% of the gain]; inf where it is not identifiable.
+        alone_percent: standard deviation that each source would give alone [%].
+        gravity_acts: whether gravity of any body on the last link acts on this axis.
         verdict: good, weak or unseen.
         advice: for a gain that is not good; None where no extra moves were offered or none helps.
     """
@@ -91,40 +91,41 @@ class GainVerdict:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """By what it is seen, the best first; empty for a gain that nothing tells."""
+        """Sources of information, the best first; empty for a gain that is not identifiable."""
         best = min(self.alone_percent.values())
         order = sorted(self.alone_percent.items(), key=lambda item: item[1])
         return tuple(source for source, alone in order if np.isfinite(alone) and alone <= SHARE_OF_BEST * best)
 
     def words(self, axis_name: str) -> str:
-        """For a report: ``J1 is seen by inertia only: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
+        """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
         if not self.sources or not np.isfinite(self.std_percent):
-            text = f"{axis_name} is not seen at all"
+            text = f"{axis_name} is not identifiable"
         else:
-            text = f"{axis_name} is seen by {self._seen_by()}: σ {self.std_percent:.2g} %"
+            text = f"{axis_name} is identifiable {self._through()}: σ {self.std_percent:.2g} %"
         if self.advice is None:
             return text
         return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {self.advice.std_percent:.2g} %)"
 
-    def _seen_by(self) -> str:
+    def _through(self) -> str:
         if not self.gravity_acts:
             shared = Source.COUPLING in self.sources
-            return "inertia only" + (", partly through parameters shared with other axes" if shared else "")
-        return " and ".join(source.value for source in self.sources) + (" only" if len(self.sources) == 1 else "")
+            return "only through inertia" + (", partly through parameters shared with other axes" if shared else "")
+        only = "only " if len(self.sources) == 1 else ""
+        return f"{only}through " + " and ".join(source.value for source in self.sources)
 
 
 Runs = Sequence[tuple[Excitation, Sequence[int | None]]]
-"""Motions, each with what was mounted every time it was made: an index into ``Expectation.payloads``, or None."""
+"""Motions, each with the payload of every repetition: an index into ``Expectation.payloads``, or None."""
 
 
 def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> tuple[GainVerdict, ...]:
-    """Judge every gain of an experiment, one that is planned or one that was made.
+    """Judge every gain of a planned or recorded experiment.
 
     Args:
         design: unknowns, expected parameters and gains, noise. After a fit: its gains, parameters and residuals.
-        runs: of the experiment. For a plan ``[(excitation, (None, 0))]``: its moves without and with the payload;
-            for recorded runs one pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
-        extras: moves that could be added; for each gain that is not good they are tried and the best is named.
+        runs: for a plan ``[(excitation, (None, 0))]``, its moves without and with the payload; for recorded runs one
+            pair each, ``(excitation, (None,))`` or ``(excitation, (payload,))``.
+        extras: moves that could be added; for each gain that is not good the best of them is named.
 
     Returns:
         one verdict an axis, in their order.
@@ -161,15 +162,19 @@ def _advice(axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, Flo
     better = [(float(found[axis]), index) for index, (_, found) in enumerate(tried) if found[axis] < std_percent]
     if not better:
         return None
-    found_, index = min(better)
-    return Advice(tried[index][0].words, tried[index][0].seconds, found_)
+    best, index = min(better)
+    return Advice(tried[index][0].words, tried[index][0].seconds, best)
 
 
 def _own_rows(
     design: Design, runs: Runs, whitened: Sequence[tuple[FloatArray, Sequence[int | None]]]
 ) -> list[tuple[float, float, bool]]:
-    """For each motor what gravity and inertia of the known payload give alone in its own rows [%], and whether gravity
-    of anything on the last link acts there."""
+    """Judge gravity and inertia in each motor's own rows.
+
+    Returns:
+        for each motor the deviations that gravity and inertia of the known payload give alone [%], and whether gravity
+        of any body on the last link acts there.
+    """
     count = len(design.expectation.gains)
     others: list[list[FloatArray]] = [[] for _ in range(count)]
     known: list[list[FloatArray]] = [[] for _ in range(count)]
@@ -194,7 +199,7 @@ def _own_rows(
 
 
 def _beside(others: FloatArray, known: FloatArray) -> tuple[float, float]:
-    """100 over the norm of what is left of each of two columns beside others; inf where nothing is left."""
+    """100 over the norm of each of two columns with the others projected out; inf where nothing is left."""
     norms = np.linalg.norm(others, axis=0)
     used = others[:, norms > 0.0] / norms[norms > 0.0]
     left = known - used @ np.linalg.lstsq(used, known, rcond=1e-9)[0] if used.shape[1] else known

@@ -56,4 +56,4 @@ def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) 
 def test_gravity_does_not_act_on_the_vertical_axis(fitted: Fit) -> None:
     found = gain_verdicts(fitted)
     assert [gain.gravity_acts for gain in found] == [False, True, True, True, True, True]
-    assert "J1 is seen by inertia only" in found[0].words("J1")
+    assert "J1 is identifiable only through inertia" in found[0].words("J1")

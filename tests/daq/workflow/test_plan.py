@@ -100,7 +100,7 @@ def _assert_kept(room: Experiment, paths: tuple[Trapezoid, ...], speed: float) -
         assert (np.abs(velocity) <= speed * np.array([a.limits.velocity for a in axes]) * (1 + 2e-3)).all()
         assert (np.abs(acceleration) <= speed * np.array([a.limits.acceleration for a in axes]) * (1 + 2e-3)).all()
         # The search halves stretches down to some millimetres of motion; six hundred samples a way are far finer.
-        assert float(room.scene.checker.margins(position.T).min()) >= 0.0
+        assert float(room.scene.checker.margins(position).min()) >= 0.0
 
 
 def test_a_tight_room_is_kept_by_good_plans_too(tight: Experiment) -> None:

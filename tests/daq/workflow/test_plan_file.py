@@ -115,7 +115,7 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     assert main([*arguments, "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert [gain["axis"] for gain in found["gains"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
-    assert "inertia only" in found["gains"][0]["words"]
+    assert "identifiable only through inertia" in found["gains"][0]["words"]
     assert found["gains"][0]["alone_percent"]["gravity"] is None
     assert any("guess" in line for line in found["assumed"])
     weak = [gain for gain in found["gains"] if gain["verdict"] != "good"]

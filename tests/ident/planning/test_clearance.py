@@ -56,8 +56,8 @@ def test_distances_are_those_of_the_segments() -> None:
     checker = Checker(robot, bare)
     rng = np.random.default_rng(1)
     for _ in range(20):
-        position = rng.uniform(-2.0, 2.0, (6, 1))
-        at = poses(robot, position.T)
+        position = rng.uniform(-2.0, 2.0, (1, 6))
+        at = poses(robot, position)
         ends = [
             at.origin_m[c.link + 1, 0] + at.rotation[c.link + 1, 0] @ np.array(point)
             for c in (bare.capsules[0], bare.capsules[2])
@@ -83,10 +83,10 @@ def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
         found = checker.obstruction(start, end)
         verdicts.append(found is None)
         if found is None:
-            along = start[:, None] + (end - start)[:, None] * np.linspace(0.0, 1.0, 800)
+            along = start + (end - start) * np.linspace(0.0, 1.0, 800)[:, None]
             assert float(checker.margins(along).min()) >= 0.0
         else:
-            there = np.array(found.position)[:, None]
+            there = np.array(found.position)[None]
             assert float(checker.margins(there)[0]) <= RESOLUTION_M
             assert found.first != found.second
 
@@ -100,7 +100,7 @@ def test_a_thin_wall_between_two_free_postures_is_found() -> None:
     scene = Scene((Capsule("tool", 5, (0.0, 0.0, 0.02), (0.0, 0.0, 0.05), 0.01),), (), (wall,), None, (), 0.0)
     checker = Checker(robot, scene)
     start, end = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert (checker.margins(np.stack((start, end), axis=1)) > 0.05).all()
+    assert (checker.margins(np.stack((start, end))) > 0.05).all()
     found = checker.obstruction(start, end)
     assert found is not None
     assert (found.first, found.second) == ("tool", "wall")
@@ -114,7 +114,7 @@ def test_what_leaves_the_workspace_is_named() -> None:
     low = Box("workspace", (-2.0, -2.0, 0.3), (2.0, 2.0, 2.0))
     checker = Checker(robot, Scene((tool,), (), (), low, (0,), 0.0))
     up, down = np.zeros(6), np.array([0.0, 2.0, 0.5, 0.0, 0.0, 0.0])
-    assert float(checker.margins(up[:, None])[0]) > 0.0
+    assert float(checker.margins(up[None])[0]) > 0.0
     found = checker.obstruction(up, down)
     assert found is not None
     assert (found.first, found.second) == ("tool", "the end of the workspace")
@@ -124,4 +124,4 @@ def test_nothing_declared_is_always_clear() -> None:
     robot = robot_from_urdf(TX40.urdf)
     checker = Checker(robot, Scene((), (), (), None, (), 0.0))
     assert checker.obstruction(np.zeros(6), np.ones(6)) is None
-    assert np.isinf(checker.margins(np.zeros((6, 3)))).all()
+    assert np.isinf(checker.margins(np.zeros((3, 6)))).all()

@@ -84,7 +84,7 @@ def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
         gains = identify(truth.model, noisy, CONDITIONING).estimate.gains
         errors.append(100.0 * (gains / GAINS - 1.0))
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / predicted
-    # 12 draws tell a deviation to 20 %, all six together (the wrist gains go together) to some 12 %.
+    # 12 draws know a deviation to 20 %, all six together (the wrist gains go together) to some 12 %.
     assert 0.7 < float(np.sqrt(np.mean(ratio**2))) < 1.3
     assert ratio.min() > 0.45
     assert ratio.max() < 1.6
@@ -134,7 +134,7 @@ def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, ti
     often = design.std_percent(times * design.information(excitation, (None, 0)))
     assert noisy == pytest.approx(factor * once, rel=1e-6)
     assert often == pytest.approx(once / np.sqrt(times), rel=1e-6)
-    # More moves never tell less.
+    # More moves never give less information.
     more = design.information(excitation, (None, 0)) + design.information(
         _excitation(np.random.default_rng(7), 20), (None, 0)
     )
@@ -167,23 +167,23 @@ def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
     assert np.isinf(found[3])
     judged = verdicts(design, [(excitation, (None, 0))])
     assert judged[3].verdict is Verdict.UNSEEN
-    assert "not seen at all" in judged[3].words("J4")
+    assert "not identifiable" in judged[3].words("J4")
 
 
-def test_axis_1_upright_is_seen_by_inertia_only_and_on_a_wall_by_gravity() -> None:
+def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_through_gravity() -> None:
     truth = tx40_truth()
     excitation = _excitation(np.random.default_rng(1))
     upright = verdicts(_design(truth), [(excitation, (None, 0))])[0]
     assert not upright.gravity_acts
     assert np.isinf(upright.alone_percent[Source.GRAVITY])
-    assert "inertia only" in upright.words("J1")
+    assert "identifiable only through inertia" in upright.words("J1")
     wall = verdicts(_design(truth, gravity=(9.81, 0.0, 0.0)), [(excitation, (None, 0))])[0]
     assert wall.gravity_acts
     assert np.isfinite(wall.alone_percent[Source.GRAVITY])
-    assert "inertia only" not in wall.words("J1")
+    assert "only through inertia" not in wall.words("J1")
 
 
-def test_no_way_of_seeing_alone_is_better_than_all_of_them() -> None:
+def test_no_source_alone_is_better_than_all_of_them() -> None:
     for gain in verdicts(_design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]):
         assert all(alone >= gain.std_percent * (1.0 - 1e-9) for alone in gain.alone_percent.values())
         assert gain.sources
