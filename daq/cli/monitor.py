@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +27,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import DriverError, NodeMissing
 from drivers.profiles.cia402 import decode
+from drivers.profiles.profile import Axis
 from drivers.profiles.scale import read_scale
 from drivers.stream.monitor import QUIET_S, CellMonitor, CellReading, Source
 from drivers.stream.sample import EventKind
@@ -64,7 +65,7 @@ def monitor_verb(
                 print_json(document)
             else:
                 console.print(view(document))
-            _require(document, QUIET_S + interval)
+            _require(network.axes, document, QUIET_S + interval)
             return
         with Live(console=console, auto_refresh=False, screen=False) as live:
             for document in readings:
@@ -201,13 +202,13 @@ def _style(axis: dict[str, Any]) -> str | None:
     return "bold" if axis["enabled"] else None
 
 
-def _require(document: dict[str, Any], waited_s: float) -> None:
-    """An axis that nobody hears is a fault, where one reading is all there is.
+def _require(axes: Sequence[Axis], document: dict[str, Any], waited_s: float) -> None:
+    """Make sure that no axis is silent, where one reading is all there is.
 
     Raises:
         NodeMissing: some axes were silent.
     """
-    silent = tuple(axis["node_id"] for axis in document["axes"] if axis["silent"])
+    silent = [axis for axis, shown in zip(axes, document["axes"], strict=True) if shown["silent"]]
     heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
     if silent:
         raise NodeMissing(silent, heard, waited_s)

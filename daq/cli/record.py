@@ -20,7 +20,7 @@ from daq.workflow.plan import slowed
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import record
 from daq.workflow.safeguards import bus_lock, check_entered_mass
-from drivers.errors import CellSilent, DriverError, SampleLost
+from drivers.errors import DriverError, SampleLost
 from ident.model.bodies import Payload
 
 
@@ -91,7 +91,7 @@ def record_verb(
             error.add_note(
                 f"kept: what was recorded until then is in {part}, which no fit reads; {_next_command(part)}"
             )
-        lost = isinstance(error, SampleLost | CellSilent)
+        lost = isinstance(error, SampleLost)
         if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "

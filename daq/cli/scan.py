@@ -86,7 +86,8 @@ def scan_verb(
         note = actual_current_note(declared)
         if note is not None:
             console.print(Text(note, "yellow"))
-    missing = tuple(row["node_id"] for row in rows if row["verdict"] == "missing")
+    absent = {row["node_id"] for row in rows if row["verdict"] == "missing"}
+    missing = [axis for axis in drive_axes(declared) if axis.node_id in absent]
     if missing:
         raise NodeMissing(missing, tuple(node.node_id for nodes in found.values() for node in nodes), wait)
 

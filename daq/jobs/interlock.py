@@ -224,10 +224,10 @@ def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
             state = decode(statusword)
             if state in FAULTS:
                 reason = f"{state} before the job began; find its cause, then reset it"
-                raise DriveFault(axis.node_id, reason, statusword)
+                raise DriveFault(axis, reason, statusword)
             if state not in IDLE:
                 left = LEFT_BEHIND if state is State.QUICK_STOP_ACTIVE else ""
-                raise StateRefused(axis.node_id, "no power before a job begins", f"{state}{left}", statusword)
+                raise StateRefused(axis, "no power before a job begins", f"{state}{left}", statusword)
 
 
 # A bound on the time of a whole job, which also ends a motion: by the alarm that the system keeps for each process.

@@ -38,8 +38,9 @@ from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.errors import MotionRefused
 from drivers.motion.execute import execute
 from drivers.motion.move import AxisLimits, MotionPermission, Move, check_moves, synchronised_move
+from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind, Sample
-from drivers.stream.stream import StreamStatistics, SyncStream
+from drivers.stream.stream import SyncStream
 from drivers.stream.sync import (
     DriveProducer,
     FollowedSync,

@@ -264,7 +264,7 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
         What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
 
     Raises:
-        ScaleImplausible: the two torque constants differ by a factor of five or more.
+        SetupRefused: the two torque constants differ by a factor of five or more.
     """
     axes_by_warning: dict[str, list[str]] = {}
     for axis, reduction, reading in zip(cell.axes, DriveTrain(cell.ratio).reduction, readings, strict=True):

@@ -1,4 +1,10 @@
-"""Opening a CAN bus by its address, with one kind of error for everything that can go wrong."""
+"""Open a CAN bus by its address, with one kind of error for everything that can go wrong.
+
+A bus between processes of one machine is a socketcand hub (drivers/canopen/hub.py). Its client here notices when the
+server is gone, and handles frames in bursts. Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode).
+Frames to the bus are ``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of
+three hexadecimal digits is a base one, of eight an extended one. There are neither remote frames nor CAN FD.
+"""
 
 from __future__ import annotations
 
@@ -16,40 +22,123 @@ import can
 from drivers.errors import BusError
 from drivers.stream.socketcan import open_socketcan
 
-# A client of the socketcand protocol that notices when its server has gone, and handles frames in bursts.
-#
-# Protocol: github.com/linux-can/socketcand, doc/protocol.md (raw mode). Frames to the bus are
-# ``< send ID DLC B0 B1 ... >``, frames from the bus ``< frame ID SECONDS HEX >``; an identifier of three hexadecimal
-# digits is a base one, of eight an extended one. The protocol has neither remote frames nor CAN FD.
-
-
 CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0
-"""How long a server may take nothing; what was sent of a frame by then cannot be taken back."""
+"""Longest time in which a server may accept nothing; a frame sent in part cannot be recalled."""
 _RECEIVE_BYTES = 1 << 16
 LONGEST_BYTES = 4096
-"""Of what may wait for its end; a frame has some 50. A server that never ends a message is none."""
+"""Longest unfinished message; a frame has some 50. A server that never ends a message speaks another protocol."""
 _LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16
 """Hexadecimal digits."""
 _SHOWN = 60
-# Possessive, and never past the next '<': what does not match is given up after one look at each byte.
+_ADDRESS = re.compile(r"([\w-]+):([^@]+)(?:@([^:]+):(\d+))?")
+# Possessive, and never past the next '<': each byte of a mismatch is read once.
 _FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa-f]*+)|([^<>]*)) >")
 
 
-def send_line(message: can.Message) -> bytes:
-    """One frame as the protocol's ``send`` command."""
-    if message.is_remote_frame or message.is_fd or message.is_error_frame:
-        raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")
-    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
-    return f"< send {identifier} {message.dlc:X} {message.data.hex(' ')} >".encode("ascii")
+@dataclass(frozen=True, slots=True)
+class BusAddress:
+    """Address of a bus.
+
+    Attributes:
+        interface: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the
+            name of any other python-can interface.
+        channel: of the interface, such as ``can0``.
+        bitrate_bit_s: of the wire; buses of the kernel and of a hub have theirs already.
+        host, port: of the hub (socketcand only).
+    """
+
+    interface: str
+    channel: str
+    bitrate_bit_s: int = 1_000_000
+    host: str = "127.0.0.1"
+    port: int = 29536
+
+    def __str__(self) -> str:
+        where = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
+        return f"{self.interface}:{self.channel}{where}"
+
+    @classmethod
+    def parse(cls, text: str) -> BusAddress:
+        """Read an address such as ``socketcan:can0`` or ``socketcand:can0@127.0.0.1:29536``.
+
+        Raises:
+            BusError: the text has another form.
+        """
+        match = _ADDRESS.fullmatch(text)
+        if match is None:
+            raise BusError(text, "expected INTERFACE:CHANNEL or INTERFACE:CHANNEL@HOST:PORT, such as socketcan:can0")
+        interface, channel, host, port = match.groups()
+        return cls(interface, channel) if host is None else cls(interface, channel, host=host, port=int(port))
+
+
+@contextmanager
+def bus_errors(address: object) -> Iterator[None]:
+    """Turn errors of python-can and the operating system into BusError with this address."""
+    try:
+        yield
+    except (can.CanError, OSError) as error:
+        raise BusError(str(address), str(error) or type(error).__name__) from error
+
+
+def open_bus(address: BusAddress) -> can.BusABC:
+    """Open one end of a bus.
+
+    A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for ever), so close ends
+    that are not read. No end receives its own frames, except the SYNCs on ``socketcan``, which return with their time
+    and ``is_rx`` False (drivers/stream/socketcan.py).
+
+    Raises:
+        BusError: the interface is unknown, the device is absent, or the hub does not answer.
+    """
+    with bus_errors(address):
+        if address.interface == "socketcand":
+            # python-can's own client mistakes a closed hub for silence.
+            return SocketcandBus(address.channel, address.host, address.port)
+        if address.interface == "socketcan":
+            # python-can's own loses frames while this interpreter is busy, and cannot count them.
+            return open_socketcan(address.channel)
+    return open_answering_bus(address)
+
+
+def open_answering_bus(address: BusAddress) -> can.BusABC:
+    """As `open_bus`, for a device that answers each frame: on ``socketcan`` without the capture process.
+
+    Raises:
+        BusError: as `open_bus`.
+    """
+    if address.interface == "socketcand":
+        return open_bus(address)
+    with bus_errors(address):
+        try:
+            # A user's python-can configuration file must not change the cell's configuration.
+            return can.Bus(
+                interface=address.interface,
+                channel=address.channel,
+                bitrate=address.bitrate_bit_s,
+                receive_own_messages=False,
+                ignore_config=True,
+            )
+        except (ValueError, TypeError, ImportError, NotImplementedError) as error:
+            raise BusError(str(address), str(error)) from error
+
+
+def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
+    """Send several frames, in one call where the bus has a ``send_burst``."""
+    burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
+    if burst is not None:
+        burst(messages)
+        return
+    for message in messages:
+        bus.send(message)
 
 
 class SocketcandBus(can.BusABC):
-    """One end of a bus that a socketcand server keeps.
+    """One end of a bus of a socketcand server.
 
     Raises:
         can.CanInitializationError: the server refused the channel.
-        OSError: nobody listens there.
+        OSError: no server listens at this address.
     """
 
     def __init__(self, channel: str, host: str, port: int) -> None:
@@ -74,7 +163,7 @@ class SocketcandBus(can.BusABC):
         super().__init__(channel=channel)
 
     def _expect(self, word: str) -> None:
-        # Only up to the first '>': behind the last answer frames of the bus may follow at once.
+        # Only up to the first '>': frames of the bus may follow the last answer at once.
         while b">" not in self._buffer:
             if len(self._buffer) > LONGEST_BYTES:
                 raise can.CanInitializationError(self._endless(self._buffer))
@@ -85,7 +174,7 @@ class SocketcandBus(can.BusABC):
         answer, _, self._buffer = self._buffer.partition(b">")
         found = answer.strip(b"< ").decode("ascii", "replace")
         if found != word:
-            raise can.CanInitializationError(f"{self.channel_info}: expected '{word}', the server said '{found}'")
+            raise can.CanInitializationError(f"{self.channel_info}: expected '{word}', the server sent '{found}'")
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -94,7 +183,7 @@ class SocketcandBus(can.BusABC):
         self.send_burst((msg,))
 
     def send_burst(self, messages: Sequence[can.Message]) -> None:
-        """Send frames, in one system call where the server takes them."""
+        """Send frames, in one system call if the server accepts them."""
         if self._stuck is not None:
             raise can.CanOperationError(self._stuck)
         try:
@@ -111,11 +200,11 @@ class SocketcandBus(can.BusABC):
                 end_s = time.monotonic() + SEND_S if end_s is None else end_s
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
-                    self._stuck = f"{self.channel_info}: the server takes nothing for {SEND_S:g} s"
+                    self._stuck = f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"
                     raise can.CanOperationError(self._stuck) from None
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.
+        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
         if self._received and self._filters is None:
             return self._received.popleft()
         return super().recv(timeout)
@@ -173,85 +262,9 @@ class SocketcandBus(can.BusABC):
         self._socket.close()
 
 
-@dataclass(frozen=True, slots=True)
-class BusAddress:
-    """Where a bus is.
-
-    Attributes:
-        interface: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the
-            name of any other python-can interface.
-        channel: of the interface, e.g. ``can0``.
-        bitrate_bit_s: of the wire; the kernel's and the hub's buses have theirs already.
-        host, port: of the hub (socketcand only).
-    """
-
-    interface: str
-    channel: str
-    bitrate_bit_s: int = 1_000_000
-    host: str = "127.0.0.1"
-    port: int = 29536
-
-    def __str__(self) -> str:
-        where = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""
-        return f"{self.interface}:{self.channel}{where}"
-
-
-@contextmanager
-def bus_errors(address: object) -> Iterator[None]:
-    """Turn what python-can and the operating system raise into BusError; the address says of which bus, or buses."""
-    try:
-        yield
-    except (can.CanError, OSError) as error:
-        raise BusError(str(address), str(error) or type(error).__name__) from error
-
-
-def open_bus(address: BusAddress) -> can.BusABC:
-    """Open one end of a bus.
-
-    A ``virtual`` bus keeps every frame that is not read, without bound (a bounded one would block the *sender* for
-    ever): close the ends that nobody reads. No end receives what it sent itself, but for the SYNCs on ``socketcan``,
-    which come back with their time and ``is_rx`` False (drivers/stream/socketcan.py).
-
-    Raises:
-        BusError: the interface is unknown, the device is absent, or the hub does not answer.
-    """
-    with bus_errors(address):
-        if address.interface == "socketcand":
-            # Not python-can's client: to that one a closed hub looks like silence.
-            return SocketcandBus(address.channel, address.host, address.port)
-        if address.interface == "socketcan":
-            # Not python-can's: that one loses frames while this interpreter is busy, and cannot say how many.
-            return open_socketcan(address.channel)
-    return open_answering_bus(address)
-
-
-def open_answering_bus(address: BusAddress) -> can.BusABC:
-    """As `open_bus`, for whoever answers each frame and keeps none: on ``socketcan`` without a process in between.
-
-    Raises:
-        BusError: as `open_bus`.
-    """
-    if address.interface == "socketcand":
-        return open_bus(address)
-    with bus_errors(address):
-        try:
-            # Users' python-can configuration files must not turn the cell's configuration into another one.
-            return can.Bus(
-                interface=address.interface,
-                channel=address.channel,
-                bitrate=address.bitrate_bit_s,
-                receive_own_messages=False,
-                ignore_config=True,
-            )
-        except (ValueError, TypeError, ImportError, NotImplementedError) as error:
-            raise BusError(str(address), str(error)) from error
-
-
-def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
-    """Send several frames; in one go where the bus has a ``send_burst`` of its own."""
-    burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
-    if burst is not None:
-        burst(messages)
-        return
-    for message in messages:
-        bus.send(message)
+def send_line(message: can.Message) -> bytes:
+    """Return a frame as the protocol's ``send`` command."""
+    if message.is_remote_frame or message.is_fd or message.is_error_frame:
+        raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")
+    identifier = f"{message.arbitration_id:08X}" if message.is_extended_id else f"{message.arbitration_id:03X}"
+    return f"< send {identifier} {message.dlc:X} {message.data.hex(' ')} >".encode("ascii")

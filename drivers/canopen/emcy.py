@@ -1,8 +1,8 @@
-"""What the error codes of EMCY and 603Fh mean.
+"""Error codes of EMCY and 603Fh in words.
 
 Source: CiA 301 (emergency error code classes 00xxh to FFxxh and the communication codes 81xxh and 82xxh) and CiA 402-2
-(IEC 61800-7-201, error codes of power drive systems). A code that neither names is told by its class, which is its
-upper byte, then its upper digit.
+(IEC 61800-7-201, error codes of power drive systems). Other codes are described by their class: upper byte, then upper
+digit.
 """
 
 from __future__ import annotations
@@ -148,11 +148,7 @@ _CLASSES = {
 
 
 def describe(code: int) -> str:
-    """What an error code means; of a code that no standard names, its class.
-
-    Args:
-        code: 16 bits.
-    """
+    """Describe an error code of 16 bits; for a code that is in no standard, its class."""
     if code in CODES:
         return CODES[code]
     if code >= 0xFF00:

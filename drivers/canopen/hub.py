@@ -1,8 +1,8 @@
 """A small socketcand-protocol server: a CAN bus between processes of one machine, without any kernel driver.
 
-Every frame of one client goes to all other clients of its channel. Bound to the loopback interface alone. A client that
-does not read is disconnected when ``BACKLOG_BYTES`` wait for it, so that frames are never lost silently: its next call
-says that the connection was closed.
+Every frame of one client goes to all other clients of its channel. The server listens on the loopback interface alone.
+A client that does not read is disconnected when ``BACKLOG_BYTES`` wait for it, so that no frame is lost silently: its
+next call fails.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MAX_COMMAND_BYTES = 256
 
 
 class _Client:
-    """One connection: what it has sent and not finished, and what waits to be sent to it."""
+    """One connection: its unfinished command, and the bytes that wait to be sent to it."""
 
     __slots__ = ("channel", "handle", "incoming", "outgoing", "raw")
 
@@ -45,8 +45,8 @@ class Hub:
 
     Args:
         channels: names that clients may open; each is a bus of its own. Another name is refused, so that a typing
-            error is not a silent bus.
-        port: to listen on; 0 takes a free one, see ``address``.
+            error does not open an empty bus.
+        port: to listen on; 0 chooses a free one, see ``address``.
         clock: wall clock [s] for the frames' time stamps.
     """
 
@@ -60,7 +60,7 @@ class Hub:
         self._clients: dict[socket.socket, _Client] = {}
 
     def address(self, channel: str | None = None) -> BusAddress:
-        """Where clients find a channel (by default the first) while the hub runs."""
+        """Return the address of a channel (by default the first) while the hub runs."""
         if self._listener is None:
             raise BusError(f"hub {HOST}:{self._port}", "is not running")
         return BusAddress("socketcand", channel or self._channels[0], host=HOST, port=self._listener.getsockname()[1])
@@ -115,7 +115,7 @@ class Hub:
         try:
             handle, _ = listener.accept()
         except OSError:
-            return  # the client has gone before it was welcomed
+            return  # the client left before it was accepted
         handle.setblocking(False)
         handle.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = self._clients[handle] = _Client(handle)
@@ -152,7 +152,7 @@ class Hub:
                 self._answer(client, command)
         client.incoming = buffer[end:]
         if len(client.incoming) > _MAX_COMMAND_BYTES:
-            self._drop(client, selector)  # whatever this speaks, it is not socketcand
+            self._drop(client, selector)  # this is not the socketcand protocol
         if frames:
             burst = b"".join(frames)
             for other in self._clients.values():
@@ -193,7 +193,7 @@ class Hub:
 
 
 def _hint(error: OSError) -> str:
-    """Why it cannot listen, and what to do."""
+    """Return the reason why the hub cannot listen, and the remedy."""
     reason = error.strerror or str(error)
     if error.errno == errno.EADDRINUSE:
         return f"{reason}: another hub runs on this port; use that one, end it, or choose another port (0: a free one)"
@@ -203,7 +203,7 @@ def _hint(error: OSError) -> str:
 
 
 def _payload(data: bytes, length: int) -> bytes | None:
-    """Hexadecimal digits of a frame's bytes, two each, or None when they are not ``length`` bytes."""
+    """Return the hexadecimal digits of a frame, two a byte, or None when they are not ``length`` bytes."""
     digits = data.replace(b" ", b"")
     if len(digits) != 2 * length:
         # The protocol allows one digit for a small byte, and python-can writes it so.

@@ -1,13 +1,13 @@
-"""The one reader of a bus: sends, receives, and hands every frame that is no PDO to whom it concerns.
+"""The one reader of a bus: sends, receives, and dispatches every frame that is no PDO.
 
-There is no receiving thread: whoever waits for something (an SDO answer, a heartbeat, the answers to a SYNC) reads the
-bus while waiting. See docs/decisions/0002-stream-owns-the-bus.md.
+There is no receiving thread. Code that waits (for an SDO answer, a heartbeat, the answers to a SYNC) reads the bus
+while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 
 import can
@@ -15,7 +15,7 @@ import can
 from drivers.canopen.bus import bus_errors, send_burst
 from drivers.canopen.emcy import describe
 from drivers.canopen.sdo import Clock, ObjectAccess, SdoPolicy, SynchronousSdoClient
-from drivers.errors import BusError, NmtRefused
+from drivers.errors import BusError, StateRefused, node_label
 from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.split_bus import BUS_OFF, BUS_OFF_REASON, CellAddress, open_cell_bus
 
@@ -24,10 +24,10 @@ _NMT_COB_ID = 0x000
 SDO_REQUEST = 0x600
 _EMCY, _SDO_ANSWER, HEARTBEAT = 0x080, 0x580, 0x700
 _RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
-"""What a drive is told (CiA 301, predefined connection set)."""
+"""Set-points of a drive (CiA 301, predefined connection set)."""
 PUMP_S = 1.0
-"""Of handling what has come already, however fast more comes."""
-# linux/can/error.h: classes of an error frame, and what its second byte says of the controller.
+"""Longest time spent on frames that have already arrived, however fast more arrive."""
+# linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
 _OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
 
@@ -53,14 +53,14 @@ class NmtCommand(IntEnum):
 
 
 def nmt_name(state: int | None) -> str:
-    """Name of an NMT state for a person."""
+    """Return the name of an NMT state."""
     if state is None:
         return "nothing"
     return str(NmtState(state)) if state in tuple(NmtState) else f"unknown ({state})"
 
 
 def command_name(identifier: int) -> str:
-    """Name of a frame that only we should send, for a person."""
+    """Describe a frame that only the recorder should send."""
     if identifier == SYNC_COB_ID:
         return "a SYNC (080h)"
     if identifier == _NMT_COB_ID:
@@ -73,19 +73,19 @@ def command_name(identifier: int) -> str:
 
 
 class Link:
-    """An open bus and what its nodes last said about themselves.
+    """An open bus and the last known state of its nodes.
 
     Attributes:
         nmt: last NMT state of each node that sent a heartbeat.
-        heard_ns: when it did, by the clock.
+        heard_ns: time of that heartbeat by the clock.
         answered: nodes that sent any SDO answer.
-        silent: nodes that did not answer when they were last asked, and were not heard since.
-        heard: node ids of which any frame came since the bus was opened.
-        foreign: how often each identifier of a master's commands (NMT, SYNC, SDO request, set-point of one of
-            `axis_ids`), or of our own heartbeat, came that we did not send.
+        silent: nodes that did not answer their last request, and sent nothing since.
+        heard: node ids of which any frame arrived since the bus was opened.
+        foreign: number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of
+            our axes, our own heartbeat) and that we did not send.
         own_id: node id of our heartbeat, None before one was chosen.
-        axis_ids: nodes that take set-points from nobody but us.
-        sync_producer: who sends SYNC because we told it to (drivers/stream/sync.py); None while only we do.
+        names: names of our axes by node id.
+        sync_producer: device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Link:
         self.silent: set[int] = set()
         self.heard: set[int] = set()
         self.own_id: int | None = None
-        self.axis_ids: frozenset[int] = frozenset()
+        self.names: Mapping[int, str] = {}
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0
@@ -125,7 +125,7 @@ class Link:
         self._bus = self._opener(self.address)
 
     def close(self) -> None:
-        """Close the bus; nothing happens when it is closed already."""
+        """Close the bus if it is open."""
         if self._bus is not None:
             self._bus.shutdown()
         self._bus = self._beat = None
@@ -145,16 +145,16 @@ class Link:
         """Send frames in their order.
 
         Raises:
-            BusError: the bus has gone.
+            BusError: the bus is lost.
         """
         with bus_errors(self.address):
             send_burst(self.bus, messages)
 
     def pump(self, timeout_s: float) -> None:
-        """Handle one frame, waiting for it at most ``timeout_s``, or with 0 all that have already come, for PUMP_S.
+        """Handle one frame, waiting at most ``timeout_s`` for it; with 0, all frames that have already arrived.
 
         Raises:
-            BusError: the bus has gone, or is off.
+            BusError: the bus is lost, or off.
         """
         self.beat()
         with bus_errors(self.address):
@@ -164,51 +164,52 @@ class Link:
                 self.dispatch(message)
                 message = self.bus.recv(0.0) if self.clock() < end_ns else None
 
+    def pass_time(self) -> None:
+        """Send one SYNC and handle frames for 1 ms: a cell in lockstep advances by SYNC alone."""
+        self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
+        self.wait(0.001)
+
     def wait(self, seconds: float) -> None:
         """Handle frames for a time.
 
         Raises:
-            BusError: the bus has gone, or is off.
+            BusError: the bus is lost, or off.
         """
         deadline = self.clock() + round(seconds * 1e9)
         while (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
-        """Let the nodes hear us from now on, as a node of this id, whenever somebody reads the bus."""
+        """Send a heartbeat with this node id from now on, whenever the bus is read."""
         self._beat = can.Message(
             arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
         )
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
     def stop_heartbeat(self) -> None:
-        """Fall silent again."""
+        """Send no heartbeat any more."""
         self._beat = None
 
     def beat(self) -> None:
-        """Send our heartbeat if one is due.
-
-        Raises:
-            BusError: the bus has gone.
-        """
+        """Send our heartbeat if it is due."""
         if self._beat is not None and (now := self.clock()) >= self._next_beat_ns:
             self._next_beat_ns = now + self._beat_period_ns
             self.send((self._beat,))
 
     def dispatch(self, message: can.Message) -> bool:
-        """Take note of a frame; tells whether it was a heartbeat, EMCY, SDO answer or the command of another master.
+        """Process a frame; returns False for a frame (such as a PDO) that is left to the caller.
 
         Raises:
-            BusError: an error frame says that the controller went off the bus.
+            BusError: an error frame reports that the controller went off the bus.
         """
         if message.is_error_frame:
             self._note_error_frame(message)
         if message.is_error_frame or not message.is_rx:
-            return True  # or a SYNC of ours, which comes back for the sake of its time
+            return True  # also our own SYNC, which is received for its time stamp
         service, node_id = message.arbitration_id & 0x780, message.arbitration_id & 0x7F
         if message.is_extended_id or message.is_remote_frame:
             return False
-        ours = (service in _RPDOS and node_id in self.axis_ids) or (service == HEARTBEAT and node_id == self.own_id)
+        ours = (service in _RPDOS and node_id in self.names) or (service == HEARTBEAT and node_id == self.own_id)
         if message.arbitration_id in (_NMT_COB_ID, SYNC_COB_ID) or (service == SDO_REQUEST and node_id) or ours:
             if message.arbitration_id != SYNC_COB_ID or self.sync_producer is None:
                 self.note_foreign(message.arbitration_id)
@@ -238,7 +239,7 @@ class Link:
             self._events.append((node_id, EventKind.NMT, state, text))
 
     def _note_error_frame(self, message: can.Message) -> None:
-        """What the CAN controller says of itself; the kernel tells each change once."""
+        """Report the state of the CAN controller; the kernel sends each change once."""
         if message.arbitration_id & BUS_OFF:
             raise BusError(str(self.address), BUS_OFF_REASON)
         if message.arbitration_id & _RESTARTED:
@@ -248,25 +249,25 @@ class Link:
             text = "the CAN controller is error passive: check termination, wiring and bit rate"
             self._events.append((0, EventKind.BUS_PASSIVE, bits, text))
         elif bits:
-            says = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
-            description = ", ".join(text for mask, text in says if bits & mask) or f"says {bits:02X}h"
+            states = ((_OVERFLOW, "overflows, frames are lost"), (_WARNING, "counts errors"), (_ACTIVE, "recovered"))
+            description = ", ".join(text for mask, text in states if bits & mask) or f"reports {bits:02X}h"
             self._events.append((0, EventKind.CONTROLLER, bits, f"the CAN controller {description}"))
 
     def note_foreign(self, identifier: int) -> None:
-        """Take note of a frame of a master's, or of our own heartbeat, that neither we nor our SYNC producer sent."""
+        """Count a command, or a heartbeat with our node id, that neither we nor our SYNC producer sent."""
         self.foreign[identifier] = self.foreign.get(identifier, 0) + 1
-        if self.foreign[identifier] == 1:  # told once: a master would fill the log
+        if self.foreign[identifier] == 1:  # once: a master would fill the log
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
 
     def _note_emcy(self, node_id: int, data: bytearray) -> None:
         code, register = int.from_bytes(data[:2], "little"), data[2]
-        # CiA 301: codes 00xxh say that an error has gone.
+        # CiA 301: codes 00xxh report the end of an error.
         kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
         text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data[3:].hex()}"
         self._events.append((node_id, kind, code, text))
 
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
-        """Events since the last call, in their order; of nodes that are no axes of ours, with axis None."""
+        """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
         if not self._events:
             return ()
         taken, self._events = self._events, deque()
@@ -276,41 +277,45 @@ class Link:
                 node_ids.index(node) if node in node_ids else None,
                 kind,
                 code,
-                f"node {node}: {text}" if node else text,
+                f"{self.label(node)}: {text}" if node else text,
             )
             for node, kind, code, text in taken
         )
 
     @property
     def has_events(self) -> bool:
-        """Whether take_events would return something."""
+        """Whether take_events would return an event."""
         return bool(self._events)
 
+    def label(self, node_id: int) -> str:
+        """Name a node in a message, with its axis where it is one of ours."""
+        return node_label(self.objects(node_id))
+
     def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
-        """Access to the object dictionary of a node, with the link's policy or another."""
+        """Return access to the object dictionary of a node, with the link's policy or another."""
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
             client = SynchronousSdoClient(node_id, self.send, self.pump, self.clock, policy)
             self._clients.setdefault(node_id, []).append(client)
-            self._access[node_id, policy] = ObjectAccess(node_id, client, policy)
+            self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]
 
     def command_nmt(self, node_id: int, command: NmtCommand) -> int:
-        """Send an NMT command; node 0 means all. Returns when, by the clock [ns]."""
+        """Send an NMT command; node 0 means all. Returns the time by the clock [ns]."""
         now = self.clock()
         self.send((can.Message(arbitration_id=0, is_extended_id=False, data=bytes((command, node_id))),))
         return now
 
     def confirm_nmt(self, node_id: int, state: NmtState, since_ns: int, within_s: float) -> None:
-        """Wait for a heartbeat with this state that was read after ``since_ns``, by the clock.
+        """Wait for a heartbeat with this state that was read after ``since_ns`` by the clock.
 
         Raises:
-            NmtRefused: none came in time; canopen would have believed the command.
+            StateRefused: none came in time; canopen would have believed the command.
         """
         deadline = self.clock() + round(within_s * 1e9)
         while self.heard_ns.get(node_id, since_ns - 1) < since_ns or self.nmt[node_id] != state:
             left_ns = deadline - self.clock()
             if left_ns <= 0:
                 found = self.nmt.get(node_id) if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
-                raise NmtRefused(node_id, str(state), nmt_name(found), within_s)
+                raise StateRefused(self.objects(node_id), f"NMT {state}", f"{nmt_name(found)} after {within_s:.3g} s")
             self.pump(left_ns * 1e-9)

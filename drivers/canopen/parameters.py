@@ -1,8 +1,8 @@
-"""Numbers in the drives of a cell, written while no axis has power: read back, saved, and all of them or none.
+"""Read and write parameters in the drives of a cell while no axis has power: all of them or none.
 
-Nothing moves: this path sends no NMT command, no PDO and no controlword. Whatever fails, the old values are put back in
-every drive that was touched. A save may keep more than what was written: where it would keep the PDO mapping, the
-mapping must not be one that a recording left behind.
+Nothing moves: no NMT command, no PDO and no controlword is sent. Each write is read back and, where requested, saved.
+After a failure the old values are restored in every drive that was touched. A save may store more than the parameter:
+where it would store the PDO mapping, that must not be a mapping which a recording left behind.
 """
 
 from __future__ import annotations
@@ -12,77 +12,22 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import (
-    PDOS,
-    SETPOINT_PDOS,
-    STATUSWORD,
-    Direction,
-    PdoRecord,
-    feedback_entries,
-    pack,
-    read_record,
-    records,
-)
-from drivers.canopen.sdo import ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX, SdoPolicy
-from drivers.errors import DriverError, ObjectAccessError, ParametersMixed, PowerNotOff, ReadbackDiffers, SaveRefused
+from drivers.canopen.pdo import PDOS, SETPOINT_PDOS, STATUSWORD, Direction, feedback_entries, pack, read_record, records
+from drivers.canopen.sdo import SdoPolicy
+from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
 from drivers.motion.guard import CONSUMERS
 from drivers.profiles.cia402 import POWERLESS, decode
 from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Parameter
 
-# What a recording that was killed has left in a drive: its power takes it away, a save would keep it.
-
-
-def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
-    """What a drive still has of a recording that was killed, for a person; empty where it has nothing.
-
-    Raises:
-        ObjectAccessError: it does not let it be read.
-    """
-    watched = _watches_recorder(network, axis)
-    if watched:
-        return watched
-    access = network.link.objects(axis.node_id)
-    for ours in _recorded(axis):
-        found = read_record(access, ours.direction, ours.number)
-        if found is not None and (found.entries, found.transmission) == (ours.entries, ours.transmission):
-            return str(found)
-    return ""
-
-
-def _watches_recorder(network: CanopenNetwork, axis: Axis) -> str:
-    """Whether the drive waits for a recorder's heartbeat: a recording sets that first, and gives it back last."""
-    access = network.link.objects(axis.node_id)
-    try:
-        for sub in range(1, access.read(CONSUMERS) + 1):
-            value = access.read(ObjectEntry(CONSUMERS.index, sub, 32, signed=False))
-            if network.was_ours(value):
-                return f"{CONSUMERS.index:04X}h:{sub:02X} = {value:08X}h watches the recorder"
-    except ObjectAccessError as error:
-        # Only one that it does not have is none: whatever else it refuses may hide what was left.
-        if error.abort_code not in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
-            raise
-    return ""
-
-
-def _recorded(axis: Axis) -> tuple[PdoRecord, ...]:
-    """The PDOs that a recording sets up."""
-    try:
-        feedback = pack(feedback_entries(axis))[:PDOS]
-    except ValueError:
-        return ()  # of this drive nothing can be recorded
-    node_id = axis.node_id
-    return records(Direction.TPDO, node_id, feedback) + records(Direction.RPDO, node_id, SETPOINT_PDOS)
-
-
 SAVE_TIMEOUT_S = 10.0
-"""Drives write their whole memory: 0.4 s and more, and answer when it is done."""
+"""Drives write their whole memory, which takes 0.4 s and more, and answer when it is done."""
 
 
 class Saving(Enum):
-    """What is to outlive the drives' power.
+    """Whether the parameters outlive the drives' power.
 
-    KNOWN: every drive saves, and of every one it is known what that keeps. ANY: where it is not known too, as if it
-    kept the mapping. RAM: none saves; what is written is gone with the next power-off.
+    KNOWN: every drive saves, and it is known what that stores. ANY: a drive whose save is not fully known saves too, as
+    if it stored the mapping. RAM: no drive saves; the values are lost with its power.
     """
 
     KNOWN = "known"
@@ -92,14 +37,7 @@ class Saving(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ParameterValue:
-    """What stands in a drive.
-
-    Attributes:
-        axis: it belongs to.
-        identity: of the drive, as it told.
-        parameter: that was read.
-        word: its bits.
-    """
+    """A parameter read from a drive, with the drive's identity; `word` holds its bits."""
 
     axis: Axis
     identity: Identity
@@ -114,7 +52,7 @@ class ParameterValue:
 
 @dataclass(frozen=True, slots=True)
 class ParameterWrite:
-    """What is to stand in a drive: the bits of a number."""
+    """A parameter to write; `word` holds its bits."""
 
     axis: Axis
     parameter: Parameter
@@ -123,14 +61,7 @@ class ParameterWrite:
 
 @dataclass(frozen=True, slots=True)
 class ParameterChange:
-    """What was done to a drive.
-
-    Attributes:
-        axis: its name.
-        parameter: that was written.
-        old, new: its bits before and after.
-        saved: whether the drive was told to keep it.
-    """
+    """A parameter that was written: its bits before and after, and whether the drive saved it."""
 
     axis: str
     parameter: Parameter
@@ -141,7 +72,7 @@ class ParameterChange:
 
 @dataclass
 class _Progress:
-    """How far a write came: what must be undone when it fails."""
+    """Steps of a write that must be undone when it fails."""
 
     tried: list[ParameterWrite] = field(default_factory=list)
     saves: list[Axis] = field(default_factory=list)
@@ -152,11 +83,11 @@ def read_parameters(network: CanopenNetwork, wanted: Sequence[tuple[Axis, Parame
 
     Args:
         network: open, and not prepared for recording.
-        wanted: which parameter of which axis of the network.
+        wanted: parameters of axes of the network.
 
     Raises:
         BusBusy: another master commands this bus.
-        NodeMissing, IdentityMismatch, ObjectAccessError, BusError: see drivers/errors.py.
+        NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py.
     """
     network.require_quiet()
     identities = dict(zip(network.node_ids, network.check_identities(), strict=True))
@@ -180,18 +111,17 @@ def write_parameters(
 
     Args:
         network: open, and not prepared for recording.
-        writes: at most one an axis; how an axis saves, the network's own axes tell.
-        saving: whether the drives keep it.
-        begin: called with the old values, when nothing more is to be asked and before the first is overwritten; what
-            it raises stops the write.
-        save_timeout_s: how long a drive may take to save [s].
+        writes: at most one an axis; the network's own axes define how an axis saves.
+        saving: whether the drives save.
+        begin: called with the old values after all checks and before the first write; an exception stops the write.
+        save_timeout_s: time allowed for a save.
 
     Raises:
-        PowerNotOff: an axis of the network has power, or may have; looked at before and after each write.
-        SaveRefused: see `Saving`.
-        BusBusy, NodeMissing, IdentityMismatch, ObjectAccessError, BusError, ReadbackDiffers: see drivers/errors.py; the
-            old values stand.
-        ParametersMixed: as these, and the old values could not be put back everywhere.
+        ParameterRefused: an axis has power (checked before and after each write), a drive cannot save, or a value reads
+            back differently. The old values are in force.
+        BusBusy, NodeMissing, SetupRefused, ObjectAccessError, BusError: see drivers/errors.py; the old values are in
+            force.
+        ParametersMixed: as these, and the old values could not be restored everywhere.
     """
     axes = {axis.node_id: axis for axis in network.axes}
     writes = [replace(write, axis=axes[write.axis.node_id]) for write in writes]
@@ -216,7 +146,7 @@ def write_parameters(
         for axis in network.axes:
             _require_powerless(network, axis)
         network.require_alone()
-    except BaseException as error:  # an interrupt too: half of the gains are none
+    except BaseException as error:  # an interrupt too: a cell with half of the new gains has no valid set
         with network.block_signals():
             _undo(network, old, progress, save_timeout_s, error)
         raise
@@ -224,6 +154,35 @@ def write_parameters(
         ParameterChange(write.axis.name, write.parameter, value.word, write.word, saving is not Saving.RAM)
         for value, write in zip(old, writes, strict=True)
     )
+
+
+def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
+    """Describe settings of a killed recording in a drive; empty where there are none.
+
+    They are lost with the drive's power, and a save would keep them.
+
+    Raises:
+        ObjectAccessError: an object cannot be read.
+    """
+    access = network.link.objects(axis.node_id)
+    # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h proves that there
+    # is no watch; any other refusal may hide one.
+    for sub in range(1, (access.read_optional(CONSUMERS) or 0) + 1):
+        value = access.read_optional(ObjectEntry(CONSUMERS.index, sub, 32, signed=False))
+        if value is None:
+            break
+        if network.was_ours(value):
+            return f"{CONSUMERS.index:04X}h:{sub:02X} = {value:08X}h watches the recorder"
+    try:
+        feedback = pack(feedback_entries(axis))[:PDOS]
+    except ValueError:
+        return ""  # this drive cannot be recorded
+    node_id = axis.node_id
+    for ours in records(Direction.TPDO, node_id, feedback) + records(Direction.RPDO, node_id, SETPOINT_PDOS):
+        found = read_record(access, ours.direction, ours.number)
+        if found is not None and (found.entries, found.transmission) == (ours.entries, ours.transmission):
+            return str(found)
+    return ""
 
 
 def _put(network: CanopenNetwork, write: ParameterWrite) -> None:
@@ -238,7 +197,11 @@ def _check(network: CanopenNetwork, write: ParameterWrite) -> None:
     found = network.link.objects(write.axis.node_id).read(write.parameter.entry)
     if found != write.word:
         written, read = (f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found))
-        raise ReadbackDiffers(write.axis.node_id, str(write.parameter), written, read)
+        raise ParameterRefused(
+            write.axis,
+            f"object {write.parameter} reads back as {read}, written was {written}; does the drive limit or round it, "
+            "or is it another object?",
+        )
 
 
 def _save_noted(network: CanopenNetwork, axis: Axis, timeout_s: float, progress: _Progress) -> None:
@@ -247,7 +210,7 @@ def _save_noted(network: CanopenNetwork, axis: Axis, timeout_s: float, progress:
         _save(network, axis, timeout_s)
     except ObjectAccessError as error:
         if error.abort_code is not None:
-            progress.saves.remove(axis)  # it says itself that it kept nothing
+            progress.saves.remove(axis)  # an abort confirms that nothing was saved
         raise
 
 
@@ -255,7 +218,7 @@ def _save(network: CanopenNetwork, axis: Axis, timeout_s: float) -> None:
     save = axis.profile.save
     if save is not None:
         _require_powerless(network, axis)
-        # Asked once: a drive that is late is still busy with the first.
+        # One attempt: a drive that is late is still busy with the first.
         network.link.objects(axis.node_id, SdoPolicy(timeout_s, 1)).write(save.command, save.signature)
 
 
@@ -263,29 +226,27 @@ def _require_powerless(network: CanopenNetwork, axis: Axis) -> None:
     statusword = network.link.objects(axis.node_id).read(STATUSWORD)
     state = decode(statusword)
     if state not in POWERLESS:
-        raise PowerNotOff(axis.node_id, str(state), statusword)
+        raise ParameterRefused(
+            axis,
+            f"{state} (statusword {statusword:#06x}): its power stage is not off, and no parameter is written while it "
+            "is on; disable the axes with the controller that enabled them, then try again",
+        )
 
 
 def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> None:
     save = axis.profile.save
     if save is None:
-        raise SaveRefused(
-            axis.node_id,
-            f"is not described in its profile {axis.profile.name}",
-            "describe it there, or write to its RAM alone (--ram-only): the gain is then gone with its power",
-        )
-    if save.mapping is Mapping.UNKNOWN and saving is Saving.KNOWN:
-        raise SaveRefused(
-            axis.node_id,
-            f"keeps nobody knows what ({axis.profile.name}: {axis.profile.save_semantics})",
-            "write to its RAM alone (--ram-only), or let it save all the same (--save-unknown)",
-        )
-    if save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
-        raise SaveRefused(
-            axis.node_id,
-            f"would keep what a recording that was killed has left there ({left})",
-            "switch the drive off and on, so that it comes back with its own settings, and try again",
-        )
+        reason = f"is not described in its profile {axis.profile.name}"
+        remedy = "describe it there, or write to its RAM alone (--ram-only): the gain is then lost with its power"
+    elif save.mapping is Mapping.UNKNOWN and saving is Saving.KNOWN:
+        reason = f"may store more than the gain ({axis.profile.name}: {axis.profile.save_semantics})"
+        remedy = "write to its RAM alone (--ram-only), or let it save all the same (--save-unknown)"
+    elif save.mapping is not Mapping.SEPARATE and (left := recording_leftover(network, axis)):
+        reason = f"would keep settings of a recording that was killed ({left})"
+        remedy = "switch the drive off and on, so that it starts with its own settings, and try again"
+    else:
+        return
+    raise ParameterRefused(axis, f"nothing was written, because saving it {reason}; {remedy}")
 
 
 def _undo(
@@ -295,16 +256,16 @@ def _undo(
     timeout_s: float,
     error: BaseException,
 ) -> None:
-    """Put the old values back, and save them where the new ones may have been saved.
+    """Restore the old values, and save them where the new ones may have been saved.
 
     Raises:
-        ParametersMixed: not everywhere; what was raised before is its cause.
+        ParametersMixed: not everywhere; its cause is the error before.
     """
     tried = {write.axis.node_id for write in progress.tried}
     touched = [value for value in old if value.axis.node_id in tried]
     restored, problems = [], []
     try:
-        # One bound for all: asked in turn, drives that have gone would keep a person waiting.
+        # One time limit for all drives that do not answer.
         network.find_silent([value.axis for value in touched])
     except DriverError as problem:
         problems.append(str(problem))
@@ -313,16 +274,16 @@ def _undo(
             _put_back(network, value, save=value.axis in progress.saves, timeout_s=timeout_s)
             restored.append(value.axis.name)
         except DriverError as problem:
-            problems.append(f"{value.axis.name}: {problem}")
+            problems.append(str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}")
     if problems and touched:
         raise ParametersMixed(tuple(restored), tuple(problems)) from error
     if restored:
-        error.add_note(f"kept: the old values stand again in {', '.join(restored)}")
+        error.add_note(f"kept: the old values are restored in {', '.join(restored)}")
 
 
 def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool, timeout_s: float) -> None:
     if value.axis.node_id in network.link.silent:
-        raise ObjectAccessError(value.axis.node_id, str(value.parameter), "the node does not answer any more")
+        raise ObjectAccessError(value.axis, str(value.parameter), "the node does not answer any more")
     write = ParameterWrite(value.axis, value.parameter, value.word)
     access = network.link.objects(value.axis.node_id)
     if access.read(value.parameter.entry) != value.word:

@@ -1,4 +1,4 @@
-"""PDO mapping: packing objects into frames, writing the mapping in the one order that drives accept, and undoing it.
+"""PDO mapping: pack objects into frames, write the mapping in the order that drives accept, and restore it.
 
 Source: CiA 301, objects 1400h–1BFFh: communication parameters (COB-ID with bit 31 = not valid, transmission type) and
 mapping parameters (count, then index << 16 | subindex << 8 | bits).
@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from drivers.canopen.sdo import ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX, ObjectAccess
-from drivers.errors import MappingRefused, ObjectAccessError
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import Axis, ObjectEntry
 
 PDO_BYTES = 8
 PDOS = 4
-"""The predefined connection set names four PDOs a direction."""
+"""PDOs of the predefined connection set, in each direction."""
 NOT_VALID = 1 << 31
 _COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
 SYNCHRONOUS = 1
@@ -34,7 +34,7 @@ _CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (3
 
 
 class Direction(Enum):
-    """Of a PDO as the drive sees it: (communication index, mapping index, first COB-ID)."""
+    """Direction seen from the drive; the value is (communication index, mapping index, first COB-ID)."""
 
     TPDO = (0x1800, 0x1A00, 0x180)
     RPDO = (0x1400, 0x1600, 0x200)
@@ -42,11 +42,11 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PdoRecord:
-    """What a drive's dictionary says about one PDO.
+    """Communication and mapping parameters of one PDO in a drive.
 
     Attributes:
-        direction, number: which PDO; numbers from 0.
-        cob_id: sub 1 as it is, with its flag bits.
+        direction, number: of the PDO; numbers from 0.
+        cob_id: sub 1 with its flag bits.
         transmission: type, sub 2.
         entries: mapped objects, each as the 32-bit word of the mapping parameter.
     """
@@ -63,12 +63,12 @@ class PdoRecord:
 
     @property
     def name(self) -> str:
-        """As the manuals call it."""
+        """Name as in the drives' manuals: TPDO1."""
         return f"{self.direction.name}{self.number + 1}"
 
 
 def word(entry: ObjectEntry) -> int:
-    """Mapping parameter of an object."""
+    """Return the mapping parameter of an object."""
     return entry.index << 16 | entry.subindex << 8 | entry.bits
 
 
@@ -94,12 +94,12 @@ def pack(entries: Sequence[ObjectEntry]) -> tuple[tuple[ObjectEntry, ...], ...]:
 
 
 def layout(entries: Sequence[ObjectEntry]) -> struct.Struct:
-    """The payload of a PDO: little endian, at constant offsets."""
+    """Return the payload of a PDO: little endian, at constant offsets."""
     return struct.Struct("<" + "".join(_CODES[entry.bits, entry.signed] for entry in entries))
 
 
 def records(direction: Direction, node_id: int, pdos: Sequence[Sequence[ObjectEntry]]) -> tuple[PdoRecord, ...]:
-    """Synchronous PDOs with the predefined COB-IDs of a node."""
+    """Return synchronous PDOs with the predefined COB-IDs of a node."""
     return tuple(
         PdoRecord(direction, number, direction.value[2] + 0x100 * number + node_id, SYNCHRONOUS, tuple(map(word, pdo)))
         for number, pdo in enumerate(pdos)
@@ -107,7 +107,7 @@ def records(direction: Direction, node_id: int, pdos: Sequence[Sequence[ObjectEn
 
 
 def feedback_entries(axis: Axis) -> tuple[ObjectEntry, ...]:
-    """What an axis reports for a Sample: position, current, statusword, in this order."""
+    """Return the objects of a Sample: position, current, statusword, in this order."""
     return (axis.profile.position, axis.profile.current, STATUSWORD)
 
 
@@ -116,7 +116,7 @@ SETPOINT_PDOS = (
     (PROFILE_VELOCITY, PROFILE_ACCELERATION),
     (PROFILE_DECELERATION,),
 )
-"""What an axis is told. The first alone is sent in the cycle in which all axes start."""
+"""Set-points of an axis. Only the first PDO is sent in the cycle in which all axes start."""
 
 
 def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectEntry, ObjectEntry]:
@@ -129,18 +129,15 @@ def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectE
 
 
 def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
-    """One PDO as the drive has it, or None when the drive has no such PDO.
+    """Read one PDO of a drive; None when the drive has no such PDO.
 
     Raises:
-        ObjectAccessError: the drive has it and does not let it be read.
+        ObjectAccessError: the drive has it and refuses to let it be read.
     """
     cob_id, transmission, count = _parameters(direction, number)
-    try:
-        identifier = access.read(cob_id)
-    except ObjectAccessError as error:
-        if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
-            return None
-        raise
+    identifier = access.read_optional(cob_id)
+    if identifier is None:
+        return None
     mapped = access.read(count)
     entries = tuple(access.read(ObjectEntry(count.index, sub, 32, signed=False)) for sub in range(1, mapped + 1))
     return PdoRecord(direction, number, identifier, access.read(transmission), entries)
@@ -149,10 +146,10 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
 def write_record(access: ObjectAccess, record: PdoRecord) -> None:
     """Write one PDO, read it back and compare.
 
-    Drives accept this order alone: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid.
+    Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid.
 
     Raises:
-        MappingRefused: a step was aborted, or it reads back differently.
+        SetupRefused: a step was aborted, or the PDO reads back differently.
     """
     cob_id, transmission, count = _parameters(record.direction, record.number)
     steps = [(cob_id, access.read(cob_id) | NOT_VALID), (count, 0)]
@@ -164,27 +161,26 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
         try:
             access.write(entry, value)
         except ObjectAccessError as error:
-            reason = f"writing {value:#x} to {entry}: {error.reason}"
-            raise MappingRefused(access.node_id, record.name, reason) from error
+            raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
     found = read_record(access, record.direction, record.number)
     if found is None or not _same(found, record):
-        raise MappingRefused(access.node_id, record.name, f"reads back as '{found}', written was '{record}'")
+        raise SetupRefused(access, f"{record.name}: reads back as '{found}', written was '{record}'")
 
 
 def switch_off(access: ObjectAccess, record: PdoRecord) -> None:
-    """Make a PDO not valid and leave its mapping alone.
+    """Mark a PDO as not valid and leave its mapping alone.
 
     Raises:
-        MappingRefused: the drive does not let it be switched off.
+        SetupRefused: the drive refused.
     """
     _write_cob_id(access, record, record.cob_id | NOT_VALID)
 
 
 def restore(access: ObjectAccess, record: PdoRecord) -> None:
-    """Give a PDO back what it had, with as few writes as that needs.
+    """Restore the original parameters of a PDO with as few writes as possible.
 
     Raises:
-        MappingRefused: a step was aborted, or it reads back differently.
+        SetupRefused: a step was aborted, or the PDO reads back differently.
     """
     found = read_record(access, record.direction, record.number)
     if found == record:
@@ -199,14 +195,13 @@ def _write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
     cob_id, _, _ = _parameters(record.direction, record.number)
     try:
         if not value & NOT_VALID:
-            access.write(cob_id, access.read(cob_id) | NOT_VALID)  # the rest may change only then
+            access.write(cob_id, access.read(cob_id) | NOT_VALID)  # the rest may change only while it is not valid
         access.write(cob_id, value)
         found = access.read(cob_id)
     except ObjectAccessError as error:
-        reason = f"writing {value:#x} to {cob_id}: {error.reason}"
-        raise MappingRefused(access.node_id, record.name, reason) from error
+        raise SetupRefused(access, f"{record.name}: writing {value:#x} to {cob_id}: {error.reason}") from error
     if (found ^ value) & _COB_ID_BITS:
-        raise MappingRefused(access.node_id, record.name, f"{cob_id} reads back as {found:#x}, written was {value:#x}")
+        raise SetupRefused(access, f"{record.name}: {cob_id} reads back as {found:#x}, written was {value:#x}")
 
 
 def _same(one: PdoRecord, other: PdoRecord) -> bool:

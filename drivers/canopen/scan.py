@@ -1,18 +1,21 @@
-"""Who is on a bus, found without changing anything there."""
+"""Find the nodes of a bus without changing anything there."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import can
 
+from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import Link
 from drivers.canopen.pdo import STATUSWORD
-from drivers.canopen.sdo import ObjectAccess
+from drivers.canopen.sdo import ObjectAccess, SdoPolicy
 from drivers.errors import NodeMissing, ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
+from drivers.stream.split_bus import CellAddress
 
 VENDOR_ID = ObjectEntry(0x1018, 1, 32, signed=False)
 PRODUCT_CODE = ObjectEntry(0x1018, 2, 32, signed=False)
@@ -23,10 +26,10 @@ _READ_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """One node of a bus, as far as it tells.
+    """One node of a bus, as far as it reports.
 
     Attributes:
-        node_id: of the node.
+        node_id: CANopen node id.
         identity: object 1018h, or None when it answers no SDO (it may be stopped).
         revision: 1018h:03, or None.
         device_name: 1008h, or None.
@@ -47,11 +50,33 @@ class FoundNode:
         return None if self.statusword is None else decode(self.statusword)
 
 
-def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
-    """All nodes that answer an SDO request or send a heartbeat within a time.
+def scan_bus(
+    address: CellAddress | str, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5
+) -> tuple[FoundNode, ...]:
+    """Open a bus and find its nodes; changes nothing.
+
+    Args:
+        address: of the bus, such as ``"socketcan:can0"``.
+        node_ids: to search.
+        wait_s: for answers and heartbeats.
 
     Raises:
-        BusError: the bus has gone.
+        BusError: the bus cannot be opened, or is lost.
+    """
+    place = BusAddress.parse(address) if isinstance(address, str) else address
+    link = Link(place, SdoPolicy(), time.monotonic_ns)
+    link.open()
+    try:
+        return scan(link, node_ids, wait_s)
+    finally:
+        link.close()
+
+
+def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
+    """Find all nodes that answer an SDO request or send a heartbeat within a time.
+
+    Raises:
+        BusError: the bus is lost.
     """
     answered = answering(link, node_ids, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
@@ -65,25 +90,25 @@ def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
         NodeMissing: some do not.
     """
     answered = answering(link, node_ids, wait_s)
-    missing = tuple(node_id for node_id in node_ids if node_id not in answered)
+    missing = [link.objects(node_id) for node_id in node_ids if node_id not in answered]
     if missing:
         raise NodeMissing(missing, answered, wait_s)
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Object 1018h; a node that has no serial number there reports None.
+    """Read object 1018h; the serial is None where a node has none.
 
     Raises:
-        ObjectAccessError: it does not tell vendor and product.
+        ObjectAccessError: it does not report vendor and product.
     """
     return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Nodes that answer an SDO request; all are asked at once, and the bound is for all together.
+    """Return the nodes that answer an SDO request; all are asked at once, and share the time.
 
     Raises:
-        BusError: the bus has gone.
+        BusError: the bus is lost.
     """
     asked = set(node_ids)
     link.answered.clear()
@@ -94,11 +119,11 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     return tuple(sorted(asked & link.answered))
 
 
-def unused(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Find node ids of which nothing came since the bus was opened, and no answer to an SDO request within a time.
+def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Return the node ids of which no frame came since the bus was opened, nor an SDO answer within a time.
 
     Raises:
-        BusError: the bus has gone.
+        BusError: the bus is lost.
     """
     _ask(link, node_ids)
     link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone

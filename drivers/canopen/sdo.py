@@ -1,4 +1,4 @@
-"""SDO access that reads the bus itself, keeps its own retries, and never takes an old answer for a new one."""
+"""SDO access that reads the bus itself, retries, and never accepts an old answer for a new one."""
 
 from __future__ import annotations
 
@@ -27,21 +27,89 @@ T = TypeVar("T")
 Send = Callable[[Sequence[can.Message]], None]
 """Sends frames."""
 Pump = Callable[[float], None]
-"""Reads the bus for at most the given time [s] and dispatches what comes; returns after each frame."""
+"""Reads the bus for at most the given time [s] and dispatches frames; returns after each frame."""
 Clock = Callable[[], int]
 """Monotonic time [ns]."""
 
 
 @dataclass(frozen=True, slots=True)
 class SdoPolicy:
-    """How long to wait for an answer [s], and how often to ask; answers do get lost near SYNC traffic."""
+    """Time to wait for an answer [s], and number of attempts; answers do get lost near SYNC traffic."""
 
     timeout_s: float = 0.5
     attempts: int = 3
 
 
+class ObjectAccess:
+    """Reads and writes the object dictionary of one node; every failure is an ObjectAccessError."""
+
+    def __init__(self, node_id: int, client: SynchronousSdoClient, policy: SdoPolicy, name: str = "") -> None:
+        self.node_id = node_id
+        self.name = name
+        self._client = client
+        self._policy = policy
+
+    def read(self, entry: ObjectEntry) -> int:
+        """Read an integer object.
+
+        Raises:
+            ObjectAccessError: aborted, not answered, or shorter than the entry.
+        """
+        data = self.read_bytes(entry.index, entry.subindex)
+        if 8 * len(data) < entry.bits:
+            raise ObjectAccessError(self, str(entry), f"has {8 * len(data)} bits, expected {entry.bits}")
+        # Some drives send four bytes whatever the object's size is.
+        return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
+
+    def read_optional(self, entry: ObjectEntry) -> int | None:
+        """Read an integer object that a drive need not have; None where it has none.
+
+        Raises:
+            ObjectAccessError: any other failure.
+        """
+        try:
+            return self.read(entry)
+        except ObjectAccessError as error:
+            if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
+                return None
+            raise
+
+    def write(self, entry: ObjectEntry, value: int) -> None:
+        """Write an integer object.
+
+        Raises:
+            ObjectAccessError: aborted, not answered, or the value does not fit the entry.
+        """
+        try:
+            data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
+        except OverflowError as error:
+            raise ObjectAccessError(self, str(entry), f"{value} does not fit {entry.bits} bits") from error
+        self._attempt(str(entry), lambda: self._client.download(entry.index, entry.subindex, data))
+
+    def read_text(self, index: int, subindex: int = 0) -> str:
+        """Read a visible string, without its padding."""
+        return self.read_bytes(index, subindex).rstrip(b"\0 ").decode("utf-8", "replace")
+
+    def read_bytes(self, index: int, subindex: int) -> bytes:
+        """Read the raw bytes of any object."""
+        name = f"{index:04X}h:{subindex:02X}"
+        return self._attempt(name, lambda: self._client.upload(index, subindex))
+
+    def _attempt(self, name: str, transfer: Callable[[], T]) -> T:
+        reason = ""
+        for _ in range(self._policy.attempts):
+            try:
+                return transfer()
+            except SdoAbortedError as error:
+                # An abort is an answer: another attempt would get it again.
+                raise ObjectAccessError(self, name, f"aborted, {error}", error.code) from error
+            except SdoCommunicationError as error:
+                reason = str(error)
+        raise ObjectAccessError(self, name, f"{reason}, asked {self._policy.attempts} times")
+
+
 class SynchronousSdoClient(SdoClient):
-    """canopen's SDO client without the thread behind it: it reads the bus while it waits.
+    """canopen's SDO client without its thread: it reads the bus while it waits.
 
     canopen leaves reading to a Notifier thread, which dies silently of an exception and would be a second reader beside
     the stream. Here the caller is the only reader.
@@ -55,19 +123,19 @@ class SynchronousSdoClient(SdoClient):
         self._policy = policy
 
     def receive(self, data: bytearray) -> None:
-        """Take an answer that somebody read from the bus."""
+        """Accept an answer that was read from the bus."""
         self.responses.put(bytes(data))
 
     def send_request(self, request: bytes) -> None:
-        """Send a request; what the bus says goes through as BusError."""
+        """Send a request; a failing bus raises BusError."""
         self._send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
 
     def abort(self, abort_code: int = _ABORT_TIMED_OUT) -> None:
-        """Tell the node that we gave up."""
+        """Abort the transfer on the node's side."""
         self.send_request(struct.pack("<B3xL", _ABORT, abort_code))
 
     def read_response(self) -> bytes:
-        """The next answer of the node.
+        """Wait for the next answer of the node.
 
         Raises:
             SdoCommunicationError: none within the policy's time.
@@ -95,7 +163,7 @@ class SynchronousSdoClient(SdoClient):
         self._pump(0.0)
         self.responses = Queue()
         self.send_request(sdo_request)
-        asked = bytes(sdo_request[1:4])
+        requested = bytes(sdo_request[1:4])
         names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD)
         while True:
             try:
@@ -104,62 +172,8 @@ class SynchronousSdoClient(SdoClient):
                 self.abort()
                 raise
             about = response[1:4]
-            if names_object and about != asked and not (response[0] == _ABORT and about == b"\0\0\0"):
+            if names_object and about != requested and not (response[0] == _ABORT and about == b"\0\0\0"):
                 continue  # a late answer to an earlier request
             if response[0] == _ABORT:
                 raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
             return response
-
-
-class ObjectAccess:
-    """Reads and writes the object dictionary of one node; every failure is an ObjectAccessError."""
-
-    def __init__(self, node_id: int, client: SynchronousSdoClient, policy: SdoPolicy) -> None:
-        self.node_id = node_id
-        self._client = client
-        self._policy = policy
-
-    def read(self, entry: ObjectEntry) -> int:
-        """Value of an integer object.
-
-        Raises:
-            ObjectAccessError: aborted, not answered, or shorter than the entry says.
-        """
-        data = self.read_bytes(entry.index, entry.subindex)
-        if 8 * len(data) < entry.bits:
-            raise ObjectAccessError(self.node_id, str(entry), f"has {8 * len(data)} bits, expected {entry.bits}")
-        # Some drives send four bytes whatever the object's size is.
-        return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
-
-    def write(self, entry: ObjectEntry, value: int) -> None:
-        """Write an integer object.
-
-        Raises:
-            ObjectAccessError: aborted, not answered, or the value does not fit the entry.
-        """
-        try:
-            data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
-        except OverflowError as error:
-            raise ObjectAccessError(self.node_id, str(entry), f"{value} does not fit {entry.bits} bits") from error
-        self._attempt(str(entry), lambda: self._client.download(entry.index, entry.subindex, data))
-
-    def read_text(self, index: int, subindex: int = 0) -> str:
-        """Value of a visible string, without its padding."""
-        return self.read_bytes(index, subindex).rstrip(b"\0 ").decode("utf-8", "replace")
-
-    def read_bytes(self, index: int, subindex: int) -> bytes:
-        """Value of any object as it comes."""
-        name = f"{index:04X}h:{subindex:02X}"
-        return self._attempt(name, lambda: self._client.upload(index, subindex))
-
-    def _attempt(self, name: str, transfer: Callable[[], T]) -> T:
-        reason = ""
-        for _ in range(self._policy.attempts):
-            try:
-                return transfer()
-            except SdoAbortedError as error:
-                # An abort is an answer: asking again would get it again.
-                raise ObjectAccessError(self.node_id, name, f"aborted, {error}", error.code) from error
-            except SdoCommunicationError as error:
-                reason = str(error)
-        raise ObjectAccessError(self.node_id, name, f"{reason}, asked {self._policy.attempts} times")

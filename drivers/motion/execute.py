@@ -1,4 +1,4 @@
-"""Walking a list of moves through CiA 402 profile position mode, one Sample after the other.
+"""Make a list of moves in CiA 402 profile position mode, one Sample after the other.
 
 Source: CiA 402-2, profile position mode: a set-point is taken on the rising edge of controlword bit 4, acknowledged by
 statusword bit 12, and reached at bit 10. Set-points go by synchronous RPDOs, so that all axes start on the same SYNC.
@@ -13,7 +13,7 @@ import can
 
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, layout
-from drivers.errors import WHILE, DataFrozen, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused
+from drivers.errors import WHILE, DriveFault, DriverError, MotionRefused, MotionTimeout, StateRefused, node_label
 from drivers.motion.move import MotionPermission, Move, check_moves
 from drivers.motion.watch import FrozenData
 from drivers.profiles.cia402 import (
@@ -38,19 +38,19 @@ _ENABLED = Command.ENABLE_OPERATION
 
 @dataclass(frozen=True, slots=True)
 class MotionBounds:
-    """How long the drives may take, in the time of the samples [s], and how near a target is.
+    """Time limits in the time of the samples [s], and distances that count as standstill and as arrival.
 
     Attributes:
         enable_s: from the first controlword to OPERATION ENABLED.
         acknowledge_s: from a set-point to bit 12, and from its end to bit 12 cleared.
         settle_s: added to a move's computed duration.
         stop_s: from the quick stop to standstill without power.
-        standstill_cycles, standstill_counts: an axis that stays in QUICK STOP ACTIVE stands, and loses its power, when
-            its position has kept within so many counts for so many cycles. An encoder at rest never shows one count
-            for ever: one of 20 bits a turn flickers by several. 16 counts in 20 cycles of 1 ms are at most
-            800 counts/s, 0.3 deg/s of such a motor, which no brake minds.
-        arrival_counts, arrival_fraction: a target that bit 10 calls reached must be as near as this, in counts plus a
-            fraction of the distance: it catches a drive whose bit 10 is still that of the move before.
+        standstill_cycles, standstill_counts: an axis that stays in QUICK STOP ACTIVE is at standstill, and loses its
+            power, when its position has kept within this many counts for this many cycles. An encoder of 20 bits a turn
+            flickers by several counts at rest. 16 counts in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of
+            such a motor, which is harmless to a brake.
+        arrival_counts, arrival_fraction: largest distance from a target that bit 10 reports as reached, in counts plus
+            a fraction of the way: it catches a drive whose bit 10 is still that of the move before.
     """
 
     enable_s: float = 3.0
@@ -75,21 +75,21 @@ def execute(
 ) -> Generator[Sample, None, None]:
     """Enable all axes, make the moves, disable all axes; yields every Sample on the way.
 
-    Whatever ends it, the last word is quick stop, then power off, confirmed as far as the bus allows. Close it
+    However it ends, all axes get quick stop, then power off, confirmed as far as the bus allows. Close it
     (``contextlib.closing``) when the loop around it may be left early; leaving the network stops the axes as well.
 
     Raises:
         MotionRefused: no permission, or a move outside of it; nothing has moved.
         StateRefused: an axis did not become OPERATION ENABLED, or could not be stopped.
-        MotionTimeout: a move did not end in its bound.
-        DataFrozen: an axis is told to move, and its position and current stay what they are.
-        DriveFault, HeartbeatLost, SampleLost, BusError, NodeMisplaced: see the stream.
+        MotionTimeout: a move did not end in time.
+        DriveFault: position and current of a moving axis do not change; or as the stream.
+        SampleLost, BusError, BusBusy, NodeMisplaced: as the stream.
     """
     if permission is None:
-        raise MotionRefused("no permission: nothing moves unless somebody says so (MotionPermission)")
+        raise MotionRefused("motion is disabled; pass a MotionPermission that names the operator")
     first = next(stream)
     yield first
-    while first.missing:  # where an axis is must be known before it is told where to go
+    while first.missing:  # the position of every axis must be known before it gets a target
         first = next(stream)
         yield first
     check_moves(first.position_counts, moves, permission, tuple(axis.name for axis in network.axes))
@@ -102,7 +102,7 @@ def execute(
         for number, move in enumerate(moves):
             yield from walk.move(number, move)
         problems = yield from walk.stop()
-        if not problems:  # amplifiers that were not seen to stand go on watching us
+        if not problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
@@ -118,7 +118,7 @@ def execute(
         for problem in problems[1:]:
             problems[0].add_note(f"{WHILE}stopping: {problem}")
         raise problems[0]
-    stream.check()  # what happened during the stop
+    stream.check()  # faults during the stop
 
 
 def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError]:
@@ -134,14 +134,14 @@ def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError
 
 
 class _Walk:
-    """One run of ``execute``: the stream, the last sample and what each axis was told last."""
+    """One run of ``execute``: the stream, the last sample and the last command of each axis."""
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
         self._network = network
         self._stream = stream
         self._bounds = bounds
         self._sample = first
-        self._nodes = network.node_ids
+        self._nodes = network.axes
         self._axes = range(len(network.axes))
         self._targets = list(first.position_counts)
         self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
@@ -157,11 +157,11 @@ class _Walk:
         return decode(self._sample.statusword[axis])
 
     def _send_command(self, axis: int, controlword: int, repeat: bool = False) -> None:
-        """Controlword and target of one axis, with the next SYNC; said again only when asked."""
+        """Send controlword and target of one axis with the next SYNC; an unchanged pair only on request."""
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
-            self._stream.send((_frame(self._nodes[axis], 0, controlword, self._targets[axis]),))
+            self._stream.send((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
 
     def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
@@ -192,13 +192,14 @@ class _Walk:
         raise StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:
-        """One move of all axes that have a way to go, and the dwell after it."""
+        """Make one move of all axes with a distance to go, and the dwell after it."""
         start = tuple(self._targets)
         moving = [axis for axis in self._axes if move.target_counts[axis] != start[axis]]
         for axis in moving:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
-            profile = (move.velocity_counts_s[axis], move.acceleration_counts_s2[axis])
-            self._stream.send((_frame(self._nodes[axis], 1, *profile), _frame(self._nodes[axis], 2, profile[1])))
+            velocity, acceleration = move.velocity_counts_s[axis], move.acceleration_counts_s2[axis]
+            node_id = self._nodes[axis].node_id
+            self._stream.send((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
@@ -220,26 +221,30 @@ class _Walk:
         else:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
-                raise MotionTimeout(number, late, allowed)
+                raise self._timeout(number, late, allowed)
         self._emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
     def _freeze(self, number: int, axis: int) -> None:
         position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
-        error = DataFrozen(number, self._nodes[axis], position, current)
+        error = DriveFault(
+            self._nodes[axis],
+            f"move {number}: position {position} and current {current} do not change during the move",
+            remedy="is its data frozen, its encoder or its motor cable off?",
+        )
         self._emit(axis, EventKind.FROZEN, number, str(error))
         raise error
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
-        """New set-point on all axes with the same SYNC, acknowledged, and taken back."""
+        """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
         rising = _ENABLED | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
         bound = self._cycles(self._bounds.acknowledge_s)
         for wanted, controlword in ((STATUS_SETPOINT_ACKNOWLEDGE, rising), (0, int(_ENABLED))):
             waiting = list(moving)
             for _ in range(bound):
                 for axis in waiting:
-                    # Said every cycle until acknowledged: some drives act on the second controlword only.
+                    # Repeated every cycle until acknowledged: some drives act on the second controlword only.
                     self._send_command(axis, controlword, repeat=True)
                 if not waiting:
                     break
@@ -248,7 +253,10 @@ class _Walk:
                     axis for axis in moving if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE != wanted
                 ]
             if waiting:
-                raise MotionTimeout(number, tuple(waiting), self._bounds.acknowledge_s)
+                raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s)
+
+    def _timeout(self, number: int, late: tuple[int, ...], waited_s: float) -> MotionTimeout:
+        return MotionTimeout(number, late, [self._nodes[axis].name for axis in late], waited_s)
 
     def _arrived(self, axis: int, start: int) -> bool:
         tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(self._targets[axis] - start)
@@ -256,31 +264,31 @@ class _Walk:
         return near and bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)
 
     def _checked(self) -> Sample:
-        """The next sample, of axes that all still hold."""
+        """Return the next sample, in which all axes are still enabled."""
         sample = self._next()
         for axis in self._axes:
             if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
                 word = sample.statusword[axis]
-                self._stream.check()  # what the drive itself says of it
+                self._stream.check()  # the drive's own report says more
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
     def ended_by(self, error: BaseException) -> None:
-        """Say why the moves are not made."""
+        """Log why the moves ended early."""
         self._emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
 
     def stop(self) -> Generator[Sample, None, list[DriverError]]:
-        """Quick stop and power off for all axes; returns what could not be confirmed."""
-        self._stream.drop_outgoing()  # a set-point that nobody has seen yet must not start a move now
+        """Quick stop all axes, then remove their power; returns the failures to confirm it."""
+        self._stream.drop_outgoing()  # a set-point that was not sent yet must not start a move now
         self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         problems: list[DriverError] = []
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
-            # What the last cycle left is counted before SDO answers are looked for among it.
+            # The rest of the last cycle is counted before SDO answers are read.
             self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
         except DriverError as error:
-            # It may be one of several buses, or a node in a wrong place: those that can be reached are asked by SDO.
+            # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
             self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
             problems.append(error)
         try:
@@ -290,12 +298,12 @@ class _Walk:
             return problems or [error]
         if silent is not None:
             problems.append(silent)
-        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis] not in silent.node_ids]
+        heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
         if heard:
             self._network.begin_stop([self._network.axes[axis] for axis in heard])
         for axis in unconfirmed:
             if axis not in heard:
-                text = f"node {self._nodes[axis]} does not answer: it is not known to stand"
+                text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
                 self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
                 continue
             try:
@@ -306,7 +314,7 @@ class _Walk:
         return problems
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
-        """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm it."""
+        """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
         still, rest = [0] * len(self._sent), list(self._sample.position_counts)
         silent = 0
         powered = list(self._axes)
@@ -319,7 +327,7 @@ class _Walk:
             self._sample = self._stream.advance()
             yield self._sample
             for axis, position in enumerate(self._sample.position_counts):
-                # Against where it came to rest, not against the cycle before: creeping is no standstill.
+                # Compared with the position of rest, not with the cycle before: creeping is no standstill.
                 near = abs(position - rest[axis]) <= self._bounds.standstill_counts
                 known = not self._sample.missing >> axis & 1
                 still[axis] = still[axis] + 1 if near and known else 0
@@ -328,17 +336,13 @@ class _Walk:
             powered = [
                 axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
             ]
-            patience = (
-                0
-                if self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
-                else (self._stream.max_missing_cycles)
-            )
-            if not powered or silent > patience:
+            lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
+            if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
                 break
         return tuple(powered)
 
 
 def _frame(node_id: int, pdo: int, *values: int) -> can.Message:
-    """One RPDO of the set-point mapping."""
+    """Return one RPDO of the set-point mapping."""
     cob_id = Direction.RPDO.value[2] + 0x100 * pdo + node_id
     return can.Message(arbitration_id=cob_id, is_extended_id=False, data=_LAYOUTS[pdo].pack(*values))

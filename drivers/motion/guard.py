@@ -1,11 +1,11 @@
-"""Amplifiers that stop by themselves when the recorder falls silent: killed, hung, or cut off.
+"""Let amplifiers stop by themselves when the recorder falls silent: killed, hung, or cut off.
 
 The recorder sends a heartbeat while axes have power. Each amplifier watches it (CiA 301, consumer heartbeat time 1016h,
-which begins with the first heartbeat) and, when none comes, does what its abort connection option code says (CiA 402-2,
-6007h): quick stop.
+which begins with the first heartbeat). When none comes, it acts by its abort connection option code (CiA 402-2, 6007h):
+quick stop.
 
-A heartbeat does not say who sends it. That of another device with the recorder's node id would keep the axes running
-after the recorder was killed, so the recorder takes an id that no device uses, and a foreign heartbeat with it is a
+A heartbeat does not identify its sender. Another device with the recorder's node id would keep the axes running after
+the recorder was killed. The recorder therefore takes an id that no device uses, and a foreign heartbeat with it is a
 fault.
 """
 
@@ -24,18 +24,21 @@ QUICK_STOP_ON_LOSS = 3
 MOST_CONSUMERS = 127
 """Entries that 1016h can have (CiA 301)."""
 LOWEST_USUAL_ID = 112
-"""The recorder takes the highest id that is free: this one or a higher one on any usual bus."""
+"""The recorder takes the highest free id: this one or a higher one on any usual bus."""
+
+Consumers = tuple[tuple[ObjectEntry, int], ...]
+"""Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guard:
-    """How an amplifier can watch the recorder, and what its objects held before.
+    """How an amplifier can watch the recorder, and the original values of the objects.
 
     Attributes:
         consumer: entry of 1016h that is used, None when there is none.
-        consumer_before: its value.
-        option_before: value of 6007h, None when the amplifier has no such object.
-        lack: what it cannot do, for a person; empty when it does all.
+        consumer_before: its original value.
+        option_before: original value of 6007h, None when the amplifier has no such object.
+        lack: missing capability, in words; empty when nothing is missing.
     """
 
     consumer: ObjectEntry | None
@@ -43,13 +46,15 @@ class Guard:
     option_before: int | None
     lack: str = ""
 
-
-Consumers = tuple[tuple[ObjectEntry, int], ...]
-"""Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
+    def describe(self, silence_ms: int) -> str:
+        """Describe the guard in words, for the log."""
+        if self.consumer is None:
+            return self.lack
+        return f"watches the recorder by {self.consumer}, {silence_ms} ms" + (f"; {self.lack}" if self.lack else "")
 
 
 def producer_of(value: int) -> int:
-    """Node id that an entry of 1016h watches, 0 where it watches none."""
+    """Return the node id that an entry of 1016h watches, 0 where it watches none."""
     return value >> 16 & 0x7F if value & 0xFFFF else 0
 
 
@@ -58,9 +63,9 @@ def is_left_over(value: int, recorder_id: int, silence_ms: int, heard: Collectio
 
     Args:
         value: of the entry.
-        recorder_id: of the recorder now. Another device may have had it use another id then.
-        silence_ms: that it lets the amplifiers bear.
-        heard: node ids of devices that are there: an entry that watches one of them is in use.
+        recorder_id: of the recorder now. It may have used another id before, because of another device.
+        silence_ms: allowed by the recorder.
+        heard: node ids of present devices: an entry that watches one of them is in use.
     """
     producer = producer_of(value)
     usual = producer >= LOWEST_USUAL_ID and value & 0xFFFF == silence_ms
@@ -68,7 +73,7 @@ def is_left_over(value: int, recorder_id: int, silence_ms: int, heard: Collectio
 
 
 def read_consumers(access: ObjectAccess) -> Consumers | None:
-    """Read 1016h, up to the first entry that cannot be read; None where the amplifier has no such object.
+    """Read 1016h up to the first entry that cannot be read; None where the amplifier has no such object.
 
     Raises:
         ObjectAccessError: the node does not answer.
@@ -85,21 +90,21 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     return tuple(found)
 
 
-def find_guard(access: ObjectAccess, consumers: Consumers | None, recording_leftover: Callable[[int], bool]) -> Guard:
-    """Choose a free entry of 1016h; one that still watches a recorder that was killed is used again.
+def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> Guard:
+    """Choose a free entry of 1016h; one that still watches a killed recorder is used again.
 
     Args:
         access: to the node.
         consumers: its 1016h.
-        recording_leftover: `is_left_over`, of an entry's value.
+        left_over: `is_left_over` for the value of an entry.
 
     Raises:
-        ObjectAccessError: the node does not answer; an object that it lacks is reported in `Guard.lack`.
+        ObjectAccessError: the node does not answer; a missing object is reported in `Guard.lack`.
     """
     if consumers is None:
         return Guard(None, 0, None, "no 1016h: it does NOT stop by itself when the recorder is killed")
     for entry, value in consumers:
-        if (ours := recording_leftover(value)) or not value & 0xFFFF:
+        if (ours := left_over(value)) or not value & 0xFFFF:
             return Guard(entry, 0 if ours else value, *_option(access))
     return Guard(None, 0, None, "no free 1016h: it does NOT stop by itself when the recorder is killed")
 
@@ -114,14 +119,13 @@ def _option(access: ObjectAccess) -> tuple[int | None, str]:
 
 
 def arm(access: ObjectAccess, guard: Guard, recorder_id: int, silence_ms: int) -> Guard:
-    """Let the amplifier quick stop after so much silence of the recorder; counted from its first heartbeat.
+    """Let the amplifier quick stop after this silence of the recorder, counted from its first heartbeat.
 
     Returns:
-        the guard as it is in force: an amplifier that refuses one of the writes lacks that, and is no reason not to
-        record.
+        The guard in force. A refused write is reported in `Guard.lack`; the recording goes on.
 
     Raises:
-        ObjectAccessError: it does not answer.
+        ObjectAccessError: the node does not answer.
     """
     consumer = guard.consumer
     if consumer is None:
@@ -151,7 +155,7 @@ def _refused(access: ObjectAccess, entry: ObjectEntry, value: int) -> str:
 
 
 def disarm(access: ObjectAccess, guard: Guard) -> None:
-    """Give back what was there.
+    """Restore the original values.
 
     Raises:
         ObjectAccessError: a write was refused or not answered.

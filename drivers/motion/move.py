@@ -1,4 +1,4 @@
-"""What an axis is asked to do, and what it may do: moves, limits, permission. Pure."""
+"""Moves, limits and the permission to move; synchronised trapezoidal profiles. Pure functions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,134 @@ from numpy.typing import NDArray
 
 from drivers.errors import MotionRefused
 
-# Synchronised trapezoidal point-to-point moves: all axes start and end together.
-
-
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLimits:
+    """Limits of one motor in its drive's counts: range of its targets, largest velocity and acceleration."""
+
+    position_min_counts: int
+    position_max_counts: int
+    velocity_counts_s: float
+    acceleration_counts_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """One synchronised point-to-point move in profile position mode.
+
+    Attributes:
+        target_counts: absolute, of each axis.
+        velocity_counts_s, acceleration_counts_s2: profile of each axis (6081h; 6083h and 6084h); not sent to an axis
+            that does not move.
+        dwell_cycles: samples to wait at the target.
+    """
+
+    target_counts: tuple[int, ...]
+    velocity_counts_s: tuple[int, ...]
+    acceleration_counts_s2: tuple[int, ...]
+    dwell_cycles: int = 0
+
+    def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
+        """Return the time that each axis needs from these positions, with the profile's whole numbers."""
+        return tuple(
+            trapezoid_duration_s(abs(target - start), velocity, acceleration) if target != start else 0.0
+            for start, target, velocity, acceleration in zip(
+                start_counts, self.target_counts, self.velocity_counts_s, self.acceleration_counts_s2, strict=True
+            )
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPermission:
+    """Permission to move these axes now, within limits; without it nothing moves.
+
+    Attributes:
+        granted_by: operator or policy that takes the responsibility; it is logged.
+        limits: one for each axis.
+    """
+
+    granted_by: str
+    limits: tuple[AxisLimits, ...]
+
+
+def trapezoid_duration_s(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float) -> float:
+    """Return the duration of a trapezoid, or of a triangle when the velocity is not reached [s]."""
+    if distance_counts * acceleration_counts_s2 < velocity_counts_s**2:
+        return 2.0 * math.sqrt(distance_counts / acceleration_counts_s2)
+    return distance_counts / velocity_counts_s + velocity_counts_s / acceleration_counts_s2
+
+
+def synchronised_move(
+    start_counts: Sequence[int], target_counts: Sequence[int], limits: Sequence[AxisLimits], dwell_cycles: int = 0
+) -> Move:
+    """Return the fastest move within the limits in which all axes start and end together.
+
+    Drives accept whole numbers only. The velocity is rounded up and the acceleration then chosen for the common
+    duration, so that the end times differ only by its rounding, on the ramp alone.
+
+    Raises:
+        ValueError: a limit is not above 2 counts/s or counts/s².
+    """
+    start, target = np.asarray(start_counts, dtype=np.float64), np.asarray(target_counts, dtype=np.float64)
+    # One count less than allowed leaves room for rounding up.
+    path = synchronised(
+        start,
+        target,
+        np.array([limit.velocity_counts_s - 1.0 for limit in limits]),
+        np.array([limit.acceleration_counts_s2 - 1.0 for limit in limits]),
+    )
+    velocities, accelerations = [], []
+    for distance, speed in zip(np.abs(target - start), np.abs(path.velocity), strict=True):
+        velocity = max(1, math.ceil(speed))
+        ramp_s = path.duration_s - distance / velocity
+        velocities.append(velocity)
+        accelerations.append(max(1, round(velocity / ramp_s)) if distance > 0 else 1)
+    return Move(tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles)
+
+
+def check_moves(
+    start_counts: Sequence[int], moves: Sequence[Move], permission: MotionPermission, names: Sequence[str]
+) -> None:
+    """Check all moves against the permission before anything moves.
+
+    Raises:
+        MotionRefused: names the axis, the requested value and the allowed one.
+    """
+    if not permission.granted_by.strip():
+        raise MotionRefused("the permission names no operator: set granted_by")
+    if len(permission.limits) != len(names):
+        raise MotionRefused(f"the permission has limits for {len(permission.limits)} axes, the cell has {len(names)}")
+    _check_positions("starts at", start_counts, permission, names)
+    here = tuple(start_counts)
+    for number, move in enumerate(moves):
+        where = f"move {number}"
+        profiles = (move.target_counts, move.velocity_counts_s, move.acceleration_counts_s2)
+        if any(len(column) != len(names) for column in profiles):
+            raise MotionRefused(f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes")
+        if move.dwell_cycles < 0:
+            raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
+        _check_positions(f"{where} goes to", move.target_counts, permission, names)
+        for axis, limit in enumerate(permission.limits):
+            if move.target_counts[axis] == here[axis]:
+                continue
+            for quantity, value, allowed in (
+                ("velocity", move.velocity_counts_s[axis], limit.velocity_counts_s),
+                ("acceleration", move.acceleration_counts_s2[axis], limit.acceleration_counts_s2),
+            ):
+                if not 0 < value <= allowed:
+                    raise MotionRefused(
+                        f"{where}: {names[axis]}: {quantity} {value}, allowed is above 0 up to {allowed:g}"
+                    )
+        here = move.target_counts
+
+
+def _check_positions(event: str, positions: Sequence[int], permission: MotionPermission, names: Sequence[str]) -> None:
+    for name, position, limit in zip(names, positions, permission.limits, strict=True):
+        if not limit.position_min_counts <= position <= limit.position_max_counts:
+            allowed = f"{limit.position_min_counts} to {limit.position_max_counts} counts"
+            raise MotionRefused(f"{name}: {event} {position} counts, allowed is {allowed}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +189,7 @@ def synchronised(
     velocity_limit: FloatArray,
     acceleration_limit: FloatArray,
 ) -> Trapezoid:
-    """The fastest trapezoid that keeps every axis within its limits and lets all axes end together.
+    """Return the fastest trapezoid within the limits of every axis in which all axes end together.
 
     Args:
         start, end: positions, shape (n,).
@@ -80,140 +204,10 @@ def synchronised(
     distance = np.abs(end - start)
     if not distance.any():
         return Trapezoid(start, end, 0.0, 0.0)
-    # Normalised to the path 0..1, the slowest axis in each of velocity and acceleration rules all.
+    # Normalised to the path 0..1, the slowest axis in velocity and in acceleration decides for all.
     with np.errstate(divide="ignore"):
         rate = float(np.min(np.where(distance > 0, velocity_limit / np.maximum(distance, 1e-300), np.inf)))
         ramp_rate = float(np.min(np.where(distance > 0, acceleration_limit / np.maximum(distance, 1e-300), np.inf)))
     ramp_s = min(rate / ramp_rate, ramp_rate**-0.5)
     cruise_s = 1.0 / (ramp_rate * ramp_s)
     return Trapezoid(start, end, cruise_s + ramp_s, ramp_s)
-
-
-@dataclass(frozen=True, slots=True)
-class AxisLimits:
-    """What one motor may do, in its drive's counts.
-
-    Attributes:
-        position_min_counts, position_max_counts: where its targets may be.
-        velocity_counts_s, acceleration_counts_s2: not to be exceeded.
-    """
-
-    position_min_counts: int
-    position_max_counts: int
-    velocity_counts_s: float
-    acceleration_counts_s2: float
-
-
-@dataclass(frozen=True, slots=True)
-class Move:
-    """One synchronised point-to-point move in profile position mode.
-
-    Attributes:
-        target_counts: absolute, of each axis.
-        velocity_counts_s, acceleration_counts_s2: profile of each axis (6081h; 6083h and 6084h); of an axis that stays
-            where it is they are not sent.
-        dwell_cycles: samples to wait at the target.
-    """
-
-    target_counts: tuple[int, ...]
-    velocity_counts_s: tuple[int, ...]
-    acceleration_counts_s2: tuple[int, ...]
-    dwell_cycles: int = 0
-
-    def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
-        """How long each axis moves from these positions, with the profile's whole numbers."""
-        return tuple(
-            trapezoid_duration_s(abs(target - start), velocity, acceleration) if target != start else 0.0
-            for start, target, velocity, acceleration in zip(
-                start_counts, self.target_counts, self.velocity_counts_s, self.acceleration_counts_s2, strict=True
-            )
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class MotionPermission:
-    """Somebody's word that these axes may move now, and how far; without it nothing moves.
-
-    Attributes:
-        granted_by: the person or the policy that takes the responsibility; it is logged.
-        limits: one for each axis.
-    """
-
-    granted_by: str
-    limits: tuple[AxisLimits, ...]
-
-
-def trapezoid_duration_s(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float) -> float:
-    """Duration of a trapezoid, or of the triangle that it is when the velocity is not reached [s]."""
-    if distance_counts * acceleration_counts_s2 < velocity_counts_s**2:
-        return 2.0 * math.sqrt(distance_counts / acceleration_counts_s2)
-    return distance_counts / velocity_counts_s + velocity_counts_s / acceleration_counts_s2
-
-
-def synchronised_move(
-    start_counts: Sequence[int], target_counts: Sequence[int], limits: Sequence[AxisLimits], dwell_cycles: int = 0
-) -> Move:
-    """The fastest move within the limits in which all axes start and end together.
-
-    The drives take whole numbers. The velocity is rounded up and the acceleration then chosen for the common duration,
-    so only its rounding, on the ramp alone, is left as a difference of the end times.
-
-    Raises:
-        ValueError: a limit is not above 2 counts/s or counts/s².
-    """
-    start, target = np.asarray(start_counts, dtype=np.float64), np.asarray(target_counts, dtype=np.float64)
-    # One count less than allowed leaves room for rounding up.
-    path = synchronised(
-        start,
-        target,
-        np.array([limit.velocity_counts_s - 1.0 for limit in limits]),
-        np.array([limit.acceleration_counts_s2 - 1.0 for limit in limits]),
-    )
-    velocities, accelerations = [], []
-    for distance, speed in zip(np.abs(target - start), np.abs(path.velocity), strict=True):
-        velocity = max(1, math.ceil(speed))
-        ramp_s = path.duration_s - distance / velocity
-        velocities.append(velocity)
-        accelerations.append(max(1, round(velocity / ramp_s)) if distance > 0 else 1)
-    return Move(tuple(map(int, target_counts)), tuple(velocities), tuple(accelerations), dwell_cycles)
-
-
-def check_moves(
-    start_counts: Sequence[int], moves: Sequence[Move], permission: MotionPermission, names: Sequence[str]
-) -> None:
-    """Refuse everything outside of the permission before anything moves.
-
-    Raises:
-        MotionRefused: names the axis, what was asked for and what is allowed.
-    """
-    if not permission.granted_by.strip():
-        raise MotionRefused("the permission does not say who granted it")
-    if len(permission.limits) != len(names):
-        raise MotionRefused(f"the permission has limits for {len(permission.limits)} axes, the cell has {len(names)}")
-    _check_positions("starts at", start_counts, permission, names)
-    here = tuple(start_counts)
-    for number, move in enumerate(moves):
-        where = f"move {number}"
-        profiles = (move.target_counts, move.velocity_counts_s, move.acceleration_counts_s2)
-        if any(len(column) != len(names) for column in profiles):
-            raise MotionRefused(f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes")
-        if move.dwell_cycles < 0:
-            raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
-        _check_positions(f"{where} goes to", move.target_counts, permission, names)
-        for axis, limit in enumerate(permission.limits):
-            if move.target_counts[axis] == here[axis]:
-                continue
-            for what, value, allowed in (
-                ("velocity", move.velocity_counts_s[axis], limit.velocity_counts_s),
-                ("acceleration", move.acceleration_counts_s2[axis], limit.acceleration_counts_s2),
-            ):
-                if not 0 < value <= allowed:
-                    raise MotionRefused(f"{where}: {names[axis]}: {what} {value}, allowed is above 0 up to {allowed:g}")
-        here = move.target_counts
-
-
-def _check_positions(what: str, positions: Sequence[int], permission: MotionPermission, names: Sequence[str]) -> None:
-    for name, position, limit in zip(names, positions, permission.limits, strict=True):
-        if not limit.position_min_counts <= position <= limit.position_max_counts:
-            allowed = f"{limit.position_min_counts} to {limit.position_max_counts} counts"
-            raise MotionRefused(f"{name}: {what} {position} counts, allowed is {allowed}")

@@ -1,6 +1,7 @@
-"""Watching the drives while a stream runs: what they say becomes events, and some of it faults.
+"""Watch the drives while a stream runs: their reports become events, and some of them faults.
 
-Watching never raises: a fault waits until the sample that shows it has been handed out.
+Watching never raises: a fault waits until the sample that shows it has been returned. Frozen data are recognised in two
+ways: neither position nor current of a moving axis changes by one count, or an amplifier's toggle bit does not toggle.
 """
 
 from __future__ import annotations
@@ -11,27 +12,30 @@ from collections.abc import Iterator, Sequence
 
 from drivers.canopen.link import HEARTBEAT, SDO_REQUEST, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
-from drivers.errors import BusBusy, DataStale, DriveFault, DriverError, HeartbeatLost, LimitActive, RecorderIdTaken
+from drivers.errors import BusBusy, DriveFault, DriverError, node_label
 from drivers.motion.move import Move
 from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
 from drivers.profiles.profile import Axis
 from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 
-# Frozen data: an axis that is told to move while neither its position nor its current changes by one count, and, where
-# an amplifier has a toggle bit, an amplifier that sends its last values again.
-
-
 FROZEN_S = 0.05
-"""Exactly equal values for so long, in the time of the samples. A loop that fights friction changes its current at
-once, and a current that is measured has noise."""
+"""Duration of exactly equal values, in the time of the samples. A loop that fights friction changes its current at
+once, and a measured current has noise."""
 FROZEN_COUNTS = 64
-"""Way that the set-point must have gone meanwhile: one that creeps or has just begun proves nothing."""
+"""Least distance of the set-point meanwhile: one that creeps or has just begun proves nothing."""
+STALE_PERIODS = 2
+"""Of the amplifier's update period, and of SYNC, without a toggle; less may be the difference of two timers."""
+HEARTBEAT_PERIODS = 2.0
+"""Silence after which a node is lost."""
+LIMIT_S = 0.5
+"""A current that saturates in a ramp is masked by the fit; a limit that is active longer is no ramp any more."""
+_WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
 
 
 def travel_counts(
     distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float, time_s: float
 ) -> float:
-    """Way of a symmetric trapezoid from rest after a time, or of the triangle that it is [counts]."""
+    """Return the distance of a symmetric trapezoid (or triangle) from rest after a time [counts]."""
     velocity = min(velocity_counts_s, math.sqrt(distance_counts * acceleration_counts_s2))
     ramp_s = velocity / acceleration_counts_s2
     duration_s = distance_counts / velocity + ramp_s
@@ -45,12 +49,12 @@ def travel_counts(
 
 
 class FrozenData:
-    """Looks at the samples of one move; made when the set-points go out.
+    """Finds moving axes whose data do not change; made when the set-points of a move are sent.
 
     Args:
-        move: that the axes make.
-        start_counts: from where.
-        axes: that have a way to go.
+        move: in progress.
+        start_counts: positions at its start.
+        axes: indices of the moving axes.
         period_ns: of the samples.
     """
 
@@ -68,7 +72,7 @@ class FrozenData:
         self._last: dict[int, tuple[int, int, int]] = {}
 
     def frozen(self, sample: Sample) -> tuple[int, ...]:
-        """Axes whose values have been equal for longer than any that moves can be; give it every sample once."""
+        """Return the axes whose values have not changed for too long; takes every sample once."""
         if self._begin is None:
             self._begin = sample.cycle
         found = []
@@ -86,38 +90,30 @@ class FrozenData:
         return tuple(found)
 
 
-STALE_PERIODS = 2
-"""Of the amplifier's own, and SYNCs, in which its toggle bit stands: less may be its timer against ours."""
-
-
 class ToggleBits:
-    """Looks at the toggle bits of all axes that have one, in every cycle.
-
-    Args:
-        axes: of the cell.
-    """
+    """Finds axes whose toggle bit does not toggle."""
 
     def __init__(self, axes: Sequence[Axis]) -> None:
         self._bits = tuple(
-            (number, axis.node_id, axis.profile.toggle_bit, STALE_PERIODS * 1000 * axis.profile.update_period_us)
+            (number, axis, axis.profile.toggle_bit, STALE_PERIODS * 1000 * axis.profile.update_period_us)
             for number, axis in enumerate(axes)
             if axis.profile.toggle_bit is not None
         )
-        # Of each axis: the bit, when it was first seen so, cycles since, whether that was told.
+        # For each axis: the bit, the time of its last change, cycles since, whether that was reported.
         self._last: dict[int, tuple[int, int, int, bool]] = {}
 
     def __bool__(self) -> bool:
         return bool(self._bits)
 
-    def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, DataStale]]:
-        """Axes whose bit has stood for too long, each once until it changes again; to be asked in every cycle.
+    def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, int, DriveFault]]:
+        """Yield (index, bit, fault) of each axis whose bit has not toggled for too long; call in every cycle.
 
         Args:
             time_ns: of the samples.
             statuswords: of all axes.
-            missing: bit i is set when axis i did not answer; what it sent meanwhile is not known, so it begins anew.
+            missing: bit i is set when axis i did not answer; its interval then starts anew.
         """
-        for axis, node_id, bit, allowed_ns in self._bits:
+        for axis, node, bit, allowed_ns in self._bits:
             if missing >> axis & 1:
                 self._last.pop(axis, None)
                 continue
@@ -129,21 +125,19 @@ class ToggleBits:
             stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
             self._last[axis] = (value, since_ns, cycles + 1, reported or stale)
             if stale and not reported:
-                yield axis, DataStale(node_id, bit, (time_ns - since_ns) * 1e-9, cycles + 1)
-
-
-HEARTBEAT_PERIODS = 2.0
-"""Silence after which a node is lost."""
-LIMIT_S = 0.5
-"""A current that saturates in a ramp is masked by the fit; a limit that acts longer is no ramp any more."""
-_WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
+                still_ms = (time_ns - since_ns) * 1e-6
+                reason = (
+                    f"statusword bit {bit} has not toggled for {cycles + 1} cycles, {still_ms:g} ms; its data are old"
+                )
+                remedy = "restart the drive, and check toggle_bit and update_period_us of its profile"
+                yield axis, bit, DriveFault(node, reason, remedy=remedy)
 
 
 class Watch:
-    """What the drives of a network last said, and the faults that nobody was told yet.
+    """Last reports of a network's drives.
 
     Attributes:
-        faults: in the order in which they were seen.
+        faults: not raised yet, in the order in which they were seen.
     """
 
     def __init__(self, network: CanopenNetwork, on_event: EventSink) -> None:
@@ -161,7 +155,7 @@ class Watch:
         self._toggle_bits = ToggleBits(network.axes)
 
     def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
-        """See to everything after one cycle.
+        """Process one cycle.
 
         Args:
             time_ns: of the samples.
@@ -170,14 +164,14 @@ class Watch:
             missing: bit i is set when axis i did not answer this cycle.
         """
         if self._link.has_events:
-            self.note_events(time_ns)  # first: an EMCY says why, the statusword only that
+            self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
         if self._unheard or statuswords != self._statuswords:
             self._note_statuswords(time_ns, statuswords, missing)
         if self._limited_since_ns:
             self._check_limits(time_ns)
         if self._toggle_bits:
-            for axis, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
-                self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, stale.bit, str(stale)))
+            for axis, bit, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
+                self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, bit, str(stale)))
                 self.faults.append(stale)
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
@@ -189,24 +183,24 @@ class Watch:
         for axis, word in enumerate(statuswords):
             first = bool(self._unheard >> axis & 1)
             if first and missing >> axis & 1:
-                continue  # the word is nobody's yet
+                continue  # no word was received yet
             self._unheard &= ~(1 << axis)
-            # Of an axis's first answer everything is news, but a fault from before is not this recording's.
+            # The first answer of an axis is reported whole, but a fault from before is not this recording's.
             changed = _WATCHED_BITS if first else word ^ before[axis]
-            saturation = self._network.axes[axis].profile.saturation_bit
+            node = self._network.axes[axis]
+            saturation = node.profile.saturation_bit
             if changed & _WATCHED_BITS:
                 state = decode(word)
-                text = f"{self._network.axes[axis].name}: {state}, statusword {word:04X}h"
+                text = f"{node.name}: {state}, statusword {word:04X}h"
                 self._on_event(CellEvent(time_ns, axis, EventKind.STATE, word, text))
                 if not first and changed & STATUS_FAULT and state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-                    self.faults.append(DriveFault(self._network.node_ids[axis], str(state), word))
+                    self.faults.append(DriveFault(node, str(state), word))
                 if not first and changed & word & STATUS_FOLLOWING_ERROR:
                     self._on_event(CellEvent(time_ns, axis, EventKind.FOLLOWING_ERROR, word, text))
-                    self.faults.append(DriveFault(self._network.node_ids[axis], "following error", word))
+                    self.faults.append(DriveFault(node, "following error", word))
             if saturation is not None and (word ^ (0 if first else before[axis])) >> saturation & 1:
-                acts = "a limit acts" if word >> saturation & 1 else "the limit acts no more"
-                text = f"{self._network.axes[axis].name}: {acts}"
-                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                active = "a limit is active" if word >> saturation & 1 else "the limit is no longer active"
+                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, f"{node.name}: {active}"))
                 if word >> saturation & 1:
                     self._limited_since_ns[axis] = time_ns
                 else:
@@ -216,38 +210,42 @@ class Watch:
         for axis, since_ns in tuple(self._limited_since_ns.items()):
             word = self._statuswords[axis]
             if decode(word) is not State.OPERATION_ENABLED:
-                self._limited_since_ns[axis] = time_ns  # what limits nothing is no reason to stop
-            elif (acted_ns := time_ns - since_ns) > LIMIT_S * 1e9:
+                self._limited_since_ns[axis] = time_ns  # a limit without motion is no reason to stop
+            elif (active_ns := time_ns - since_ns) > LIMIT_S * 1e9:
                 del self._limited_since_ns[axis]
-                text = f"{self._network.axes[axis].name}: a limit acts for {acted_ns * 1e-9:.3f} s"
+                node = self._network.axes[axis]
+                text = f"{node.name}: a limit has been active for {active_ns * 1e-9:.3f} s"
                 self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
-                self.faults.append(LimitActive(self._network.node_ids[axis], LIMIT_S, word))
+                reason = f"a limit has been active for {LIMIT_S:g} s, statusword {word:#06x}"
+                remedy = "check limit switches, position, speed and current limits, or use slower moves"
+                self.faults.append(DriveFault(node, reason, word, remedy=remedy))
 
     def note_events(self, time_ns: int) -> None:
-        """What the nodes said of themselves since the last cycle, at a time of the samples."""
+        """Report the events of the nodes since the last cycle, at a time of the samples."""
         for event in self._link.take_events(time_ns, self._network.node_ids):
             self._on_event(event)
             if event.kind is EventKind.BUS_BUSY and event.code < SDO_REQUEST:
-                # Whoever only asks a drive something disturbs, and is told; one who commands would move the robot.
-                self.faults.append(BusBusy(str(self._link.address), command_name(event.code)))
+                # A reader only disturbs, and is reported; a device that sends commands could move the robot.
+                self.faults.append(BusBusy.by_master(self._link.address, command_name(event.code)))
             elif event.kind is EventKind.BUS_BUSY and event.code >= HEARTBEAT:
-                self.faults.append(RecorderIdTaken.by_another(event.code - HEARTBEAT))
+                self.faults.append(BusBusy.by_heartbeat(self._link.address, event.code - HEARTBEAT))
             if event.axis is None:
                 continue
-            node_id = self._network.node_ids[event.axis]
+            node = self._network.axes[event.axis]
             if event.kind is EventKind.EMCY and self._begun:
-                reason = event.text.removeprefix(f"node {node_id}: ")
-                self.faults.append(DriveFault(node_id, reason, emcy_code=event.code))
+                reason = event.text.removeprefix(f"{node_label(node)}: ")
+                self.faults.append(DriveFault(node, reason, emcy_code=event.code))
             elif event.kind is EventKind.NMT and event.code != NmtState.OPERATIONAL and self._begun:
-                self.faults.append(DriveFault(node_id, f"left OPERATIONAL, is {nmt_name(event.code)}"))
+                self.faults.append(DriveFault(node, f"left OPERATIONAL, is {nmt_name(event.code)}"))
 
     def _check_heartbeats(self, time_ns: int, clock_ns: int) -> None:
-        """A node is lost when it is silent by the clock *and* in the time of the samples.
+        """Report nodes that are silent by the clock *and* in the time of the samples.
 
         In lockstep the samples' time runs faster or slower than the clock, and either alone would be a false alarm.
         """
-        for axis, node_id in enumerate(self._network.node_ids):
-            # Silence counts from the first cycle on: before it nobody read the bus.
+        for axis, node in enumerate(self._network.axes):
+            node_id = node.node_id
+            # Silence counts from the first cycle on: before it the bus was not read.
             heard_ns = self._link.heard_ns.get(node_id, 0)
             known_ns, since_clock_ns, since_time_ns = self._heard_at.get(node_id, (-1, 0, 0))
             if known_ns != heard_ns:
@@ -256,7 +254,8 @@ class Watch:
                 continue
             silent_ns = min(clock_ns - since_clock_ns, time_ns - since_time_ns)
             if silent_ns > self._allowed_silence_ns:
-                text = f"node {node_id}: no heartbeat for {silent_ns * 1e-9:.3f} s"
+                reason = f"no heartbeat for {silent_ns * 1e-9:.3f} s"
+                text = f"{node_label(node)}: {reason}"
                 self._on_event(CellEvent(time_ns, axis, EventKind.HEARTBEAT_LOST, node_id, text))
-                self.faults.append(HeartbeatLost(node_id, silent_ns * 1e-9))
+                self.faults.append(DriveFault(node, reason))
                 self._heard_at[node_id] = (heard_ns, clock_ns, time_ns)

@@ -1,4 +1,4 @@
-"""The CiA 402 state machine, pure: what a statusword says, and which controlword leads where.
+"""The CiA 402 state machine: the state in a statusword, and the controlword that leads to a goal.
 
 Source: CiA 402-2 (IEC 61800-7-201), finite state automaton of the power drive system, objects 6040h and 6041h.
 """
@@ -28,7 +28,7 @@ class State(Enum):
     FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
     FAULT = (0x4F, 0x08)
     UNKNOWN = (0x00, 0xFF)
-    """A pattern that the standard does not name; no statusword matches this mask."""
+    """A pattern outside the standard; no statusword matches this mask."""
 
     def __str__(self) -> str:
         return self.name.replace("_", " ")
@@ -38,7 +38,7 @@ POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT
 """States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does, in UNKNOWN it may."""
 
 STATE_BITS = 0x6F
-"""The bits of the statusword that tell the state."""
+"""Bits of the statusword that encode the state."""
 
 
 def _match(statusword: int) -> State:
@@ -53,7 +53,7 @@ _STATES = tuple(_match(bits) for bits in range(STATE_BITS + 1))  # six decodes a
 
 
 def decode(statusword: int) -> State:
-    """State that a statusword (6041h) stands for."""
+    """Return the state of a statusword (6041h)."""
     return _STATES[statusword & STATE_BITS]
 
 
@@ -64,13 +64,13 @@ class Command(IntEnum):
     QUICK_STOP = 0x02
     SHUTDOWN = 0x06
     SWITCH_ON = 0x07
-    DISABLE_OPERATION = 0x07  # the same word: what it does depends on the state (transitions 3 and 5)
+    DISABLE_OPERATION = 0x07  # the same word; its effect depends on the state (transitions 3 and 5)
     ENABLE_OPERATION = 0x0F
     FAULT_RESET = 0x80
 
 
 class Goal(Enum):
-    """Where a drive is to be led."""
+    """State to which a drive is led."""
 
     OPERATION_ENABLED = "operation enabled"
     SWITCH_ON_DISABLED = "switch on disabled"
@@ -84,7 +84,7 @@ _ENABLING = {
     State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
 }
 _DISABLING = {
-    # One step at a time: voltage is taken only after the drive has stopped and its brake could close.
+    # One step at a time: voltage is removed only after the drive has stopped and its brake could close.
     State.OPERATION_ENABLED: Command.DISABLE_OPERATION,
     State.SWITCHED_ON: Command.SHUTDOWN,
 }
@@ -92,17 +92,17 @@ _STOPPING = {
     State.OPERATION_ENABLED: Command.QUICK_STOP,
     State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
 }
-_WAYS = {Goal.OPERATION_ENABLED: _ENABLING, Goal.SWITCH_ON_DISABLED: _DISABLING, Goal.QUICK_STOP: _STOPPING}
+_PATHS = {Goal.OPERATION_ENABLED: _ENABLING, Goal.SWITCH_ON_DISABLED: _DISABLING, Goal.QUICK_STOP: _STOPPING}
 
 
 def next_command(state: State, goal: Goal) -> Command:
-    """The next command on the way from a state to a goal.
+    """Return the next command on the path from a state to a goal.
 
-    From FAULT, and from every state that has no way, it is DISABLE VOLTAGE: a fault is left by ``FAULT_RESET_SEQUENCE``
-    alone, so nothing re-enables an axis by itself. It is also a harmless first controlword for the drives that show
-    statusword 0000h until they got one.
+    From FAULT, and from every state without a path, it is DISABLE VOLTAGE. A fault is left by ``FAULT_RESET_SEQUENCE``
+    alone, so nothing re-enables an axis by itself. DISABLE VOLTAGE is also a harmless first controlword for drives that
+    show statusword 0000h until they receive one.
     """
-    return _WAYS[goal].get(state, Command.DISABLE_VOLTAGE)
+    return _PATHS[goal].get(state, Command.DISABLE_VOLTAGE)
 
 
 FAULT_RESET_SEQUENCE = (Command.DISABLE_VOLTAGE, Command.FAULT_RESET, Command.DISABLE_VOLTAGE)

@@ -1,4 +1,4 @@
-"""What a make of amplifier calls position and current, in which unit it says them, and who says so."""
+"""Describe a make of amplifier: its objects for position and current, their units, and the source of each fact."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Amplitude(Enum):
     """Convention of a current value; peak against RMS alone is a 41 % gain error.
 
     QUADRATURE is the torque-making component of a field-oriented loop, in the length that the drive's transformation
-    gives it. UNSTATED is a convention that was chosen when the drive was set up and that it does not tell.
+    gives it. UNSTATED is a convention that was chosen when the drive was set up and that it does not report.
     """
 
     PEAK = "peak"
@@ -32,11 +32,11 @@ class TapPoint(Enum):
 
 
 class Basis(Enum):
-    """What a fact of a profile rests on, the strongest first.
+    """Evidence for a fact of a profile, the strongest first.
 
-    EDS: the manufacturer's electronic data sheet. MANUAL: the manufacturer's text, read. STANDARD: what CiA 301 or 402
-    asks for; that the drive does so was not checked. NOTES: this project's notes on amplifiers, not traced to a text of
-    the manufacturer. ASSUMED: nobody has checked it.
+    EDS: the manufacturer's electronic data sheet. MANUAL: the manufacturer's text, read. STANDARD: required by CiA 301
+    or 402, not checked for this drive. NOTES: this project's notes on amplifiers, not traced to a text of the
+    manufacturer. ASSUMED: not checked at all.
     """
 
     EDS = "eds"
@@ -52,7 +52,7 @@ class Basis(Enum):
 
 
 class Mapping(Enum):
-    """What becomes of PDO mappings when a drive saves its parameters."""
+    """Effect of a drive's save on PDO mappings."""
 
     STORED = "stored"
     SEPARATE = "separate"
@@ -60,11 +60,11 @@ class Mapping(Enum):
 
 
 class ScaleForm(Enum):
-    """The known ways from a raw number to ampere; `CurrentScale` is what each amounts to.
+    """Known conversions from a raw number to ampere; each becomes a `CurrentScale`.
 
-    PRODUCT: factor × objects. PER_MILLE: of a rated current that the drive holds in mA. FIXED_STEP: so many ampere.
-    DIGITS_OF_PEAK: so many digits are the drive's peak current, which a person enters. DIGITS_OF_REPORTED_PEAK: the
-    same, and the drive tells it in mA. SWITCHED_PER_MILLE: of the rated current, or of it over √2, as an object says.
+    PRODUCT: factor × objects. PER_MILLE: of a rated current in the drive [mA]. FIXED_STEP: ampere per digit.
+    DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters. DIGITS_OF_REPORTED_PEAK: the same,
+    with the peak current in the drive [mA]. SWITCHED_PER_MILLE: of the rated current or of it over √2, by an object.
     """
 
     PRODUCT = "product"
@@ -96,9 +96,9 @@ class CurrentScale:
 
     Attributes:
         factor, objects: of the product; the objects are read by SDO at connect.
-        form: how a profile file says it.
-        switch: object whose value chooses a weight, None where there is no choice.
-        weights: of the switch's values 0, 1, and so on.
+        form: in a profile file.
+        switch: object whose value selects a weight, None where there is no choice.
+        weights: for the switch's values 0, 1, and so on.
     """
 
     factor: float
@@ -108,11 +108,7 @@ class CurrentScale:
     weights: tuple[float, ...] = (1.0,)
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
-        """The scale.
-
-        Args:
-            values: of the objects, in their order.
-            choice: value of the switch.
+        """Return the scale for the values of the objects and of the switch.
 
         Raises:
             IndexError: the switch has no such value.
@@ -124,13 +120,11 @@ class CurrentScale:
 
 @dataclass(frozen=True, slots=True)
 class RatedMotor:
-    """Where a drive keeps the motor's name plate; what ampere values are checked against.
+    """Objects of the motor's name plate in a drive, against which ampere values are checked.
 
     Attributes:
-        current: rated current.
-        ampere_per_unit: of it (6075h: 1e-3).
-        torque: rated torque, None where the drive has none.
-        newton_metre_per_unit: of it (6076h: 1e-3).
+        current, ampere_per_unit: rated current and its unit (6075h: 1e-3).
+        torque, newton_metre_per_unit: rated torque and its unit (6076h: 1e-3); None where the drive has none.
     """
 
     current: ObjectEntry
@@ -141,12 +135,11 @@ class RatedMotor:
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """How a drive is told to keep its parameters.
+    """Command that saves a drive's parameters.
 
     Attributes:
-        command: object that takes the signature.
-        signature: what to write to it ("save" of CiA 301).
-        mapping: whether mappings made for a recording would be kept too; then they must be restored before.
+        command, signature: object, and the value to write to it ("save" of CiA 301).
+        mapping: whether it saves PDO mappings too; those of a recording must then be restored before.
     """
 
     command: ObjectEntry
@@ -156,12 +149,12 @@ class Save:
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """Why one line of a profile is believed.
+    """Evidence for one key of a profile.
 
     Attributes:
         about: key of the profile.
         basis: kind of evidence.
-        where: document and section, EDS object, or what is missing.
+        where: document and section, EDS object, or the missing evidence.
     """
 
     about: str
@@ -177,15 +170,15 @@ class DriveProfile:
         position: encoder position [counts], motor side.
         current: the signal whose gain is identified.
         current_scale: from raw unit to ampere in the stated amplitude convention.
-        saturation_bit: bit of statusword 6041h that tells that a limit acts, None when the drive has none.
-        toggle_bit: bit of statusword 6041h that the drive inverts whenever it fills its PDO anew; None when it has
-            none: then frozen data show as values that do not change in a move (drivers/motion/watch.py).
-        update_period_us: how often the drive refreshes the mapped objects.
-        save_semantics: what saving stores, in words; it decides what must be restored before a save.
-        source: where these facts stand, in short.
-        facts: the same, one a line of the profile.
+        saturation_bit: bit of statusword 6041h that shows an active limit, None when the drive has none.
+        toggle_bit: bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none:
+            then frozen data show as values that do not change in a move (drivers/motion/watch.py).
+        update_period_us: period in which the drive refreshes the mapped objects.
+        save_semantics: content of a save, in words; it decides what must be restored before a save.
+        source: documents, in short.
+        facts: the same for each key of the profile.
         rated: the motor's name plate in the drive, None where it has none.
-        save: how it is told to save, None where it cannot or where nobody knows.
+        save: command that saves, None where there is none or it is unknown.
     """
 
     name: str
@@ -205,7 +198,7 @@ class DriveProfile:
 
     @property
     def signal(self) -> str:
-        """What the log's current is, for people: "current reference 6074h:00"."""
+        """Description of the recorded current: "current reference 6074h:00"."""
         words = {
             TapPoint.REFERENCE: "current reference",
             TapPoint.LIMITED_REFERENCE: "limited current reference",
@@ -215,79 +208,24 @@ class DriveProfile:
 
     @property
     def unverified(self) -> tuple[Fact, ...]:
-        """What was not read in a text of the manufacturer."""
+        """Facts that were not read in a text of the manufacturer."""
         return tuple(fact for fact in self.facts if not fact.basis.verified)
 
 
-# A number in a drive's object dictionary that is not always an integer.
-
-
-class ParameterKind(Enum):
-    """Data type of an object (CiA 301: INTEGER16, UNSIGNED16, INTEGER32, UNSIGNED32, REAL32)."""
-
-    I16 = "i16"
-    U16 = "u16"
-    I32 = "i32"
-    U32 = "u32"
-    F32 = "f32"
-
-    @property
-    def bits(self) -> int:
-        """Width."""
-        return int(self.value[1:])
-
-
-_CODES = {
-    ParameterKind.I16: "<h",
-    ParameterKind.U16: "<H",
-    ParameterKind.I32: "<i",
-    ParameterKind.U32: "<I",
-    ParameterKind.F32: "<f",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One number in a drive."""
-
-    index: int
-    subindex: int
-    kind: ParameterKind
-
-    def __str__(self) -> str:
-        return str(self.entry)
-
-    @property
-    def entry(self) -> ObjectEntry:
-        """The object as it goes over the bus: its bits as an unsigned word."""
-        return ObjectEntry(self.index, self.subindex, self.kind.bits, signed=False)
-
-    @property
-    def whole(self) -> bool:
-        """Whether it holds integers alone."""
-        return self.kind is not ParameterKind.F32
-
-    def word(self, value: float) -> int:
-        """The bits of the number that it can hold nearest to a value.
-
-        Raises:
-            ValueError: it holds no such number: out of range, or not finite.
-        """
-        if not math.isfinite(value):
-            raise ValueError(f"{value} is no number for {self}")
-        try:
-            data = struct.pack(_CODES[self.kind], round(value) if self.whole else value)
-        except (struct.error, OverflowError) as error:
-            raise ValueError(f"{value:g} does not fit {self.kind.value} {self}") from error
-        return int.from_bytes(data, "little")
-
-    def value(self, word: int) -> float:
-        """The number that some bits stand for; REAL32 knows NaN and infinity."""
-        (number,) = struct.unpack(_CODES[self.kind], word.to_bytes(self.kind.bits // 8, "little"))
-        return float(number)
-
-
-# One configured axis of a cell, as the bus sees it.
+CIA402 = DriveProfile(
+    name="cia402",
+    position=ObjectEntry(0x6064, 0, 32, signed=True),
+    current=ObjectEntry(0x6074, 0, 16, signed=True),
+    current_scale=CurrentScale(1e-6, (ObjectEntry(0x6075, 0, 32, signed=False),), ScaleForm.PER_MILLE),
+    amplitude=Amplitude.RMS,
+    tap=TapPoint.REFERENCE,
+    saturation_bit=11,
+    update_period_us=1000,
+    save_semantics="unknown",
+    source="CiA 402-2 (objects 6041h, 6064h, 6074h, 6075h, 6076h)",
+    rated=RatedMotor(ObjectEntry(0x6075, 0, 32, signed=False), torque=ObjectEntry(0x6076, 0, 32, signed=False)),
+)
+"""An amplifier that follows the standard: position in 6064h, torque demand in 6074h as per mille of rated current."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,13 +242,78 @@ class Axis:
     """One amplifier of the cell.
 
     Attributes:
-        name: what a person calls it.
+        name: for messages and logs.
         node_id: CANopen node id, 1 to 127.
-        profile: which objects it keeps position and current in.
-        identity: what 1018h must say, or None when the configuration does not know it.
+        profile: objects of position and current.
+        identity: expected 1018h, or None when it is not configured.
     """
 
     name: str
     node_id: int
-    profile: DriveProfile
+    profile: DriveProfile = CIA402
     identity: Identity | None = None
+
+
+class ParameterKind(Enum):
+    """Data type of an object (CiA 301: INTEGER16, UNSIGNED16, INTEGER32, UNSIGNED32, REAL32)."""
+
+    I16 = "i16"
+    U16 = "u16"
+    I32 = "i32"
+    U32 = "u32"
+    F32 = "f32"
+
+    @property
+    def bits(self) -> int:
+        """Width in bits."""
+        return int(self.value[1:])
+
+
+_CODES = {
+    ParameterKind.I16: "<h",
+    ParameterKind.U16: "<H",
+    ParameterKind.I32: "<i",
+    ParameterKind.U32: "<I",
+    ParameterKind.F32: "<f",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One number in a drive's object dictionary, integer or floating point."""
+
+    index: int
+    subindex: int
+    kind: ParameterKind
+
+    def __str__(self) -> str:
+        return str(self.entry)
+
+    @property
+    def entry(self) -> ObjectEntry:
+        """The object as it goes over the bus: its bits as an unsigned word."""
+        return ObjectEntry(self.index, self.subindex, self.kind.bits, signed=False)
+
+    @property
+    def whole(self) -> bool:
+        """Whether it holds integers only."""
+        return self.kind is not ParameterKind.F32
+
+    def word(self, value: float) -> int:
+        """Return the bits of the nearest number that it can hold.
+
+        Raises:
+            ValueError: the value is out of range, or not finite.
+        """
+        if not math.isfinite(value):
+            raise ValueError(f"{value} is no number for {self}")
+        try:
+            data = struct.pack(_CODES[self.kind], round(value) if self.whole else value)
+        except (struct.error, OverflowError) as error:
+            raise ValueError(f"{value:g} does not fit {self.kind.value} {self}") from error
+        return int.from_bytes(data, "little")
+
+    def value(self, word: int) -> float:
+        """Return the number of a bit pattern; REAL32 has NaN and infinity."""
+        (number,) = struct.unpack(_CODES[self.kind], word.to_bytes(self.kind.bits // 8, "little"))
+        return float(number)

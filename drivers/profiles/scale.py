@@ -1,7 +1,7 @@
-"""The ampere value of a drive's raw unit, read at connect and held against the motor's name plate.
+"""The ampere value of a drive's raw unit, read at connect and compared with the motor's name plate.
 
-A gain is Nm per ampere, so an ampere that is none passes through everything unseen: it only makes all gains of the axis
-wrong by one factor. What the drive itself says of its motor, and the name plate of the cell, are the two witnesses.
+A gain is Nm per ampere. A wrong ampere value passes every later check and makes all gains of the axis wrong by one
+factor, so it is compared with the motor data in the drive and with the name plate in the cell configuration.
 """
 
 from __future__ import annotations
@@ -9,45 +9,35 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drivers.canopen.sdo import ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX, ObjectAccess
-from drivers.errors import DriverError, ObjectAccessError
-from drivers.profiles.profile import Amplitude, DriveProfile, ObjectEntry
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import Node, SetupRefused
+from drivers.profiles.profile import Amplitude, DriveProfile
 
 SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
-"""Of servo motors; what is outside was entered in another unit than mA."""
+"""Range of servo motors; a value outside was entered in another unit than mA."""
 MIN_STEPS = 20.0
-"""Raw units in the rated current; with fewer, rounding alone would be 5 % of it."""
+"""Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it."""
 GROSS = 5.0
-"""Ratio of two name plates from which on one of them is in another unit; no two motors are so unlike on purpose."""
+"""Ratio of two name plates above which one of them must be in another unit."""
 FINE = 1.25
 """Ratio that tolerances of Kt and a gear's efficiency explain."""
 
 
-class ScaleImplausible(DriverError):
-    """A drive's ampere value cannot be true."""
-
-    def __init__(self, node_id: int, profile: str, found: str, expected: str, remedy: str) -> None:
-        super().__init__(f"node {node_id}, profile {profile}: found {found}; expected {expected}; {remedy}")
-        self.node_id = node_id
-        self.profile = profile
-        self.found = found
-        self.expected = expected
-
-
 @dataclass(frozen=True, slots=True)
 class ScaleReading:
-    """What a drive says of its ampere.
+    """Current scale and motor data of a drive.
 
     Attributes:
-        node_id, profile: whose, by which profile.
+        node_id, name: of the axis.
+        profile: name of its profile.
         ampere_per_unit: of the mapped current object [A].
-        objects: values that it was made of, by object.
-        rated_current_a: of the motor, None where the drive does not tell.
-        rated_torque_nm: of the motor, None where the drive does not tell.
-        warnings: what could not be checked, and what is odd, with the evidence.
+        objects: values of the scale objects, by object.
+        rated_current_a, rated_torque_nm: of the motor, None where the drive does not report them.
+        warnings: missing checks and doubtful values, with the evidence.
     """
 
     node_id: int
+    name: str
     profile: str
     ampere_per_unit: float
     objects: dict[str, int]
@@ -60,16 +50,16 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     """Read the scale of a drive's current, and check it against the rated current in the drive.
 
     Raises:
-        ScaleImplausible: an object of the scale is zero, the rated current is none of a servo motor, or it does not fit
-            the range or the resolution of the current object.
-        ObjectAccessError: an object of the scale cannot be read.
+        SetupRefused: a scale object is zero, the rated current is not that of a servo motor, or it does not fit the
+            range or the resolution of the current object.
+        ObjectAccessError: a scale object cannot be read.
     """
     scale = profile.current_scale
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
-            raise ScaleImplausible(
-                access.node_id,
+            raise _implausible(
+                access,
                 profile.name,
                 f"{name} = {value}",
                 "the motor's rated value",
@@ -79,23 +69,23 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
     try:
         ampere = scale.ampere_per_unit(tuple(values.values()), choice)
     except IndexError as error:
-        raise ScaleImplausible(
-            access.node_id,
+        raise _implausible(
+            access,
             profile.name,
             f"{scale.switch} = {choice}",
             f"0 to {len(scale.weights) - 1}",
-            "this firmware scales its current in a way that the profile does not know; complete the profile",
+            "this firmware scales its current in a way that is not in the profile; complete the profile",
         ) from error
     if scale.switch is not None:
         values[str(scale.switch)] = choice
     rated_a, rated_nm, warnings = _name_plate(access, profile)
     if rated_a is not None:
-        _check_rated(access.node_id, profile, ampere, rated_a)
-    return ScaleReading(access.node_id, profile.name, ampere, values, rated_a, rated_nm, warnings)
+        _check_rated(access, profile, ampere, rated_a)
+    return ScaleReading(access.node_id, access.name, profile.name, ampere, values, rated_a, rated_nm, warnings)
 
 
 def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float) -> tuple[str, ...]:
-    """Hold the drive's Kt = rated torque / rated current against the cell's, |nameplate gain / N|.
+    """Compare the drive's Kt = rated torque / rated current with the cell's, |nameplate gain / N|.
 
     Args:
         reading: of the drive.
@@ -103,13 +93,13 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
         motor_nm_per_a: torque constant of the motor by the cell configuration [Nm/A], sign irrelevant.
 
     Returns:
-        Warnings: what cannot be checked, or does not fit well.
+        Warnings for a poor fit.
 
     Raises:
-        ScaleImplausible: the two differ by a factor of five or more.
+        SetupRefused: the two differ by a factor of five or more.
     """
     if reading.rated_current_a is None or reading.rated_torque_nm is None:
-        return ()  # the reading itself has said so
+        return ()  # the reading has a warning of it
     reported, declared = reading.rated_torque_nm / reading.rated_current_a, abs(motor_nm_per_a)
     ratio = reported / declared
     evidence = (
@@ -117,8 +107,8 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
         f"{declared:.4g} Nm/A by the cell's nameplate gain, {ratio:.3g} times"
     )
     if not 1.0 / GROSS < ratio < GROSS:
-        raise ScaleImplausible(
-            reading.node_id,
+        raise _implausible(
+            reading,
             reading.profile,
             evidence,
             f"the same torque constant, within a factor of {GROSS:g}",
@@ -134,34 +124,28 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
 
 
 def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | None, float | None, tuple[str, ...]]:
-    """Rated current [A] and torque [Nm] of the motor, None where the drive does not tell, and what that means."""
+    """Read rated current [A] and torque [Nm] of the motor, None where the drive reports none, and warnings."""
     if profile.rated is None:
-        return None, None, (f"profile {profile.name} knows no rated current; the ampere cannot be checked",)
+        return None, None, (f"profile {profile.name} has no rated current; the ampere cannot be checked",)
     rated = profile.rated
-    current = _optional(access, rated.current)
-    if current is None:
-        return None, None, (f"{rated.current} is not told or 0; the ampere cannot be checked",)
-    torque = None if rated.torque is None else _optional(access, rated.torque)
-    if torque is None:
-        missing = "no rated torque" if rated.torque is None else f"{rated.torque} is not told or 0"
+    current = access.read_optional(rated.current)
+    if not current:  # 0 is "not entered"
+        return None, None, (f"drive reports no rated current ({rated.current}); the ampere cannot be checked",)
+    torque = None if rated.torque is None else access.read_optional(rated.torque)
+    if not torque:
+        missing = "no rated torque" if rated.torque is None else f"drive reports no rated torque ({rated.torque})"
         return current * rated.ampere_per_unit, None, (f"{missing}; the torque constant cannot be checked",)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
 
 
-def _optional(access: ObjectAccess, entry: ObjectEntry) -> int | None:
-    """An object that a drive need not have; 0 is "not entered"."""
-    try:
-        return access.read(entry) or None
-    except ObjectAccessError as error:
-        if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
-            return None
-        raise
+def _implausible(node: Node, profile: str, found: str, expected: str, remedy: str) -> SetupRefused:
+    return SetupRefused(node, f"profile {profile}: found {found}; expected {expected}; {remedy}")
 
 
-def _check_rated(node_id: int, profile: DriveProfile, ampere: float, rated_a: float) -> None:
+def _check_rated(node: Node, profile: DriveProfile, ampere: float, rated_a: float) -> None:
     if not SMALLEST_RATED_A <= rated_a <= LARGEST_RATED_A:
-        raise ScaleImplausible(
-            node_id,
+        raise _implausible(
+            node,
             profile.name,
             f"a rated current of {rated_a:g} A",
             f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A",
@@ -170,10 +154,10 @@ def _check_rated(node_id: int, profile: DriveProfile, ampere: float, rated_a: fl
     steps, entry = rated_a / ampere, profile.current
     most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
     if not MIN_STEPS <= steps <= most:
-        raise ScaleImplausible(
-            node_id,
+        raise _implausible(
+            node,
             profile.name,
             f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
-            f"{MIN_STEPS:g} to {most} steps, what {entry} can say",
+            f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
             "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
         )

@@ -1,10 +1,10 @@
-"""The process that reads a SocketCAN bus, and nothing else: receive, stamp, hand on.
+"""The process that only reads a SocketCAN bus: receive, time stamp, forward.
 
     python capture.py SOCKET OUT INTERFACE [RECORDS]     (two inherited file descriptors by their numbers)
 
-It runs by its path, isolated and with the standard library alone, so that it is there in some milliseconds. Its parent
-sends on the same socket; only this process receives. Frames leave as records of fixed size; while the parent is busy
-they wait here, in a bounded backlog, and what overflows that is counted. It ends when the parent has gone.
+It runs as a script, isolated and with the standard library alone, so that it starts within milliseconds. Its parent
+sends on the same socket; only this process receives. Frames leave as records of fixed size. While the parent is busy
+they wait here in a bounded backlog; overflow is counted. The process ends when its parent is gone.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from typing import NamedTuple
 
 SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
 MSG_OWN, MSG_LOCAL = 0x800, 0x4
-"""What linux/can/raw.h makes of MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
+"""linux/can/raw.h: MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
 BACKLOG_RECORDS = 1 << 20
 """A hundred seconds of a full bus in 56 MiB."""
 BURST = 128
-"""Frames between two looks at the parent."""
+"""Frames between two checks of the parent."""
 IDLE_MS = 20
-"""Silence after which losses are told that no frame came behind."""
+"""Silence after which losses are reported without a following frame."""
 LOOK_NS = 200_000_000
-"""Between two looks at the interface's own counters, and at who the parent is."""
+"""Time between two checks of the interface's own counters, and of the parent's process id."""
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
@@ -41,29 +41,29 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.si
 _SEND_BYTES = 1 << 16
 _PAUSE_NS = 200_000
 _CLOCK_STEP_NS = 1_000_000
-"""No slewing changes the difference of the two clocks that much between two bursts: somebody set the wall clock."""
+"""A larger difference between two bursts is no slewing: the wall clock was set."""
 
 
 class Kind(IntEnum):
-    """What a record tells."""
+    """Kind of a record."""
 
     READY = 0
     FRAME = 1
     LOSSES = 2
-    """Nothing but the counts, where no frame followed that could carry them."""
+    """Only the counts, where no frame followed that could carry them."""
     END = 3
-    """Nothing more will come; `can_id` is the error number."""
+    """The last record; `can_id` is the error number."""
 
 
 class Record(NamedTuple):
     """One frame, or a note of the capture process.
 
     Attributes:
-        kernel_ns: when the kernel received the frame, by the wall clock [ns since 1970].
-        monotonic_ns: the same moment by the monotonic clock [ns].
+        kernel_ns: wall time at which the kernel received the frame [ns since 1970].
+        monotonic_ns: the same time by the monotonic clock [ns].
         kernel_dropped, interface_dropped, backlog_dropped: frames lost so far: in the socket's buffer, before it, and
             in the backlog.
-        can_id: identifier and flags, as struct can_frame has them.
+        can_id: identifier and flags of struct can_frame.
         kind: a Kind.
         length: of the data [bytes].
         own, local: sent by this very socket, by any program of this machine.
@@ -97,9 +97,9 @@ class DropCounter:
         self.total = 0
 
     def see(self, raw: int) -> int:
-        """Take a reading; returns the total.
+        """Process a reading; returns the total.
 
-        A frame carries the count from when it was queued, and so may tell less than a reading of the socket did.
+        A frame carries the count of the time when it was queued, which may be less than a reading of the socket.
         """
         ahead = (raw - self.total) & 0xFFFF_FFFF
         if ahead < 0x8000_0000:
@@ -108,16 +108,16 @@ class DropCounter:
 
 
 class MonotonicTime:
-    """The kernel's wall-clock stamps on the monotonic clock, across settings of the wall clock.
+    """Converts the kernel's wall-clock stamps to the monotonic clock, also when the wall clock is set.
 
-    The kernel stamps received frames by CLOCK_REALTIME alone. The difference of the clocks, read after each burst,
-    takes that to the monotonic clock; after a step of the wall clock a frame may still have been stamped before it.
+    The kernel stamps received frames by CLOCK_REALTIME alone. The difference of the clocks is read after each burst;
+    after a step of the wall clock a frame may still have a stamp from before it.
 
     Args:
         wall_ns, monotonic_ns: both clocks, read together; no stamp becomes older than that.
 
     Attributes:
-        offset_ns: wall minus monotonic time, as last known [ns].
+        offset_ns: last known difference, wall minus monotonic time [ns].
     """
 
     def __init__(self, wall_ns: int, monotonic_ns: int) -> None:
@@ -125,7 +125,7 @@ class MonotonicTime:
         self._last_ns = monotonic_ns
 
     def of(self, stamp_ns: int, wall_ns: int, monotonic_ns: int) -> int:
-        """Monotonic time of a stamp [ns]; never before that of the one before, never after `monotonic_ns`.
+        """Return the monotonic time of a stamp [ns]; never before the previous one, never after `monotonic_ns`.
 
         Args:
             stamp_ns: of the kernel.
@@ -143,13 +143,13 @@ class MonotonicTime:
 
 
 class Capture:
-    """One bus and the parent that gets its frames.
+    """Reads one bus and forwards its frames to the parent.
 
     Args:
-        bus: non-blocking use of a CAN_RAW socket, or of a packet socket that carries struct can_frame.
+        bus: CAN_RAW socket, or a packet socket that carries struct can_frame; used non-blocking.
         out: stream socket to the parent.
         interface: name of the bus's interface, for its counters.
-        backlog_records: that may wait for the parent.
+        backlog_records: largest number that may wait for the parent.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Capture:
         self._frame = bytearray(_FRAME.size)
 
     def run(self, parent: int) -> None:
-        """Capture until the parent has gone, or the bus has.
+        """Capture until the parent or the bus is gone.
 
         Args:
             parent: its process id.
@@ -200,10 +200,10 @@ class Capture:
                 look_ns = self._now_ns + LOOK_NS
                 self._interface_dropped = self._read_interface() - self._interface_before
                 if os.getppid() != parent:
-                    return  # somebody else holds the parent's end of the pair open
+                    return  # another process holds the parent's end of the pair open
 
     def receive(self) -> int:
-        """Take what has come, a burst at most; returns the error number that ended the bus, else 0."""
+        """Receive waiting frames, a burst at most; returns the error number that ended the bus, else 0."""
         burst: list[tuple[int, int, bytes, int, int]] = []
         number = 0
         while len(burst) < BURST:
@@ -233,7 +233,7 @@ class Capture:
         before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2
         if self._now_ns - before_ns > _PAUSE_NS:
-            wall_ns = now_ns + self._time.offset_ns  # somebody else ran between the readings: they belong not together
+            wall_ns = now_ns + self._time.offset_ns  # preempted between the readings: they do not belong together
         for can_id, length, payload, stamp_ns, flags in burst:
             monotonic_ns = self._time.of(stamp_ns or wall_ns, wall_ns, now_ns)
             self._keep(
@@ -261,7 +261,7 @@ class Capture:
         self._reported_drops = (record.kernel_dropped, record.interface_dropped, record.backlog_dropped)
 
     def _note(self, kind: Kind, number: int = 0) -> None:
-        """Into the backlog even when that is full: these are few."""
+        """Append a note to the backlog, even when that is full: notes are few."""
         self._reported_drops = self._counts
         self._backlog += RECORD.pack(0, 0, *self._reported_drops, number, kind, 0, False, False, bytes(8))
 
@@ -276,20 +276,20 @@ class Capture:
                 with open(name, "rb") as file:  # noqa: PTH123 - pathlib costs the start of this process some ms
                     total += int(file.read())
             except (OSError, ValueError):
-                continue  # it has gone, or does not count this
+                continue  # it is gone, or does not count this
         return total
 
     def _read_drops(self) -> None:
-        """Ask the socket itself: a drop is told with the next frame, and there may be none."""
+        """Read the socket's own drop count: a frame reports drops before it, and there may be none."""
         try:
             counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
         except OSError:
-            return  # before Linux 4.12: then the next frame tells it
+            return  # before Linux 4.12: then the next frame reports it
         if len(counters) == _MEMINFO.size:
             self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
 
     def forward(self) -> bool:
-        """Hand on what the parent takes without waiting; tells whether there is still a parent."""
+        """Forward what the parent accepts without waiting; returns False when the parent is gone."""
         try:
             while self._backlog:
                 with memoryview(self._backlog) as waiting:
@@ -306,10 +306,10 @@ class Capture:
 
 def main(arguments: list[str]) -> None:
     """Capture from one inherited socket to the other."""
-    # Ctrl-C is the parent's to handle: it stops the axes first, and needs to see them for that.
+    # The parent handles Ctrl-C: it stops the axes first, and needs the frames for that.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = os.getppid()
-    # It does little and may not wait for those who do much, where we may ask for that (root, CAP_SYS_NICE).
+    # Real-time priority where permitted (root, CAP_SYS_NICE): this process does little and must not wait.
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     with socket.socket(fileno=int(arguments[0])) as bus, socket.socket(fileno=int(arguments[1])) as out:

@@ -1,7 +1,7 @@
-"""Watching a cell without touching it: what its axes report, how often, and what the bus carries.
+"""Watch a cell without changing it: reports of its axes, their rate, and the load of the bus.
 
-While another master is on the bus, nothing is sent: its SYNC, and the answers that our mapping gives to it, are
-overheard. On a quiet bus the axes are asked by SDO uploads, one open request a node. Nothing is ever written.
+While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are overheard. On a quiet
+bus the axes are read by SDO uploads, one open request a node. Nothing is ever written.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from drivers.stream.sample import CellEvent
 from drivers.stream.split_bus import SplitAddress
 
 QUIET_S = 2.0
-"""Silence of other masters after which the axes are asked."""
+"""Silence of other masters after which the axes are read by SDO."""
 ANSWER_S = 0.3
-"""That an answer may take; CiA 301 sets no bound, and drives answer within milliseconds."""
+"""Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds."""
 READING_S = 0.1
-"""Between two readings of an axis that is asked: six axes then take some 5 % of a bus of 1 Mbit/s."""
+"""Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %."""
 _UPLOAD = 0x40
 _EXPEDITED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
 """Bytes of data by the command byte of an expedited upload answer (CiA 301, SDO upload initiate)."""
 
 
 class Source(Enum):
-    """Where the readings come from."""
+    """Origin of the readings."""
 
     OVERHEARD = "overheard"
     ASKED = "asked"
@@ -40,13 +40,13 @@ class Source(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AxisReading:
-    """What is known of one axis.
+    """Reading of one axis.
 
     Attributes:
-        position_counts, current_raw, statusword: last ones, None where none came yet.
-        nmt: state in its last heartbeat, None where none came.
-        rate_hz: of whole readings since the reading before.
-        lost: SYNCs, or requests, that it left without an answer since the monitor began.
+        position_counts, current_raw, statusword: last values, None before the first.
+        nmt: state in its last heartbeat, None before the first.
+        rate_hz: of complete readings since the last reading.
+        lost: SYNCs or requests without an answer since the monitor began.
     """
 
     position_counts: int | None
@@ -59,14 +59,14 @@ class AxisReading:
 
 @dataclass(frozen=True, slots=True)
 class CellReading:
-    """What is known of a cell.
+    """Reading of a cell.
 
     Attributes:
         source: of the values.
-        seconds: since the reading before.
+        seconds: since the last reading.
         axes: in their order.
         sync_hz: SYNCs a second.
-        frames: on each bus, number of frames in that time by their length, ours among them, shape (buses, 9).
+        frames: number of frames in that time by bus and length, ours included, shape (buses, 9).
         events: EMCY and changes of NMT states in that time.
     """
 
@@ -79,7 +79,7 @@ class CellReading:
 
 
 class _AxisWatch:
-    """The last values of one axis, and its frames that are due."""
+    """Last values of one axis, and its pending answers."""
 
     def __init__(self, axis: Axis) -> None:
         self.node_id = axis.node_id
@@ -107,7 +107,7 @@ class _AxisWatch:
         self.readings += self.seen == self.slots.keys()
 
     def sync(self) -> None:
-        """The time for the answers to the SYNC before is over; an axis is followed from its first answer on."""
+        """End the time for answers to the SYNC before; losses count from an axis's first complete answer on."""
         self.lost += self.followed and self.seen != self.slots.keys()
         self.followed = self.followed or self.seen == self.slots.keys()
         self.seen.clear()
@@ -115,7 +115,7 @@ class _AxisWatch:
     def answer(self, data: bytes) -> None:
         entry = self.entries[self.asked]
         if self.open_until_ns is None or data[1:4] != struct.pack("<HB", entry.index, entry.subindex):
-            return  # an answer to somebody else
+            return  # an answer to another program
         self.open_until_ns = None
         length = _EXPEDITED.get(data[0], 0)
         if 8 * length >= entry.bits:
@@ -127,7 +127,7 @@ class _AxisWatch:
             if now_ns < self.open_until_ns:
                 return None
             self.lost += 1
-            self.open_until_ns, self.asked = None, -1  # from the first one on: the values of a reading belong together
+            self.open_until_ns, self.asked = None, -1  # start again: the values of a reading belong together
         following = (self.asked + 1) % len(self.entries)
         if following == 0:
             if now_ns < self.due_ns:
@@ -139,10 +139,10 @@ class _AxisWatch:
 
 
 class CellMonitor:
-    """Reads a bus and, where nobody else leads it, asks its axes.
+    """Reads a bus and, where no other master is on it, reads its axes by SDO.
 
     Args:
-        link: open; nobody else may read it meanwhile.
+        link: open; only the monitor may read it meanwhile.
         axes: of the cell.
     """
 
@@ -160,15 +160,15 @@ class CellMonitor:
 
     @property
     def source(self) -> Source:
-        """Of the values now: until it is known that no other master is there, nothing is sent."""
+        """Origin of the values now; overheard until the absence of another master is certain."""
         last_ns = self._began_ns if self._master_ns is None else self._master_ns
         return Source.OVERHEARD if self._link.clock() - last_ns < QUIET_S * 1e9 else Source.ASKED
 
     def watch(self, seconds: float) -> CellReading:
-        """Read the bus for a time; what came meanwhile.
+        """Read the bus for a time and return a reading.
 
         Raises:
-            BusError: the bus has gone, or is off.
+            BusError: the bus is lost, or off.
         """
         clock = self._link.clock
         deadline_ns = clock() + round(seconds * 1e9)
@@ -182,7 +182,7 @@ class CellMonitor:
         return self._reading()
 
     def pause(self) -> None:
-        """Let go of what was asked: somebody else will read the bus for a moment."""
+        """Drop open requests: other code reads the bus for a moment."""
         for axis in self._axes:
             axis.open_until_ns, axis.asked = None, -1
 
@@ -220,7 +220,7 @@ class CellMonitor:
             self._link.dispatch(message)
 
     def _lead(self) -> None:
-        """Another master speaks."""
+        """Note a command of another master."""
         if self.source is Source.ASKED:
             self.pause()
             for axis in self._axes:

@@ -1,4 +1,4 @@
-"""One SYNC cycle of a cell, as the amplifiers sent it."""
+"""One SYNC cycle of a cell as the amplifiers sent it, and the events between."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from enum import Enum
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What all axes reported for one SYNC.
+    """Reports of all axes for one SYNC.
 
-    Raw counts, converted late: the gain is what is being identified, so no assumed gain is baked into data.
+    Values are raw counts, converted late: the gain is to be identified, so the data contain no assumed gain.
 
     Attributes:
         cycle: number of the sampling period since the stream began; a period that had no SYNC leaves a gap.
@@ -31,11 +31,8 @@ class Sample:
     missing: int = 0
 
 
-# What happens in a cell besides samples.
-
-
 class EventKind(Enum):
-    """What a CellEvent tells; its code says more."""
+    """Kind of a CellEvent."""
 
     EMCY = "emcy"
     EMCY_RESET = "emcy reset"
@@ -59,7 +56,7 @@ class EventKind(Enum):
     STOP = "stop"
     STOP_UNCONFIRMED = "stop unconfirmed"
     ENDED = "ended"
-    """Early, before the moves were made; the text says by what."""
+    """Before all moves were made; the text has the cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +64,12 @@ class CellEvent:
     """One event of the cell.
 
     Attributes:
-        time_ns: in the time of the samples [ns since 1970]: that of the SYNC it came after.
-        axis: index of the axis from 0, or None when it concerns the whole cell.
-        kind: what happened.
-        code: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, bits of
-            the controller's state, number of frames, by kind.
-        text: for a person.
+        time_ns: time of the SYNC before it [ns since 1970].
+        axis: index of the axis from 0, or None for the whole cell.
+        kind: of the event.
+        code: by kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the
+            cycle, bits of the controller's state, number of frames.
+        text: for the operator.
     """
 
     time_ns: int
@@ -83,8 +80,8 @@ class CellEvent:
 
 
 EventSink = Callable[[CellEvent], None]
-"""Receives events in the order in which they happen, before the sample of their cycle is handed out."""
+"""Receives events in the order in which they happen, before the sample of their cycle is returned."""
 
 
 def ignore_event(event: CellEvent) -> None:
-    """An EventSink for those who want samples alone."""
+    """Discard an event: an EventSink for samples alone."""

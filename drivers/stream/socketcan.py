@@ -1,4 +1,4 @@
-"""One end of a SocketCAN bus, read by a process of its own (drivers/stream/capture.py); here it is only sent on.
+"""One end of a SocketCAN bus: a separate process reads it (drivers/stream/capture.py), this one sends.
 
 See docs/decisions/0017-capture-in-its-own-process.md.
 """
@@ -24,18 +24,18 @@ from drivers.stream import capture
 from drivers.stream.capture import RECORD, Kind
 
 RECEIVE_BUFFER_BYTES = 4 << 20
-"""A kernel buffer of 208 KiB holds 43 ms of a full bus; a busy machine needs more."""
+"""The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more."""
 START_S = 20.0
-"""Until the capture process reads; a loaded machine takes its time to start an interpreter."""
+"""Time for the capture process to start; a loaded machine is slow to start an interpreter."""
 END_S = 5.0
 SEND_S = 0.1
-"""How long a full transmit queue may stay full: at 10 kbit/s a frame takes 13 ms."""
+"""Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms."""
 RETRY_S = 0.0002
 SO_RCVBUFFORCE, SO_TIMESTAMPNS = 33, 35  # asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
 ERROR_CLASSES = 0x4 | 0x40 | 0x100
-"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not told:
-a bus without a second node sends thousands a second."""
+"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not
+requested: a bus without a second node sends thousands a second."""
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
 _FRAME = struct.Struct("=IB3x8s")
 _PAIR_BYTES = 1 << 18
@@ -47,9 +47,9 @@ class Losses:
 
     Attributes:
         kernel: in the socket's receive buffer (SO_RXQ_OVFL).
-        backlog: in the capture process, because nobody took them from it for minutes.
+        backlog: in the capture process, because this process did not read them for minutes.
         interface: before any socket, in the controller or in the kernel's queue behind its driver (the interface's
-            counters, which are looked at five times a second).
+            counters, which are read five times a second).
     """
 
     kernel: int = 0
@@ -58,11 +58,11 @@ class Losses:
 
     @property
     def total(self) -> int:
-        """All of them."""
+        """Sum of all losses."""
         return self.kernel + self.interface + self.backlog
 
     def since(self, earlier: Losses) -> Losses:
-        """What has been lost since a reading."""
+        """Return the losses since an earlier reading."""
         return Losses(
             kernel=self.kernel - earlier.kernel,
             backlog=self.backlog - earlier.backlog,
@@ -76,11 +76,11 @@ NO_LOSSES = Losses()
 class CapturedMessage(can.Message):
     """A frame with the kernel's time.
 
-    ``is_rx`` is False on a SYNC that this end sent itself: it comes back for the sake of its time.
+    ``is_rx`` is False on a SYNC that this end sent itself: it is received for its time.
 
     Attributes:
-        kernel_ns: when the kernel received or sent it, by the wall clock [ns since 1970].
-        monotonic_ns: the same moment by the monotonic clock [ns].
+        kernel_ns: wall time at which the kernel received or sent it [ns since 1970].
+        monotonic_ns: the same time by the monotonic clock [ns].
         local: sent by a program of this machine.
     """
 
@@ -92,13 +92,13 @@ class CapturedMessage(can.Message):
 
 
 def losses_of(bus: can.BusABC) -> Losses:
-    """What a bus says that this machine lost of its frames; nothing where a bus cannot tell."""
+    """Return the frames of a bus that this machine lost; zeros where a bus does not count them."""
     found = getattr(bus, "losses", NO_LOSSES)
     return found if isinstance(found, Losses) else NO_LOSSES
 
 
 def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
-    """What a person should know of how a bus was opened."""
+    """Return remarks for the operator on how a bus was opened."""
     return tuple(getattr(bus, "remarks", ()))
 
 
@@ -111,11 +111,11 @@ def open_socketcan(
 
     Args:
         channel: name of the interface.
-        receive_buffer_bytes: to ask the kernel for.
+        receive_buffer_bytes: requested of the kernel.
         backlog_records: frames that may wait in the capture process.
 
     Raises:
-        OSError: there is no such interface, or it may not be used.
+        OSError: there is no such interface, or no permission to use it.
         can.CanInitializationError: the interface is down, or the capture process did not start.
     """
     handle = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
@@ -136,7 +136,7 @@ class SocketcanBus(can.BusABC):
         channel: name of the interface, for messages.
         handle: bound socket; the bus closes it.
         backlog_records: frames that may wait in the capture process.
-        remarks: what a person should know of how it was opened.
+        remarks: for the operator, on how it was opened.
 
     Raises:
         can.CanError: the capture process did not start; the socket is closed.
@@ -182,7 +182,7 @@ class SocketcanBus(can.BusABC):
             raise
 
     def _wait_until_ready(self) -> None:
-        """Before it reads, nobody would hear another master."""
+        """Wait for the capture process: before it reads, another master would not be heard."""
         deadline = time.monotonic() + START_S
         while not self._ready:
             left_s = deadline - time.monotonic()
@@ -200,7 +200,7 @@ class SocketcanBus(can.BusABC):
             try:
                 self._socket.send(frame, socket.MSG_DONTWAIT)
             except OSError as error:
-                # A full queue of the interface, and a full buffer of the socket: the kernel would wait for ever.
+                # The queue of the interface, or the buffer of the socket, is full.
                 if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
                 # The interface's queue holds ten frames by default; a burst of set-points is longer.
@@ -215,7 +215,7 @@ class SocketcanBus(can.BusABC):
                 return
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; the rest of it is handed out without python-can's clock and logging.
+        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
         if self._received and self._filters is None:
             return self._received.popleft()
         return super().recv(timeout)
@@ -230,7 +230,7 @@ class SocketcanBus(can.BusABC):
         if self._end is not None:
             raise can.CanOperationError(self._end)
         try:
-            # What an interrupted call took and did not make frames of comes first.
+            # Bytes that an interrupted call received and did not parse come first.
             if sum(map(len, self._chunks)) < RECORD.size and not self._take(timeout_s):
                 return
         except (OSError, ValueError) as error:
@@ -243,11 +243,11 @@ class SocketcanBus(can.BusABC):
             raise can.CanOperationError(self._end)
 
     def _take(self, timeout_s: float | None) -> bool:
-        """Append what the capture process has sent to the chunks; tells whether there was anything."""
-        # Within one call into C, so that no signal handler's exception comes between receiving and keeping.
+        """Append the bytes of the capture process to the chunks; returns whether there were any."""
+        # One call into C, so that no signal handler's exception comes between receiving and appending.
         receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
         try:
-            # Beside a busy thread each system call may cost the wait for the interpreter: not one too many.
+            # Beside a busy thread each system call may wait for the interpreter lock: try without select first.
             self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
         except BlockingIOError:
             if timeout_s == 0 or not select.select((self._pair,), (), (), timeout_s)[0]:
@@ -256,7 +256,7 @@ class SocketcanBus(can.BusABC):
         return True
 
     def _parse(self) -> None:
-        """Make frames of the chunks; an exception on the way, such as Ctrl-C, leaves them for the next time."""
+        """Parse the chunks into frames; an exception meanwhile, such as Ctrl-C, leaves them for the next time."""
         chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
         rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
@@ -264,7 +264,7 @@ class SocketcanBus(can.BusABC):
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
-                # Of what we sent ourselves only SYNC is of interest: when it really went out.
+                # Of our own frames only SYNC is of interest: its actual time.
                 if not own or can_id == 0x080:
                     received.append(self._message(kernel_ns, monotonic_ns, can_id, data[:length], own, local))
             elif kind == Kind.READY:
@@ -272,7 +272,7 @@ class SocketcanBus(can.BusABC):
             elif kind == Kind.END:
                 end = _reason(can_id)
         losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
-        # Nothing is called from here on: all of it, or none.
+        # No call from here on: the state changes whole, or not at all.
         self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
 
     def _message(
@@ -305,7 +305,7 @@ class SocketcanBus(can.BusABC):
         self._socket.close()
 
     def _wait(self) -> int:
-        """For the capture process, which has nobody to work for any more; its exit code."""
+        """Wait for the end of the capture process; returns its exit code."""
         try:
             return self._process.wait(END_S)
         except subprocess.TimeoutExpired:
@@ -317,18 +317,18 @@ def _spawn(bus: socket.socket, out: socket.socket, channel: str, backlog_records
     numbers = (bus.fileno(), out.fileno())
     program = (str(Path(capture.__file__).resolve()), *map(str, numbers), channel, str(backlog_records))
     return subprocess.Popen(
-        # Isolated: whatever the user's environment imports has nothing to do there.
+        # Isolated from the user's environment, and without the packages of this one.
         [sys.executable, "-I", "-S", *program],
         pass_fds=numbers,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
-        # A terminal's Ctrl-C goes to a whole group: the axes are stopped first, and that needs the frames.
+        # A terminal's Ctrl-C goes to the whole process group, but stopping the axes needs the frames.
         start_new_session=True,
     )
 
 
 def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, ...]:
-    """Set the options of a CAN_RAW socket; returns remarks for a person."""
+    """Set the options of a CAN_RAW socket; returns remarks for the operator."""
     for level, option, value in (
         (socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
         (socket.SOL_SOCKET, capture.SO_RXQ_OVFL, 1),
@@ -340,7 +340,7 @@ def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, .
         handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
     except PermissionError:
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
-    # The kernel doubles what it is asked for, for its own book-keeping, and tells the double.
+    # The kernel doubles the requested size for its own book-keeping, and reports the double.
     given = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     if given >= receive_buffer_bytes:
         return ()
@@ -357,7 +357,7 @@ def _require_up(handle: socket.socket) -> None:
 
 
 def _packed(message: can.Message) -> bytes:
-    """A frame as struct can_frame."""
+    """Return a frame as struct can_frame."""
     if message.is_fd:
         raise can.CanOperationError(f"no CAN FD frames on this bus: {message}")
     flags = (
@@ -369,10 +369,10 @@ def _packed(message: can.Message) -> bytes:
 
 
 def _reason(number: int) -> str:
-    """What an error of the socket means to a person."""
+    """Explain an error of the socket."""
     name = errno.errorcode.get(number, str(number))
     if number == errno.ENETDOWN:
         return f"the interface is down ({name}): ip link set ... up"
     if number in (errno.ENODEV, errno.ENXIO):
-        return f"the interface has gone ({name}): was the adapter unplugged?"
+        return f"the interface is gone ({name}): was the adapter unplugged?"
     return f"{os.strerror(number)} ({name})"

@@ -1,12 +1,12 @@
 """Several CAN buses that one cell is wired to, read and written as one.
 
 A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven bits of their COB-ID
-(CiA 301, predefined connection set), NMT by its second byte. What concerns everybody goes to all: SYNC, NMT to all, and
-the heartbeat of the recorder, whose id is no node's. Received frames come in the order of their time stamps, which
-every interface takes from clocks of this one computer: monotonic where all have one, else by the wall clock.
+(CiA 301, predefined connection set), NMT by its second byte. Frames without a node go to all buses: SYNC, NMT to all,
+and the heartbeat of the recorder. Received frames come in the order of their time stamps, which all interfaces take
+from clocks of this computer: monotonic where all have such stamps, else wall time.
 
-A bus that fails is told of once, as a BusError with its name; then the others go on without it, so that the axes on
-them can be stopped and given back. Its own nodes are silent from then on.
+A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes can be stopped and
+restored; the nodes of the failed bus are silent from then on.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from drivers.errors import BusError, NodeMisplaced
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 
 ALTERNATION_S = 0.0005
-"""Of waiting at one bus while another may receive, where one of them has no file descriptor to wait at."""
+"""Time to wait at one bus while another may receive, where one of them has no file descriptor."""
 LARGEST_RUN = 64
-"""Frames of one bus in a row while another has one too: a clock that lags behind must not silence the others."""
+"""Frames of one bus in a row while another has one too: a lagging clock must not silence the others."""
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
 _FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
@@ -38,8 +38,8 @@ class BusPart:
     """One of the buses of a cell.
 
     Attributes:
-        name: as people call it.
-        address: where it is.
+        name: for messages.
+        address: of the bus.
         node_ids: of the amplifiers on it.
     """
 
@@ -53,7 +53,7 @@ class BusPart:
 
 @dataclass(frozen=True, slots=True)
 class SplitAddress:
-    """Where the buses of a cell are; a node id is on one of them at most."""
+    """Addresses of the buses of a cell; each node id is on one of them at most."""
 
     parts: tuple[BusPart, ...]
 
@@ -61,7 +61,7 @@ class SplitAddress:
         return " + ".join(map(str, self.parts))
 
     def route(self, message: can.Message) -> tuple[int, ...]:
-        """Indices of the parts that a frame concerns: its node's, or all where it is nobody's."""
+        """Return the indices of the parts that a frame concerns: its node's, or all."""
         node_id = 0
         if not (message.is_extended_id or message.is_error_frame):
             node_id = message.arbitration_id & 0x7F
@@ -74,11 +74,11 @@ class SplitAddress:
 
 
 CellAddress = BusAddress | SplitAddress
-"""Of one bus, or of several."""
+"""Address of one bus, or of several."""
 
 
 def open_cell_bus(address: CellAddress) -> can.BusABC:
-    """One end of the bus, or of all buses, of a cell.
+    """Open one end of the bus, or of all buses, of a cell.
 
     Raises:
         BusError: one cannot be opened (those before it are closed again), or two have a node id in common.
@@ -89,7 +89,7 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
 
 
 def open_split_bus(address: SplitAddress, clock: Callable[[], float] = time.monotonic) -> SplitBus:
-    """An end of every bus of a cell, as one.
+    """Open an end of every bus of a cell, as one bus.
 
     Raises:
         BusError: as `open_cell_bus`.
@@ -115,13 +115,11 @@ def open_split_bus(address: SplitAddress, clock: Callable[[], float] = time.mono
 
 
 class SplitBus(can.BusABC):
-    """Ends of several buses as one.
-
-    A received frame says in ``channel`` which of the buses it came from.
+    """Ends of several buses as one; ``channel`` of a received frame names its bus.
 
     Args:
         address: of the buses.
-        ends: of them, in their order; they are the split bus's to close.
+        ends: of the buses, in their order; the split bus closes them.
         clock: monotonic seconds, for time-outs.
     """
 
@@ -148,18 +146,18 @@ class SplitBus(can.BusABC):
 
     @property
     def losses(self) -> Losses:
-        """Of all buses together."""
+        """Losses of all buses together."""
         each = [losses_of(end) for end in self._ends]
         return Losses(**{place.name: sum(getattr(lost, place.name) for lost in each) for place in fields(Losses)})
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know of how each bus was opened."""
+        """Remarks for the operator on how each bus was opened."""
         named = zip(self._names, map(remarks_of, self._ends), strict=True)
         return tuple(f"{name}: {remark}" for name, remarks in named for remark in remarks)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame to whom it concerns.
+        """Send a frame to its bus, or to all.
 
         Raises:
             BusError: one of the buses has just failed, the others got it; or all have failed.
@@ -167,10 +165,10 @@ class SplitBus(can.BusABC):
         self.send_burst((msg,))
 
     def send_burst(self, messages: Sequence[can.Message]) -> None:
-        """Send several frames in their order; what follows each other on one bus goes there in one call.
+        """Send several frames in their order; consecutive frames of one bus go there in one call.
 
-        What concerns all goes to one bus right after the other, when everything before it has been sent: so near
-        together are the SYNCs.
+        A frame for all buses goes to one right after the other, when everything before it has been sent: this keeps the
+        SYNCs close together.
 
         Raises:
             BusError: as `send`.
@@ -194,11 +192,11 @@ class SplitBus(can.BusABC):
             failures.append(self._failure(index, error))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """The oldest frame that waits on any of the buses.
+        """Return the oldest frame that waits on any of the buses.
 
         Raises:
             BusError: one of the buses has just failed, or went off; or all have failed.
-            NodeMisplaced: a node is heard on another bus than its own; said once, its frames there are left out.
+            NodeMisplaced: a node is heard on another bus than its own; raised once, its frames there are left out.
         """
         end_s = None if timeout is None else self._clock() + timeout
         while True:
@@ -210,7 +208,7 @@ class SplitBus(can.BusABC):
                 message, self._waiting[oldest] = self._waiting[oldest], None
                 if message is not None and not self._is_echo(message, oldest) and self._at_home(message, oldest):
                     return message
-                continue  # an end may hold more frames, which no file descriptor tells of
+                continue  # an end may hold more frames without a ready file descriptor
             left_s = None if end_s is None else end_s - self._clock()
             if left_s is not None and left_s <= 0:
                 return None
@@ -230,7 +228,7 @@ class SplitBus(can.BusABC):
         return message
 
     def _oldest(self) -> int | None:
-        """The bus of the oldest of the frames that wait, one a bus; None where there is none."""
+        """Return the bus of the oldest waiting frame; None where there is none."""
         waiting = [(message, index) for index, message in enumerate(self._waiting) if message is not None]
         # The wall clock can be set between two frames, and a float of its seconds has steps of 200 ns.
         heads: list[tuple[float, int]] = [
@@ -248,7 +246,7 @@ class SplitBus(can.BusABC):
         return index
 
     def _is_echo(self, message: can.Message, index: int) -> bool:
-        """A SYNC of ours that a bus gives back for the sake of its time: one stands for all, that of the first bus."""
+        """Whether a frame is our own SYNC, received for its time, on another bus than the first."""
         return not message.is_rx and index != min(set(range(len(self._ends))) - self._failed, default=index)
 
     def _at_home(self, message: can.Message, index: int) -> bool:
@@ -265,7 +263,7 @@ class SplitBus(can.BusABC):
         return False
 
     def _wait(self, left_s: float | None) -> None:
-        """Until a frame comes on one of the buses, or the time is over."""
+        """Wait until a frame comes on one of the buses, or the time is over."""
         live = [index for index in range(len(self._ends)) if index not in self._failed]
         handles = [handle for index in live if (handle := self._handles[index]) is not None]
         if len(handles) == len(live):
@@ -277,7 +275,7 @@ class SplitBus(can.BusABC):
         self._waiting[index] = self._take(index, timeout_s if left_s is None else min(left_s, timeout_s))
 
     def _failure(self, index: int, error: Exception) -> BusError:
-        """From now on this bus is left out."""
+        """Leave this bus out from now on."""
         self._failed.add(index)
         failure = BusError(self._names[index], error.reason if isinstance(error, BusError) else _text(error))
         failure.__cause__ = error
@@ -288,7 +286,7 @@ class SplitBus(can.BusABC):
             raise BusError(self.channel_info, "all of them have failed")
 
     def shutdown(self) -> None:
-        """Close all ends, whatever one of them does.
+        """Close all ends, also after a failure.
 
         Raises:
             BusError: the first that could not be closed.

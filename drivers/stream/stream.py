@@ -1,93 +1,32 @@
-"""The SYNC-grouped stream: one SYNC, sent or followed, the answers of all axes back, one Sample.
+"""The SYNC-grouped stream: one SYNC, sent or followed, the answers of all axes, one Sample.
 
-The stream is the only reader of the bus while it runs. A TPDO carries no cycle number, so an answer that comes after
-the next SYNC can be told from that SYNC's own answer only by waiting for both: after a missing frame the stream does
-that, for one cycle, before it believes that the frame was lost.
+The stream is the only reader of the bus while it runs. Which answer belongs to which SYNC is decided in answers.py, the
+pacing is described in sync.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from struct import Struct
 
 import can
 
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID
 from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
-from drivers.errors import BusError, CellSilent, NodeMisplaced, PdoLengthWrong, SampleLost
+from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
+from drivers.stream.answers import Answers, Slot, StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample, ignore_event
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
 SHORTENED, STRAGGLING = 16, 4
-"""Parts of a lockstep cycle's bound: for a cell that was silent before, and for axes when others have answered."""
+"""Fractions of a lockstep cycle's time: for a cell that was silent before, and for axes after others answered."""
 
 LARGEST_LAG_NS = 1_000_000_000
-"""Of the reader behind the bus; what it sees of the axes is then older than what a person would bear."""
+"""Largest delay of the reader behind the bus; older data cannot protect moving axes."""
 FRAMES_PER_S = 50_000
-"""More than two buses of 1 Mbit/s carry: among so many frames a producer that is alive has been heard."""
-
-
-@dataclass(frozen=True, slots=True)
-class StreamStatistics:
-    """What has become of the frames so far; a run is sound when all from `missing` to `backlog_dropped` are zero.
-
-    Attributes:
-        cycles: SYNCs sent, or followed.
-        frames: answers used.
-        missing: answers that did not come in their cycle.
-        late: answers that came in a later cycle, where that could be known.
-        duplicate: second answers of an axis to one SYNC.
-        surplus: PDOs of an axis of the cell that it was not told to send.
-        wrong_length: answers that are not as long as the mapping says; they count as missing too.
-        skipped_periods: periods without a SYNC because the schedule slipped, or a followed SYNC did not come.
-        kernel_dropped: frames of any kind that the kernel dropped because its receive buffer was full.
-        interface_dropped: the same, before they came to the buffer.
-        backlog_dropped: frames that the capture process dropped because nobody took them from it.
-        foreign: PDOs that are explained: of nodes that are no axes of the cell, or from before the first SYNC.
-    """
-
-    cycles: int = 0
-    frames: int = 0
-    missing: int = 0
-    late: int = 0
-    duplicate: int = 0
-    surplus: int = 0
-    wrong_length: int = 0
-    skipped_periods: int = 0
-    kernel_dropped: int = 0
-    interface_dropped: int = 0
-    backlog_dropped: int = 0
-    foreign: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class _Slot:
-    """Where the values of one TPDO go."""
-
-    axis: int
-    bit: int
-    length: int
-    layout: Struct
-    columns: tuple[int, ...]
-
-
-def _slots(network: CanopenNetwork) -> dict[int, _Slot]:
-    """The slot of each COB-ID; column = field × axes + axis, with fields position, current, statusword."""
-    slots: dict[int, _Slot] = {}
-    axes = len(network.axes)
-    for number, axis in enumerate(network.axes):
-        entries = feedback_entries(axis)
-        pdos = pack(entries)
-        for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True):
-            form = layout(pdo)
-            columns = tuple(entries.index(entry) * axes + number for entry in pdo)
-            slots[record.cob_id] = _Slot(number, 1 << len(slots), form.size, form, columns)
-    return slots
+"""More than two buses of 1 Mbit/s carry: among so many frames a SYNC producer that is alive has been heard."""
 
 
 def _is_sync(message: can.Message) -> bool:
@@ -99,21 +38,18 @@ class SyncStream:
     """An iterator of Samples that never ends by itself; ``next`` raises what must stop a recording.
 
     Args:
-        network: a prepared network; nobody else may read its bus while the stream is used.
-        pacing: when a SYNC goes out.
-        on_event: gets EMCY, NMT and CiA 402 changes and losses, before the sample of their cycle is returned.
-        max_missing_cycles: so many incomplete cycles in a row are tolerated, counted and marked in their samples.
+        network: a prepared network; only the stream may read its bus meanwhile.
+        pacing: schedule of SYNC.
+        on_event: receives EMCY, NMT and CiA 402 changes and losses before the sample of their cycle is returned.
+        max_missing_cycles: tolerated number of incomplete cycles in a row; they are counted, and marked in the samples.
 
     Raises (by ``next``):
         SampleLost: more incomplete cycles in a row than tolerated.
-        DriveFault: an EMCY, a new fault or following error, or a node that left OPERATIONAL.
-        CellSilent: the same, and no axis answered.
-        PdoLengthWrong: an axis answers twice in a row with a PDO that is not as long as its mapping.
-        LimitActive: a limit of a drive acts for too long.
+        DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends no heartbeat for two
+            of its periods, an active limit, stale data, or a PDO of wrong length twice in a row.
         BusBusy: another master sends SYNC, NMT commands or set-points of an axis.
-        HeartbeatLost: a node is silent for more than two of its periods.
-        BusError: the bus, one of its parts or the capture process has gone, the followed SYNC does not come any more,
-            or the bus is read more than a second late.
+        BusError: the bus, one of its parts or the capture process is lost, the followed SYNC stopped, or the bus is
+            read more than a second late.
         NodeMisplaced: a node is heard on another of the cell's buses than its own.
     """
 
@@ -129,16 +65,12 @@ class SyncStream:
         self.max_missing_cycles = max_missing_cycles
         self._link = network.link
         self._on_event = on_event
-        self._slots = _slots(network)
+        self._answers = Answers(network.axes)
+        self._slots = self._answers.slots
         self._axes = len(network.axes)
         self._nodes = frozenset(network.node_ids)
-        self._all = (1 << len(self._slots)) - 1
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
         self._outgoing: list[can.Message] = []
-        self._values = [0] * (3 * self._axes)
-        self._seen = 0
-        self._debt = 0
-        self._last_data: dict[int, bytearray] = {}
         self._incomplete_cycles = 0
         self._short: dict[int, int] = {}
         self._silent = False
@@ -154,25 +86,24 @@ class SyncStream:
         self._base = self._losses = Losses()
         self._time_ns = pacing.start_ns
         self._watch = Watch(network, on_event)
-        self._cycles = self._frames = self._missing = self._late = 0
-        self._duplicate = self._surplus = self._wrong_length = self._skipped = self._foreign = 0
+        self._cycles = self._surplus = self._wrong_length = self._skipped = self._foreign = 0
 
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
         return StreamStatistics(
-            self._cycles,
-            self._frames,
-            self._missing,
-            self._late,
-            self._duplicate,
-            self._surplus,
-            self._wrong_length,
-            self._skipped,
-            self._losses.kernel,
-            self._losses.interface,
-            self._losses.backlog,
-            self._foreign,
+            cycles=self._cycles,
+            frames=self._answers.frames,
+            missing=self._answers.missing,
+            late=self._answers.late,
+            duplicate=self._answers.duplicate,
+            surplus=self._surplus,
+            wrong_length=self._wrong_length,
+            skipped_periods=self._skipped,
+            kernel_dropped=self._losses.kernel,
+            interface_dropped=self._losses.interface,
+            backlog_dropped=self._losses.backlog,
+            foreign=self._foreign,
         )
 
     @property
@@ -186,15 +117,15 @@ class SyncStream:
         return self._time_ns
 
     def emit(self, event: CellEvent) -> None:
-        """Put an event of the caller's into the order of the stream's."""
+        """Insert an event of the caller into the stream's events."""
         self._on_event(event)
 
     def send(self, messages: Sequence[can.Message]) -> None:
-        """Send frames right before the next SYNC, on which synchronous RPDOs act."""
+        """Send frames right before the next SYNC, which triggers synchronous RPDOs."""
         self._outgoing.extend(messages)
 
     def drop_outgoing(self) -> None:
-        """Forget the frames that wait for the next SYNC: what they ask for is no longer wanted."""
+        """Discard the frames that wait for the next SYNC."""
         self._outgoing.clear()
 
     def __iter__(self) -> Iterator[Sample]:
@@ -205,15 +136,15 @@ class SyncStream:
         return self.advance()
 
     def check(self) -> None:
-        """Raise the oldest fault that was seen and not raised yet."""
+        """Raise the oldest fault that was not raised yet."""
         if self._watch.faults:
             raise self._watch.faults.popleft()
 
     def advance(self) -> Sample:
-        """One cycle whatever the drives' condition is, as stopping them needs; faults wait for the next ``next``.
+        """Run one cycle even with faults, as stopping the axes needs; faults wait for the next ``next``.
 
         Raises:
-            BusError: the bus has gone.
+            BusError: the bus is lost.
             NodeMisplaced: as `next`.
         """
         self._over = False
@@ -229,12 +160,12 @@ class SyncStream:
         return self._finish_cycle()
 
     def _begin(self) -> None:
-        """What came before the first SYNC is nobody's, and what was lost before it is not missed."""
+        """Discard the frames from before the first SYNC; losses before it do not count."""
         bus, begun_ns = self._link.bus, self.pacing.clock()
         for message in self._waiting():
             fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
             if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
-                self._opened = message  # a reader that is no faster than the bus would look for an end for ever
+                self._opened = message  # a reader no faster than the bus would never reach the end
                 break
             self._between_cycles(message)
         self._base = losses_of(bus)
@@ -242,7 +173,7 @@ class SyncStream:
             self._on_event(CellEvent(self._time_ns, None, EventKind.CAPTURE, 0, remark))
 
     def _waiting(self) -> Iterator[can.Message]:
-        """The frames that have come already; who is at them for too long sees no axis any more."""
+        """Yield the frames that have arrived already; a reader that needs too long is a fault."""
         clock, recv = self.pacing.clock, self._link.bus.recv
         begun_ns = clock()
         while (message := recv(0.0)) is not None:
@@ -252,14 +183,16 @@ class SyncStream:
                 return
 
     def _fall_behind(self, behind_ns: int) -> None:
-        """A fault, once: whether anything is lost the counters say."""
+        """Report a late reader once; the counters show whether frames were lost."""
         if not self._behind:
             self._behind = True
-            reason = f"read {behind_ns * 1e-9:.1f} s late: nobody watches axes that move so"
+            reason = (
+                f"read {behind_ns * 1e-9:.1f} s late: moving axes cannot be watched; reduce the load of this computer"
+            )
             self._watch.faults.append(BusError(str(self._link.address), reason))
 
     def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
-        """The next frame until a time by the clock, or that had come by then: a late reader is no dead producer."""
+        """Return the next frame that arrived before a time by the clock: a late reader is no dead producer."""
         self._link.beat()
         while (left_ns := end_ns - pacing.clock()) > 0:
             message = self._link.bus.recv(left_ns * 1e-9)
@@ -269,10 +202,10 @@ class SyncStream:
         return self._link.bus.recv(0.0) if self._overdue <= FRAMES_PER_S * pacing.timeout_s else None
 
     def _follow_sync(self, pacing: FollowedSync) -> int:
-        """Send what waits, and find the next SYNC among the frames; returns until when the one after it must come."""
+        """Send waiting frames, and read until the next SYNC; returns the latest time of the one after it."""
         self._link.beat()
         if self._outgoing:
-            # As early in the period as can be: all of it should be there before the next SYNC.
+            # As early in the period as possible: all of it should arrive before the next SYNC.
             outgoing, self._outgoing = self._outgoing, []
             self._link.send(outgoing)
         sync, self._opened = self._opened, None
@@ -291,7 +224,7 @@ class SyncStream:
         if self._cycles == 0:
             self._first_sync_ns = self._answered_ns = at_ns
         else:
-            # One period after the SYNC before it, or more where others between them did not come.
+            # One period after the SYNC before it, or more where SYNCs between them did not come.
             since_ns = at_ns - self._last_sync_ns
             periods = max(1, (since_ns + pacing.period_ns // 2) // pacing.period_ns)
             self._skipped += periods - 1
@@ -310,7 +243,7 @@ class SyncStream:
         return now_ns + round(pacing.timeout_s * 1e9)
 
     def _lose_sync(self, pacing: FollowedSync) -> int:
-        """The producer is dead: tell it once, and send SYNC from now on, because the axes must be stopped."""
+        """Report the dead producer once, and send SYNC from now on, because the axes must be stopped."""
         reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
         self._on_event(CellEvent(self._time_ns, None, EventKind.SYNC_LOST, self._cycles, reason))
         self._watch.faults.append(BusError(str(self._link.address), reason))
@@ -322,7 +255,7 @@ class SyncStream:
         return self._send_sync()
 
     def _send_sync(self) -> int:
-        """Send what waits and the SYNC; returns until when its answers may come, by the clock."""
+        """Send waiting frames and the SYNC; returns the deadline of its answers by the clock."""
         pacing, bus = self.pacing, self._link.bus
         self._link.beat()
         for before in self._waiting():
@@ -332,7 +265,7 @@ class SyncStream:
             self._first_sync_ns = self._next_sync_ns = self._answered_ns = now
         if isinstance(pacing, LockstepSync):
             self._time_ns = pacing.start_ns + self._cycles * pacing.period_ns
-            # A cell that was silent for the whole bound gets no second one: the stop must not take minutes.
+            # A cell that was silent for the whole time gets less the next time: the stop must not take minutes.
             bound_s = pacing.timeout_s / SHORTENED if self._silent else pacing.timeout_s
             deadline_ns = now + round(bound_s * 1e9)
         else:
@@ -353,10 +286,10 @@ class SyncStream:
         return deadline_ns
 
     def _next_frame(self, deadline_ns: int) -> can.Message | None:
-        """The next frame of this cycle; None when it is over: at its deadline, or with the next followed SYNC."""
+        """Return the next frame of this cycle; None at its deadline, or at the next followed SYNC."""
         recv, clock = self._link.bus.recv, self.pacing.clock
         if isinstance(self.pacing, FollowedSync):
-            # By the order on the bus alone: whatever the clock says, what has come already is read first.
+            # Only the order on the bus counts: frames that have arrived are read first, whatever the clock shows.
             message = self._until_sync(self.pacing, deadline_ns)
             self._waited = message is None
             if message is not None and _is_sync(message):
@@ -373,7 +306,7 @@ class SyncStream:
         return None
 
     def _note_own_sync(self, message: CapturedMessage) -> None:
-        """The SYNC of this cycle as the kernel saw it; what is made up keeps its time."""
+        """Adopt the kernel's time of our SYNC; made-up time stays as it is."""
         if isinstance(self.pacing, TimedSync):
             if (behind_ns := self.pacing.clock() - message.monotonic_ns) > LARGEST_LAG_NS:
                 self._fall_behind(behind_ns)
@@ -383,10 +316,9 @@ class SyncStream:
 
     def _collect(self, deadline_ns: int) -> None:
         """Receive until all answers are there, or the cycle is over."""
-        clock, slots, values = self.pacing.clock, self._slots, self._values
-        last_data = self._last_data
-        debt, seen, everything = self._debt, 0, self._all
-        while seen != everything or debt:
+        answers, slots = self._answers, self._slots
+        answers.begin()
+        while not answers.complete:
             message = self._next_frame(deadline_ns)
             if message is None:
                 break
@@ -399,53 +331,39 @@ class SyncStream:
             if len(data) != slot.length:
                 self._note_length(slot, identifier, len(data))
                 continue
-            deadline_ns = deadline_ns if seen else self._stragglers_until(deadline_ns)
-            if seen & slot.bit:
-                if debt & slot.bit:
-                    # The first one was the late answer to an earlier SYNC, this one is ours.
-                    debt &= ~slot.bit
-                    self._late += 1
-                else:
-                    self._duplicate += 1
-                    if last_data.get(identifier) == data:
-                        continue
-                    # The second answer differs: the first may have been a repetition of the cycle before.
-            seen |= slot.bit
-            last_data[identifier] = data
-            for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
-                values[column] = value
-        self._seen = seen
-        self._silent = not seen
-        if seen:
-            self._answered_ns = clock()
-        # One answer and a debt at the end: the owed frame was lost for good, and the answer is this cycle's.
-        self._debt = everything & ~seen
+            deadline_ns = deadline_ns if answers.any else self._stragglers_until(deadline_ns)
+            answers.take(identifier, slot, data)
+        self._silent = not answers.any
+        if not self._silent:
+            self._answered_ns = self.pacing.clock()
 
     def _stragglers_until(self, deadline_ns: int) -> int:
-        """Cells in lockstep answer in one go: where one axis has answered, the others get less patience."""
+        """Shorten the deadline in lockstep once one axis has answered: such cells answer all at once."""
         if not isinstance(self.pacing, LockstepSync):
             return deadline_ns
         return min(deadline_ns, self.pacing.clock() + round(self.pacing.timeout_s * 1e9) // STRAGGLING)
 
-    def _note_length(self, slot: _Slot, identifier: int, found: int) -> None:
-        """One frame may have been cut by another's; a second one with the next SYNC is a wrong mapping."""
+    def _note_length(self, slot: Slot, identifier: int, found: int) -> None:
+        """Report a PDO of wrong length: the first may have been corrupted, one with the next SYNC too is a fault."""
         self._wrong_length += 1
-        node_id = self.network.node_ids[slot.axis]
+        axis = self.network.axes[slot.axis]
+        reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
         if identifier not in self._short or self._short[identifier] < self._cycles - 1:
-            text = f"node {node_id}: PDO {identifier:03X}h has {found} bytes, its mapping says {slot.length}"
+            text = f"{node_label(axis)}: {reason}"
             self._on_event(CellEvent(self._time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
         elif self._short[identifier] == self._cycles - 1:
-            self._watch.faults.append(PdoLengthWrong(node_id, identifier, slot.length, found))
+            remedy = "did another program change the mapping, or does another device use this COB-ID?"
+            self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
         self._short[identifier] = self._cycles
 
     def read_on(self, seconds: float) -> None:
-        """After the last cycle: count what it left on the bus, and what this machine tells late of its losses.
+        """Count the frames left after the last cycle, and losses that are reported late. Sends nothing.
 
-        Sends nothing. Answers after the first such call, or after the next SYNC of a producer that is followed, are
-        nobody's: others may have sent SYNC by then, to stop axes by SDO.
+        Answers after the first such call, or after the next followed SYNC, do not count: another SYNC may have been
+        sent by then, to stop axes by SDO.
 
         Raises:
-            BusError: the bus has gone, and so has what it would have told.
+            BusError: the bus is lost, and with it the last reports.
             NodeMisplaced: as `next`.
         """
         clock, followed = self.pacing.clock, isinstance(self.pacing, FollowedSync)
@@ -463,17 +381,14 @@ class SyncStream:
         self._watch.note_events(self._time_ns)
 
     def _between_cycles(self, message: can.Message) -> None:
-        """A frame that is read before the next SYNC, and so answers none that is still open."""
+        """Process a frame that is read before the next SYNC, and so answers none that is open."""
         slot = self._slots.get(message.arbitration_id)
         if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
             self._other(message)
         elif self._cycles == 0:
             self._foreign += 1
-        elif self._debt & slot.bit:
-            self._debt &= ~slot.bit
-            self._late += 1
         else:
-            self._duplicate += 1
+            self._answers.take_between(slot)
 
     def _other(self, message: can.Message) -> None:
         if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
@@ -485,26 +400,21 @@ class SyncStream:
             self._foreign += 1
 
     def _finish_cycle(self) -> Sample:
-        axes, values = self._axes, self._values
-        # A period that was left out has a number too, so that nobody takes its neighbours for neighbours.
+        axes, values = self._axes, self._answers.values
+        # A skipped period has a number too, so that a gap is visible in the samples.
         cycle = self._cycles - 1 + self._skipped
-        missing = 0
-        if self._seen != self._all:
-            for slot in self._slots.values():
-                if not self._seen & slot.bit:
-                    missing |= 1 << slot.axis
-                    self._missing += 1
+        missing = self._answers.end()
+        if missing:
             self._note_missing(cycle, missing)
         else:
             self._incomplete_cycles = 0
-        self._frames += self._seen.bit_count()
         self._note_losses()
         statuswords = tuple(values[2 * axes :])
         self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords, missing)
         return Sample(cycle, self._time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
 
     def _note_losses(self) -> None:
-        """Frames that this machine lost; which they were nobody knows."""
+        """Report frames that this machine lost; their content is unknown."""
         losses = losses_of(self._link.bus).since(self._base)
         if losses == self._losses:
             return
@@ -522,12 +432,10 @@ class SyncStream:
         silent = tuple(axis for axis in range(self._axes) if missing >> axis & 1)
         self._incomplete_cycles += 1
         for axis in silent:
-            text = f"no complete answer of {self.network.axes[axis].name} to cycle {cycle}"
+            text = f"no complete answer from {self.network.axes[axis].name} to cycle {cycle}"
             self._on_event(CellEvent(self._time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
         if self._incomplete_cycles <= self.max_missing_cycles:
             return
-        if len(silent) == self._axes:
-            waited_s = (self.pacing.clock() - self._answered_ns) * 1e-9
-            self._watch.faults.append(CellSilent(cycle, waited_s))
-        else:
-            self._watch.faults.append(SampleLost(cycle, silent))
+        silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == self._axes else None
+        names = [self.network.axes[axis].name for axis in silent]
+        self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))

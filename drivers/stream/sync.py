@@ -1,8 +1,14 @@
-"""When the next SYNC goes out, and what time it stands for.
+"""The schedule of SYNC and its time; SYNC producers other than this process: the kernel, or a drive.
 
-Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus the time
-that has passed since, which no setting of the wall clock changes. On SocketCAN a SYNC's time is the kernel's, taken to
-the monotonic clock (drivers/stream/capture.py); the clock must then be that one.
+Samples and events of all pacings have one epoch: wall time [ns since 1970] at the stream's first SYNC, plus monotonic
+time since, so that setting the wall clock has no effect. On SocketCAN the time of a SYNC is the kernel's, converted to
+the monotonic clock (drivers/stream/capture.py); `clock` must then be that clock.
+
+A producer is started once the network is prepared and stopped before the network is left:
+
+    with CanopenNetwork(...) as network, KernelProducer(network, period_us) as producer:
+        network.prepare()
+        producer.start()
 """
 
 from __future__ import annotations
@@ -24,16 +30,32 @@ from drivers.canopen.sdo import Clock
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
 
+SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
+CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
+"""Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
+PRODUCES = 1 << 30
+STEERING_S = 0.25
+"""Time between two corrections of the kernel's interval."""
+LARGEST_CORRECTION = 0.2
+"""Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
+_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
+# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
+_HEAD, _FRAME = struct.Struct("@3I4l2I0q"), struct.Struct("=IB3x8s")
+SURPLUS = 3.0
+"""SYNCs ahead of the schedule that are too many; a late producer catches up with one or two."""
+DECAY = 0.99
+"""Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class LockstepSync:
-    """The next SYNC goes out when the last one is answered: for a cell whose time is the SYNC itself.
+    """Send the next SYNC when the last one is answered: for a simulated cell, whose time is the SYNC itself.
 
-    The samples' time is made up, a period a cycle: that is true of a simulated cell alone.
+    The time of the samples is made up, one period a cycle.
 
     Attributes:
-        period_ns: what one cycle stands for [ns].
-        timeout_s: how long one cycle waits for its answers [s of the clock].
+        period_ns: time of one cycle [ns].
+        timeout_s: time in which one cycle must be answered [s of the clock].
         start_ns: wall time of cycle 0 [ns since 1970].
         clock: for the time-out and the heartbeats [ns].
     """
@@ -46,14 +68,14 @@ class LockstepSync:
 
 @dataclass(frozen=True, slots=True)
 class TimedSync:
-    """A SYNC every period by the clock, on an absolute schedule that starts with the first one.
+    """Send a SYNC every period by the clock, on an absolute schedule that starts with the first one.
 
-    A schedule that slips by whole periods leaves them out, counted; it never sends a burst to catch up.
+    Whole periods that were missed are counted and left out; there is never a burst to catch up.
 
     Attributes:
         period_ns: of the schedule [ns].
         start_ns: wall time of the first SYNC [ns since 1970].
-        clock: monotonic; what has passed by it since the first SYNC is added to start_ns [ns].
+        clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
 
     period_ns: int
@@ -62,24 +84,24 @@ class TimedSync:
 
 
 def ignore(monotonic_ns: int, periods: int) -> None:
-    """For a producer that keeps its period by itself."""
+    """Do nothing: for a producer that keeps its period by itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class FollowedSync:
-    """Somebody else sends SYNC, told so by us (drivers/stream/sync.py): a cycle begins with each one that is seen.
+    """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
 
-    What belongs to which cycle is decided by the order of the frames on the bus: a reader that is late loses nothing.
+    The order of the frames on the bus decides which cycle they belong to: a late reader loses nothing.
 
     Attributes:
         period_ns: of the producer [ns].
         producer: its name, for messages.
-        in_kernel: the producer is this machine's kernel; a SYNC from the wire is then somebody else's.
-        timeout_s: without a SYNC, whatever else is on the bus, after which the producer is taken for dead; the stream
-            then sends SYNC itself, because the axes are stopped by frames that act on SYNC.
-        seen: told the monotonic time of each SYNC [ns], and how many periods after the one before it came.
+        in_kernel: the producer is this machine's kernel; a SYNC from the wire is then another device's.
+        timeout_s: time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself,
+            because the axes are stopped by frames that act on SYNC.
+        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before.
         start_ns: wall time of the first SYNC [ns since 1970].
-        clock: monotonic; what has passed by it since the first SYNC is added to start_ns [ns].
+        clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
 
     period_ns: int
@@ -94,38 +116,16 @@ class FollowedSync:
 Pacing = LockstepSync | TimedSync | FollowedSync
 
 
-# Who sends SYNC instead of the recorder: this machine's kernel, or one of the drives; and who told them to stop.
-#
-# A producer is started once the network is prepared and stopped before the network is left:
-#
-#     with CanopenNetwork(...) as network, KernelProducer(network, period_us) as producer:
-#         network.prepare()
-#         producer.start()
-
-
-SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
-CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
-"""In us; a producer sends none while it is 0 (CiA 301)."""
-PRODUCES = 1 << 30
-STEERING_S = 0.25
-"""Between two corrections of the kernel's interval."""
-LARGEST_CORRECTION = 0.2
-"""Of the period; where the kernel is later than that, the time stamps are to be refused."""
-_TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
-# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
-_HEAD, _FRAME = struct.Struct("@3I4l2I0q"), struct.Struct("=IB3x8s")
-
-
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
-    """The interval to tell the kernel for the next window [us].
+    """Return the kernel's interval for the next window [us].
 
-    What it was late in the last window it will be late again, and the phase is to be made up within one window.
+    The lateness of the last window is expected again, and the phase is to be corrected within one window.
 
     Args:
         period_us: wanted.
-        interval_us: that the kernel has now.
-        late_ns: how much longer than its periods the last window was.
-        phase_ns: how late its last SYNC was in the whole schedule.
+        interval_us: of the kernel now.
+        late_ns: difference of the last window's duration to its periods.
+        phase_ns: lateness of its last SYNC in the whole schedule.
         periods: in a window.
     """
     wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
@@ -139,10 +139,10 @@ def _setup(flags: int, interval_us: int) -> bytes:
 
 
 class KernelProducer:
-    """The kernel's broadcast manager (CAN_BCM): a timer of the kernel's, no process has to wake up for it.
+    """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
-    It ends with the process that started it, however that ends. It counts each interval from when the last SYNC really
-    went out, so its period is too long by what the timer is late: `seen` measures that, and sets the interval shorter.
+    It ends with the process that started it. Each interval counts from the actual time of the last SYNC, so the period
+    is too long by the lateness of the timer: `seen` measures that and shortens the interval.
 
     Args:
         network: on SocketCAN.
@@ -171,7 +171,7 @@ class KernelProducer:
         """Send SYNC from now on.
 
         Raises:
-            BusError: the kernel has no broadcast manager, or the bus is none of its.
+            BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
         """
         address = self._link.address
         if not isinstance(address, BusAddress) or address.interface != "socketcan":
@@ -188,14 +188,14 @@ class KernelProducer:
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Take note of a SYNC, so that on average they come at the period and stay in phase with the first.
+        """Process a SYNC, to keep the average period and the phase of the first one.
 
         Args:
-            monotonic_ns: when it went out [ns].
+            monotonic_ns: its time [ns].
             periods: since the one before; 0 for the first, where the schedule begins.
 
         Raises:
-            OSError: the kernel takes no interval any more.
+            OSError: the kernel refuses a new interval.
         """
         if periods == 0:
             self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
@@ -212,14 +212,14 @@ class KernelProducer:
             self._socket.send(_setup(_SET_TIMER, interval_us))
 
     def stop(self) -> None:
-        """Send no more; nothing happens when it did not start."""
+        """Stop sending, if started."""
         if self._socket is not None:
             self._socket.close()
         self._socket, self._link.sync_producer = None, None
 
 
 class DriveProducer:
-    """A drive of the cell, by its objects 1005h (bit 30) and 1006h; both are given back as they were.
+    """SYNC by a drive of the cell, by its objects 1005h (bit 30) and 1006h; both are restored afterwards.
 
     Args:
         network: that the drive belongs to.
@@ -251,7 +251,7 @@ class DriveProducer:
         """A drive keeps its period by itself."""
 
     def start(self) -> None:
-        """Tell the drive to send SYNC.
+        """Let the drive send SYNC.
 
         Raises:
             ObjectAccessError: it cannot, or does not answer.
@@ -265,7 +265,7 @@ class DriveProducer:
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
 
     def stop(self) -> None:
-        """Give both objects back; nothing happens when it was not started, or does not answer any more.
+        """Restore both objects, if started and if the drive still answers.
 
         Raises:
             ObjectAccessError: the drive refuses.
@@ -285,20 +285,10 @@ class DriveProducer:
 SyncProducer = KernelProducer | DriveProducer
 
 
-# Whether more SYNCs come than the one producer sends that we know of.
-
-
-SURPLUS = 3.0
-"""SYNCs ahead of the period: what a late producer catches up with is one or two."""
-DECAY = 0.99
-"""Of what a SYNC was ahead, after the next: clocks differ by some tens of ppm for ever, which adds up to nothing so."""
-
-
 class SyncRate:
-    """Followed SYNCs against their period.
+    """Detects a second SYNC producer: its SYNCs look like the expected producer's, but then too many arrive.
 
-    A SYNC of somebody else looks like the producer's own; but then too many come. Jitter cancels out: who comes late
-    once comes early after it.
+    Jitter cancels out: a late SYNC is followed by an early one.
 
     Args:
         period_ns: of the producer [ns].
@@ -309,6 +299,6 @@ class SyncRate:
         self._ahead = 0.0
 
     def too_fast(self, since_last_ns: int) -> bool:
-        """Whether this SYNC, so long after the one before, is one too many."""
+        """Whether a SYNC this long after the one before is one too many."""
         self._ahead = max(-1.0, DECAY * self._ahead + 1.0 - since_last_ns / self._period_ns)
         return self._ahead > SURPLUS

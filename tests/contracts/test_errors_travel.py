@@ -17,6 +17,7 @@ import drivers
 import ident
 from daq.errors import DaqError
 from drivers.errors import DriverError
+from drivers.profiles.profile import Axis
 from ident.errors import IdentificationError
 
 ROOTS = (DaqError, DriverError, IdentificationError)
@@ -26,6 +27,10 @@ EVIDENCE: dict[str, object] = {
     "int": 3,
     "int | None": 0x8611,
     "float": 0.25,
+    "float | None": 0.25,
+    "Node": Axis("J3", 3),
+    "Sequence[Node]": (Axis("J3", 3), 4),
+    "Sequence[str]": ("J2", "J5"),
     "tuple[int, ...]": (2, 5),
     "tuple[float, ...]": (0.5, 2.0),
     "tuple[str, ...]": ("J2", "J5"),

@@ -10,7 +10,7 @@ import daq
 import drivers
 import ident
 from daq.errors import CalibrationRefused, DaqError, OutputFailed, SchemaMismatch, UsageError, exit_code
-from drivers.errors import DriverError, IdentityMismatch
+from drivers.errors import DriverError, SetupRefused
 from drivers.simulation.spec import SdoAbort
 from ident.errors import IdentificationError, RankDeficient
 
@@ -26,7 +26,7 @@ def _exceptions() -> set[type[BaseException]]:
 
 def test_every_exception_class_has_an_exit_code() -> None:
     kinds = _exceptions()
-    assert {IdentityMismatch, RankDeficient, SchemaMismatch} <= kinds
+    assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
     # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus, it never reaches a user.
     unmapped = {kind.__qualname__ for kind in kinds - {DaqError, SdoAbort} if exit_code(kind) is None}
     assert not unmapped

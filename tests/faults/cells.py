@@ -23,8 +23,9 @@ from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.node import Node
 from drivers.simulation.spec import SdoAbort
+from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind
-from drivers.stream.stream import StreamStatistics, SyncStream
+from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 
 CONFIGS = Path(__file__).parents[2] / "configs"

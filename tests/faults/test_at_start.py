@@ -7,11 +7,9 @@ import pytest
 from drivers.errors import (
     BusBusy,
     DriverError,
-    FeedbackDiffers,
-    IdentityMismatch,
-    MappingRefused,
-    NmtRefused,
     NodeMissing,
+    SetupRefused,
+    StateRefused,
 )
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
@@ -19,13 +17,22 @@ from drivers.stream.sample import EventKind
 from tests.faults.cells import run
 
 REFUSALS: dict[FaultKind, tuple[type[DriverError], str]] = {
-    FaultKind.SILENT: (NodeMissing, r"node 2 did not answer within 1 s \(answered: 1, 3, 4, 5, 6\)"),
-    FaultKind.OTHER_SERIAL: (IdentityMismatch, "node 2: serial number 1018h:04 is 0x3eb, .* expects 0x3ea"),
-    FaultKind.REFUSES_NMT: (NmtRefused, "node 2: asked for NMT OPERATIONAL, its heartbeat still says PRE-OPERATIONAL"),
-    FaultKind.REFUSES_MAPPING: (MappingRefused, r"node 2: TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002"),
-    FaultKind.SHIFTED: (FeedbackDiffers, r"node 2: object 6064h(:00)? is -?\d+ by SDO and -?\d+ in its PDO"),
+    FaultKind.SILENT: (NodeMissing, r"J2 \(node 2\) did not answer within 1 s \(answered: 1, 3, 4, 5, 6\)"),
+    FaultKind.OTHER_SERIAL: (SetupRefused, r"J2 \(node 2\): serial number 1018h:04 is 0x3eb, .* expects 0x3ea"),
+    FaultKind.REFUSES_NMT: (
+        StateRefused,
+        r"J2 \(node 2\): asked for NMT OPERATIONAL, its heartbeat still says PRE-OPERATIONAL",
+    ),
+    FaultKind.REFUSES_MAPPING: (
+        SetupRefused,
+        r"J2 \(node 2\): TPDO1: writing 0x0 to 1A00h:00: aborted.*0x06010002",
+    ),
+    FaultKind.SHIFTED: (SetupRefused, r"J2 \(node 2\): object 6064h(:00)? is -?\d+ by SDO and -?\d+ in its PDO"),
     FaultKind.SECOND_MASTER: (BusBusy, r"a SYNC \(080h\) that we did not send"),
-    FaultKind.SYNC_PRODUCER: (BusBusy, r"a SYNC \(080h\) that we did not send: another master, .* SYNC producer"),
+    FaultKind.SYNC_PRODUCER: (
+        BusBusy,
+        r"a SYNC \(080h\) that we did not send; .* no other master, .* SYNC producer",
+    ),
     FaultKind.SDO_MASTER: (BusBusy, r"an SDO request to node 2 \(602h\) that we did not send"),
 }
 

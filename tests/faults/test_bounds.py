@@ -6,7 +6,7 @@ import can
 import pytest
 
 from drivers.canopen.link import NmtCommand
-from drivers.errors import NmtRefused
+from drivers.errors import StateRefused
 from tests.drivers.scripted import ScriptedBus, cell
 
 
@@ -24,7 +24,7 @@ def test_a_refused_nmt_command_is_reported_within_its_bound(number: int, monkeyp
     monkeypatch.setattr(ScriptedBus, "send", noting)
     bus.nodes[number].obeys_nmt = False
     with network:
-        with pytest.raises(NmtRefused, match=f"node {number + 1}: asked for NMT OPERATIONAL"):
+        with pytest.raises(StateRefused, match=rf"J{number + 1} \(node {number + 1}\): asked for NMT OPERATIONAL"):
             network.prepare()
         waited_ns = bus.clock.now_ns - commanded_ns[bytes((NmtCommand.START, number + 1))]
         # The nodes before it are waited for first: sound ones confirm with their next heartbeat.

@@ -128,7 +128,7 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
         def serve_forever(self) -> None:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("daq.cli.simulate.SimulatedCell", Cell)
+    monkeypatch.setattr("drivers.simulation.cell.SimulatedCell", Cell)
     faults = tmp_path / "faults.yaml"
     faults.write_text("faults:\n  - {fault: limit, axis: J2, at_s: 1.5}\n  - {fault: silent}\n", encoding="utf-8")
     simulation = scenario(tmp_path, "  - {fault: lost, axis: 2, at_cycle: 7}\n")

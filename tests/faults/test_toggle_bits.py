@@ -27,8 +27,8 @@ def alarm_cycles(values: Sequence[int], update_period_us: int = 1000, missing: S
     found = []
     for cycle, value in enumerate(values):
         lost = int(cycle in missing)
-        for axis, error in bits.stale(cycle * PERIOD_NS, (value << BIT | 0x27, 0x27), lost):
-            assert (axis, error.node_id, error.bit) == (0, 1, BIT)
+        for axis, bit, error in bits.stale(cycle * PERIOD_NS, (value << BIT | 0x27, 0x27), lost):
+            assert (axis, error.node_id, bit) == (0, 1, BIT)
             found.append(cycle)
     return found
 

@@ -188,6 +188,6 @@ def test_when_one_bus_dies_the_axes_on_the_other_are_stopped(wiring: Wiring, cut
         _turn(network, 200, lambda: ends[0].cut(cut))
     notes = " ".join(caught.value.__notes__)
     dead = tuple(node for node in (*LEFT, *RIGHT) if node not in alive)
-    assert f"node {', '.join(map(str, dead))} did not answer" in notes
+    assert ", ".join(f"J{node} (node {node})" for node in dead) + " did not answer" in notes
     nodes = {node.node_id: node for node in wiring.simulated.nodes}
     assert not any(nodes[node].drive.powered for node in alive)

@@ -26,9 +26,10 @@ from daq.log.conversion import Scaling, moves, scaling
 from daq.log.message import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
-from drivers.canopen.network import MODE_OF_OPERATION, PROFILE_POSITION_MODE, CanopenNetwork
+from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, write_record
 from drivers.canopen.sdo import ObjectAccess
+from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry

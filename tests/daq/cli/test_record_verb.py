@@ -13,8 +13,8 @@ from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.log.metadata import RunStatistics
 from daq.workflow.record import Recorded
-from drivers.errors import DriverError, HeartbeatLost, SampleLost
-from drivers.stream.stream import StreamStatistics
+from drivers.errors import DriveFault, DriverError, SampleLost
+from drivers.stream.answers import StreamStatistics
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
 ) -> None:
     out, part = tmp_path / name, tmp_path / f"{name}.part"
     command = ["record", cells["lockstep"], "plan.yaml", "--out", str(out), "--enable-motion"]
-    monkeypatch.setattr("daq.cli.record.record", _failing(HeartbeatLost(3, 0.5), part))
+    monkeypatch.setattr("daq.cli.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part))
     assert main(command) == ExitCode.DEVICE_FAULT
     first = " ".join(capsys.readouterr().err.split())
     assert f"kept: what was recorded until then is in {part}" in first
@@ -92,9 +92,9 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
 @pytest.mark.parametrize(
     ("pacing", "error", "hinted"),
     [
-        ("timed", SampleLost(7, (0,)), True),
-        ("lockstep", SampleLost(7, (0,)), False),
-        ("timed", HeartbeatLost(3, 0.5), False),
+        ("timed", SampleLost(7, (0,), ("J1",)), True),
+        ("lockstep", SampleLost(7, (0,), ("J1",)), False),
+        ("timed", DriveFault(3, "no heartbeat for 0.5 s"), False),
     ],
 )
 def test_a_lost_sample_with_a_timed_pacing_names_lockstep(

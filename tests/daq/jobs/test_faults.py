@@ -13,7 +13,7 @@ from daq.environment import shipped_configurations
 from daq.errors import ExitCode, JobHeld, RunInvalid, exit_code
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
-from drivers.errors import BusError, CellSilent, DriveFault, SampleLost, StateRefused
+from drivers.errors import BusError, DriveFault, SampleLost, StateRefused
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
@@ -25,7 +25,7 @@ STRIKE = 120
 """SYNCs since power-on: in the first move of the first recording, which begins at about 30 and takes more than 500."""
 AXIS = 2
 CUT_OFF = {
-    "silent": (FaultSpec(FaultKind.SILENT, None, STRIKE), CellSilent),
+    "silent": (FaultSpec(FaultKind.SILENT, None, STRIKE), SampleLost),
     "silent axis": (FaultSpec(FaultKind.SILENT, AXIS, STRIKE), SampleLost),
     "bus off": (FaultSpec(FaultKind.BUS_OFF, None, STRIKE), BusError),
 }

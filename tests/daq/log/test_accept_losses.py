@@ -12,7 +12,7 @@ from daq.errors import RunInvalid
 from daq.log.conversion import load_run
 from daq.log.reader import MASKED, LossyLogs, reports_only_losses
 from daq.workflow.record import _verdict
-from drivers.stream.stream import StreamStatistics
+from drivers.stream.answers import StreamStatistics
 from tests.daq.logs import demo_content, samples, write
 
 

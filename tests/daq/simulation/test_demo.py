@@ -12,7 +12,7 @@ from daq.simulation import demo
 from daq.simulation.demo import RETRIES, ProgressReporter, Settings
 from daq.workflow.plan import Plan
 from daq.workflow.record import Recorded
-from drivers.stream.stream import StreamStatistics
+from drivers.stream.answers import StreamStatistics
 
 NOTHING_LOST = StreamStatistics(*(0 for _ in StreamStatistics.__slots__))
 

@@ -11,8 +11,9 @@ import pytest
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.workflow.safeguards import check_currents
+from drivers.errors import SetupRefused
 from drivers.profiles.profile import TapPoint
-from drivers.profiles.scale import ScaleImplausible, ScaleReading
+from drivers.profiles.scale import ScaleReading
 from ident.model.model import DriveTrain
 
 
@@ -20,7 +21,7 @@ def readings(cell: Cell, factor: float = 1.0) -> list[ScaleReading]:
     """Of drives whose torque constants are the cell's, times a factor; each motor has 2 A."""
     constants = [abs(a.nameplate_gain / n) for a, n in zip(cell.axes, DriveTrain(cell.ratio).reduction, strict=True)]
     return [
-        ScaleReading(number, "generic-cia402", 0.002, {}, 2.0, 2.0 * factor * constant, ())
+        ScaleReading(number, "", "generic-cia402", 0.002, {}, 2.0, 2.0 * factor * constant, ())
         for number, constant in enumerate(constants, start=1)
     ]
 
@@ -36,7 +37,7 @@ def test_root_two_is_a_warning_for_each_axis_and_a_thousand_is_refused(checkout:
     found = check_currents(cell, readings(cell, math.sqrt(2)))
     assert sorted(", ".join(line.partition(":")[0] for line in found).split(", ")) == list(cell.axis_names)
     assert all("near √2" in line for line in found)
-    with pytest.raises(ScaleImplausible, match=r"node 1, profile generic-cia402: .* 1e\+03 times"):
+    with pytest.raises(SetupRefused, match=r"node 1: profile generic-cia402: .* 1e\+03 times"):
         check_currents(cell, readings(cell, 1000.0))
 
 

@@ -160,7 +160,7 @@ def test_moves_are_planned_from_where_the_axes_are_known_to_be(
 
 def test_an_axis_that_never_answers_is_not_waited_for_for_ever(lockstep: Rig) -> None:
     silent_at_first(lockstep.bus, 1000)
-    with pytest.raises(SampleLost, match=f"no answer from axis {ELBOW}"):
+    with pytest.raises(SampleLost, match=f"no answer from J{ELBOW}"):
         lockstep.run()
     assert not lockstep.out.exists()
     assert not any(node.powered_cycles for node in lockstep.bus.nodes)

@@ -11,7 +11,7 @@ from daq.config.cell import KERNEL, RECORDER
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.record import _verdict
-from drivers.stream.stream import StreamStatistics
+from drivers.stream.answers import StreamStatistics
 
 CONFIGURATIONS = Path(__file__).parents[3] / "configs"
 EXPLAINED = ("cycles", "frames", "foreign")

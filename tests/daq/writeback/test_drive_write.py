@@ -31,12 +31,10 @@ from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import (
     BusBusy,
     DriverError,
-    IdentityMismatch,
     ObjectAccessError,
+    ParameterRefused,
     ParametersMixed,
-    PowerNotOff,
-    ReadbackDiffers,
-    SaveRefused,
+    SetupRefused,
 )
 from drivers.profiles.profile import Mapping, ObjectEntry, Parameter, ParameterKind
 from drivers.simulation.cell import SimulatedCell
@@ -179,7 +177,7 @@ def test_an_axis_with_power_is_refused_and_nothing_is_written(
         listener.frames()
         with (
             network_of(cell, address) as network,
-            pytest.raises(PowerNotOff, match=rf"node {axis + 1}: OPERATION ENABLED"),
+            pytest.raises(ParameterRefused, match=rf"J{axis + 1} \(node {axis + 1}\): OPERATION ENABLED"),
         ):
             _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
@@ -199,7 +197,7 @@ def test_power_that_comes_midway_ends_it_and_the_rest_is_put_back(
 
     write = _after_gain(monkeypatch, enable_2)
     with simulated(address) as simulation:
-        with pytest.raises(ParametersMixed, match=r"stand again in J1, and are NOT known to stand where J2: node 2"):
+        with pytest.raises(ParametersMixed, match=r"restored in J1, and NOT confirmed where J2 \(node 2\)"):
             _write(cell, address)
         assert _gains(simulation)[0] == pytest.approx(NAMEPLATE[0])
         assert _gains(simulation)[1] == pytest.approx(IDENTIFIED[1])
@@ -229,10 +227,10 @@ def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
 ) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address, FaultSpec(kind, 2)) as simulation:
-        with pytest.raises(ObjectAccessError, match=r"node 3: object (2003h:01|1010h:01): aborted") as caught:
+        with pytest.raises(ObjectAccessError, match=r"J3 \(node 3\): object (2003h:01|1010h:01): aborted") as caught:
             _write(cell, address)
         restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
-        assert caught.value.__notes__ == [f"kept: the old values stand again in {', '.join(restored)}"]
+        assert caught.value.__notes__ == [f"kept: the old values are restored in {', '.join(restored)}"]
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -248,7 +246,9 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
                 simulation.nodes[2].nmt = NmtState.STOPPED
 
         _after_gain(monkeypatch, stop)
-        with pytest.raises(ParametersMixed, match="node 3: object 2003h:01: the node does not answer") as caught:
+        with pytest.raises(
+            ParametersMixed, match=r"J3 \(node 3\): object 2003h:01: the node does not answer"
+        ) as caught:
             _write(cell, address)
         assert caught.value.restored == ("J1", "J2")
         assert isinstance(caught.value.__cause__, ObjectAccessError)
@@ -330,14 +330,14 @@ def test_a_foreign_master_that_comes_midway_ends_it(
     with simulated(address) as simulation:
         with pytest.raises(BusBusy) as caught:
             _write(cell, address)
-        assert "kept: the old values stand again in J1, J2, J3" in caught.value.__notes__
+        assert "kept: the old values are restored in J1, J2, J3" in caught.value.__notes__
         assert _gains(simulation) == IN_DRIVES
 
 
 def test_another_drive_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     faulty = simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 5))
-    with faulty, network_of(cell, address) as network, pytest.raises(IdentityMismatch, match="node 6"):
+    with faulty, network_of(cell, address) as network, pytest.raises(SetupRefused, match="node 6"):
         _propose(cell, network)
 
 
@@ -353,9 +353,9 @@ def test_a_drive_that_keeps_something_else_is_found(
 
     monkeypatch.setattr(ObjectAccess, "write", rounding)
     with simulated(address) as simulation:
-        with pytest.raises(ReadbackDiffers, match=r"reads back as -9209 .*written was -9210") as caught:
+        with pytest.raises(ParameterRefused, match=r"reads back as -9209 .*written was -9210") as caught:
             _write(cell, address)
-        assert caught.value.__notes__ == ["kept: the old values stand again in J1, J2, J3, J4"]
+        assert caught.value.__notes__ == ["kept: the old values are restored in J1, J2, J3, J4"]
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -371,7 +371,7 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
         for node in simulation.nodes:
             node.lose_guard()  # the mapping alone must be enough
         listener.frames()
-        with network_of(cell, address) as network, pytest.raises(SaveRefused, match="TPDO1: COB-ID 00000181h"):
+        with network_of(cell, address) as network, pytest.raises(ParameterRefused, match="TPDO1: COB-ID 00000181h"):
             _apply(proposal, DriveTarget(cell, network))
         assert listener.downloads() == []
         assert _saved(simulation) == IN_DRIVES
@@ -391,7 +391,9 @@ def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
         proposal = _propose(cell, network)
         consumer = ObjectEntry(0x1016, 1, 32, signed=False)
         network.link.objects(2).write(consumer, recorder_id << 16 | 500)
-        with pytest.raises(SaveRefused, match=rf"node 2: .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"):
+        with pytest.raises(
+            ParameterRefused, match=rf"J2 \(node 2\): .*1016h:01 = 00{recorder_id:02X}01F4h watches the recorder"
+        ):
             _apply(proposal, DriveTarget(cell, network))
         assert _gains(simulation) == IN_DRIVES
 
@@ -399,7 +401,7 @@ def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
 def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation:
-        with pytest.raises(SaveRefused, match=r"node 1: .*--ram-only.*--save-unknown"):
+        with pytest.raises(ParameterRefused, match=r"J1 \(node 1\): .*--ram-only.*--save-unknown"):
             _write(cell, address, mapping=Mapping.UNKNOWN)
         assert _gains(simulation) == IN_DRIVES
         assert all(change.saved for change in _write(cell, address, Saving.ANY, Mapping.UNKNOWN).parameters)
@@ -410,8 +412,8 @@ def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         network.axes = tuple(replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes)
-        with pytest.raises(SaveRefused, match="is not described in its profile"):
-            _apply(_propose(cell, network), DriveTarget(cell, network, Saving.ANY))
+        with pytest.raises(ParameterRefused, match="is not described in its profile"):
+            apply_to_drives(_propose(cell, network), network, NOW, saving=Saving.ANY)
         assert _gains(simulation) == IN_DRIVES
 
 

@@ -14,17 +14,14 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
     BusError,
-    IdentityMismatch,
-    MappingRefused,
     MotionRefused,
-    NmtRefused,
     NodeMissing,
     ObjectAccessError,
+    SetupRefused,
     StateRefused,
 )
 from drivers.profiles.cia402 import State
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
-from drivers.profiles.scale import ScaleImplausible
 from drivers.stream.sample import EventKind
 from tests.drivers.scripted import ADDRESS, PROFILE, FakeClock, ScriptedBus, ScriptedNode, cell
 
@@ -116,7 +113,7 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
     bus = ScriptedBus((ScriptedNode(1),), clock)
     axes = (Axis("J1", 1, PROFILE), Axis("J2", 2, PROFILE))
     network = CanopenNetwork(ADDRESS, axes, clock=clock, opener=lambda address: bus)
-    with network, pytest.raises(NodeMissing, match=r"node 2 did not answer .*answered: 1") as missing:
+    with network, pytest.raises(NodeMissing, match=r"J2 \(node 2\) did not answer .*answered: 1") as missing:
         network.prepare()
     assert missing.value.node_ids == (2,)
 
@@ -127,7 +124,7 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
 def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field: str) -> None:
     network, bus = cell(2)
     bus.nodes[1].store(0x1018, sub, 0x1234)
-    with network, pytest.raises(IdentityMismatch, match=rf"node 2: {field} .*0x1234"):
+    with network, pytest.raises(SetupRefused, match=rf"J2 \(node 2\): {field} .*0x1234"):
         network.prepare()
     writes = [f for f in bus.sent if 0x600 < f.arbitration_id < 0x680 and f.data[0] >> 5 == 1]
     assert writes == []
@@ -136,7 +133,7 @@ def test_another_amplifier_is_refused_before_anything_is_written(sub: int, field
 def test_a_node_that_ignores_nmt_is_refused() -> None:
     network, bus = cell(2)
     bus.nodes[1].obeys_nmt = False
-    with network, pytest.raises(NmtRefused, match=r"node 2: asked for NMT OPERATIONAL.*PRE-OPERATIONAL"):
+    with network, pytest.raises(StateRefused, match=r"J2 \(node 2\): asked for NMT OPERATIONAL.*PRE-OPERATIONAL"):
         network.prepare()
     assert bus.nodes[0].value(0x1800, 2) == 255
 
@@ -144,7 +141,7 @@ def test_a_node_that_ignores_nmt_is_refused() -> None:
 def test_a_node_without_heartbeat_cannot_confirm() -> None:
     network, bus = cell(1)
     bus.nodes[0].beats = False
-    with pytest.raises(NmtRefused, match="nothing") as refused, network:
+    with pytest.raises(StateRefused, match="nothing") as refused, network:
         network.prepare()
     assert any("closing the network" in note for note in refused.value.__notes__)
 
@@ -152,7 +149,7 @@ def test_a_node_without_heartbeat_cannot_confirm() -> None:
 def test_a_mapping_that_reads_back_differently_is_refused() -> None:
     network, bus = cell(1)
     bus.nodes[0].lies[0x1A00, 2] = 0x60770010
-    with pytest.raises(MappingRefused, match=r"TPDO1: reads back as .*60770010.*written was .*60740010"), network:
+    with pytest.raises(SetupRefused, match=r"TPDO1: reads back as .*60770010.*written was .*60740010"), network:
         network.prepare()
 
 
@@ -167,7 +164,7 @@ def test_a_mapping_that_reads_back_differently_is_refused() -> None:
 def test_aborts_of_the_mapping_are_shown(where: tuple[int, int], code: int, words: str) -> None:
     network, bus = cell(1)
     bus.nodes[0].aborts[where] = code
-    with pytest.raises(MappingRefused, match=words), network:
+    with pytest.raises(SetupRefused, match=words), network:
         network.prepare()
 
 
@@ -199,7 +196,9 @@ def test_sdo_failures_name_node_object_and_reason() -> None:
     network, bus = cell(1)
     with network:
         access = network.link.objects(1)
-        with pytest.raises(ObjectAccessError, match=r"node 1: object 2000h:00: aborted.*does not exist") as aborted:
+        with pytest.raises(
+            ObjectAccessError, match=r"J1 \(node 1\): object 2000h:00: aborted.*does not exist"
+        ) as aborted:
             access.read(ObjectEntry(0x2000, 0, 32, signed=False))
         assert aborted.value.abort_code == 0x06020000
         with pytest.raises(ObjectAccessError, match="has 16 bits, expected 32"):
@@ -262,7 +261,7 @@ def test_preparing_twice_still_restores_the_first_settings() -> None:
 
 def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
     network, bus = cell(2)
-    with pytest.raises(MappingRefused, match=r"node 1: TPDO1"), network:
+    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1"), network:
         network.prepare()
         bus.nodes[0].aborts[0x1800, 2] = 0x06010002
     assert bus.nodes[0].value(0x1400, 2) == 255
@@ -273,7 +272,7 @@ def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> No
 def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> None:
     network, bus = cell(2)
     bus.nodes[1].store(0x6075, 0, 0)
-    with pytest.raises(ScaleImplausible, match=r"node 2.*6075h:00 = 0"), network:
+    with pytest.raises(SetupRefused, match=r"node 2.*6075h:00 = 0"), network:
         network.prepare()
     assert not any(node.powered_cycles for node in bus.nodes)
     assert bus.nodes[0].value(0x6060, 0) == 8  # everything was given back

@@ -7,7 +7,7 @@ from itertools import pairwise
 import can
 import pytest
 
-from drivers.errors import RecorderIdTaken
+from drivers.errors import BusBusy
 from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.stream.sample import CellEvent, EventKind
@@ -180,7 +180,7 @@ def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> 
         give_guard(node)
     for node_id in range(3, 128):
         join(bus, node_id)
-    with pytest.raises(RecorderIdTaken, match=r"found none that is free.*expected an id.*nothing has moved"), network:
+    with pytest.raises(BusBusy, match=r"found no free node id.*expected an id.*nothing has moved"), network:
         network.prepare()
     assert [node.value(0x1016, 1) for node in bus.nodes[:2]] == [0, 0]
     assert all(node.powered_cycles == 0 for node in bus.nodes)
@@ -193,7 +193,7 @@ def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: c
         network.prepare()
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
         bus.inject(frame)
-        with pytest.raises(RecorderIdTaken, match="77Fh of another device, which has node id 127 too"):
+        with pytest.raises(BusBusy, match="77Fh of another device, which has node id 127 too"):
             list(
                 execute(network, stream, (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),), permission())
             )
@@ -209,9 +209,7 @@ def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: c
         bus.cycle = -1
         bus.on_cycle = lambda cycle: bus.inject(frame) if cycle in (60, 61) else None
         stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
-        with pytest.raises(
-            RecorderIdTaken, match=r"found a heartbeat 77Fh .*expected an id .*give that device another"
-        ):
+        with pytest.raises(BusBusy, match=r"found a heartbeat 77Fh .*expected an id .*give that device another"):
             list(
                 execute(
                     network, stream, (Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000)),), permission()

@@ -114,5 +114,5 @@ def test_refusals_name_axis_found_and_allowed() -> None:
         with pytest.raises(MotionRefused) as refusal:
             check_moves((start,), (move,), granted, ("J1",))
         assert all(word in str(refusal.value) for word in words)
-    with pytest.raises(MotionRefused, match="who"):
+    with pytest.raises(MotionRefused, match="names no operator"):
         check_moves((0,), (), MotionPermission(" ", room), ("J1",))

@@ -125,7 +125,7 @@ def test_an_emergency_of_a_node_stops_the_others(address: BusAddress, axes: tupl
             start = next(stream).position_counts
             far = synchronised_move(start, tuple(position + 300_000 for position in start), ROOM)
             with (
-                pytest.raises(DriveFault, match=r"node 3: .*2310h"),
+                pytest.raises(DriveFault, match=r"J3 \(node 3\): .*2310h"),
                 closing(execute(network, stream, (far,), PERMISSION)) as samples,
             ):
                 for sample in samples:

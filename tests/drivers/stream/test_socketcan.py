@@ -190,7 +190,7 @@ def test_an_interface_that_goes_is_named_after_its_last_frames() -> None:
     wire.send(FRAME.pack(0x181, 0, bytes(8)))
     wire.close()
     assert received(bus).arbitration_id == 0x181
-    with pytest.raises(can.CanOperationError, match="interface has gone \\(ENODEV\\)"):
+    with pytest.raises(can.CanOperationError, match="interface is gone \\(ENODEV\\)"):
         bus.recv(WAIT_S)
     bus.shutdown()
 

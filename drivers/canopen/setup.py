@@ -1,0 +1,163 @@
+"""Set one amplifier up for a recording, and restore afterwards the settings that it had before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+
+from drivers.canopen.link import Link
+from drivers.canopen.pdo import (
+    NOT_VALID,
+    PDOS,
+    SETPOINT_PDOS,
+    STATUSWORD,
+    Direction,
+    PdoRecord,
+    feedback_entries,
+    pack,
+    read_record,
+    records,
+    restore,
+    switch_off,
+    write_record,
+)
+from drivers.errors import SetupRefused, StateRefused
+from drivers.motion.guard import Consumers, Guard, arm, disarm, find_guard
+from drivers.profiles.profile import Axis, Identity, ObjectEntry
+from drivers.profiles.scale import ScaleReading
+
+HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
+MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
+MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
+PROFILE_POSITION_MODE = 1
+
+
+class AxisSetup:
+    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone.
+
+    Attributes:
+        guard: how the amplifier watches the recorder; None before `watch_recorder`.
+    """
+
+    def __init__(self, link: Link, axis: Axis) -> None:
+        self.guard: Guard | None = None
+        self._link = link
+        self._axis = axis
+        self._access = link.objects(axis.node_id)
+        self._heartbeat_ms: int | None = None
+        self._mode: int | None = None
+        self._pdos_before: dict[str, PdoRecord] = {}
+        self._pdos: tuple[PdoRecord, ...] = ()
+
+    def send_heartbeats(self, period_ms: int) -> None:
+        """Let the amplifier send heartbeats.
+
+        Raises:
+            ObjectAccessError: refused or not answered.
+        """
+        if self._heartbeat_ms is None:
+            self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
+        self._access.write(HEARTBEAT_TIME, period_ms)
+
+    def watch_recorder(
+        self, consumers: Consumers | None, is_left_over: Callable[[int], bool], recorder_id: int, silence_ms: int
+    ) -> None:
+        """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py).
+
+        Raises:
+            ObjectAccessError: not answered.
+        """
+        if self.guard is None:
+            self.guard = find_guard(self._access, consumers, is_left_over)
+        self.guard = arm(self._access, self.guard, recorder_id, silence_ms)
+
+    def map_pdos(self) -> None:
+        """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
+
+        Raises:
+            SetupRefused: a mapping is impossible, was refused, or reads back differently.
+        """
+        axis, node_id = self._axis, self._axis.node_id
+        try:
+            feedback = pack(feedback_entries(axis))
+        except ValueError as error:
+            raise SetupRefused(axis, f"TPDO: profile {axis.profile.name}: {error}") from error
+        wanted = {
+            Direction.TPDO: records(Direction.TPDO, node_id, feedback),
+            Direction.RPDO: records(Direction.RPDO, node_id, SETPOINT_PDOS),
+        }
+        for direction, pdos in wanted.items():
+            for number in range(PDOS):
+                found = read_record(self._access, direction, number)
+                if number < len(pdos) and found is None:
+                    raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
+                if found is None:
+                    continue
+                if number < len(pdos):
+                    self._pdos_before.setdefault(found.name, found)
+                    write_record(self._access, pdos[number])
+                elif not found.cob_id & NOT_VALID:
+                    self._pdos_before.setdefault(found.name, found)
+                    switch_off(self._access, found)  # a drive's default PDOs would come between ours
+        self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
+
+    def set_mode(self, within_s: float) -> None:
+        """Select profile position mode, and wait until 6061h shows it.
+
+        Raises:
+            StateRefused: it does not show it in time.
+            ObjectAccessError: refused or not answered.
+        """
+        access = self._access
+        if self._mode is None:
+            self._mode = access.read(MODE_OF_OPERATION)
+        access.write(MODE_OF_OPERATION, PROFILE_POSITION_MODE)
+        deadline = self._link.clock() + round(within_s * 1e9)
+        while (shown := access.read(MODE_DISPLAY)) != PROFILE_POSITION_MODE:
+            if self._link.clock() >= deadline:
+                found = f"mode {shown} in 6061h"
+                raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
+            self._link.pass_time()
+
+    def stop_watching(self) -> None:
+        """Restore the objects of the guard.
+
+        Raises:
+            ObjectAccessError: refused or not answered.
+        """
+        if self.guard is not None:
+            disarm(self._access, self.guard)
+
+    def restoring(self) -> Iterator[Callable[[], object]]:
+        """Yield the steps that restore all settings; the heartbeat last."""
+        for record in self._pdos_before.values():
+            yield partial(restore, self._access, record)
+        if self._mode is not None:
+            yield partial(self._access.write, MODE_OF_OPERATION, self._mode)
+        yield self.stop_watching
+        if self._heartbeat_ms is not None:
+            yield partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
+
+    def describe(self, identity: Identity, scale: ScaleReading, silence_ms: int) -> dict[str, object]:
+        """Return what the drive reported during the setup, for the log."""
+        profile = self._axis.profile
+        return {
+            "node_id": self._axis.node_id,
+            "vendor_id": identity.vendor_id,
+            "product_code": identity.product_code,
+            "serial": identity.serial,
+            "profile": profile.name,
+            # The recorded current: without both, a gain of this log cannot be compared with another's.
+            "amplitude": profile.amplitude.value,
+            "tap": profile.tap.value,
+            "signal": profile.signal,
+            "scale_objects": scale.objects,
+            "ampere_per_unit": scale.ampere_per_unit,
+            "rated_current_a": scale.rated_current_a,
+            "rated_torque_nm": scale.rated_torque_nm,
+            "scale_warnings": list(scale.warnings),
+            "guard": "none" if self.guard is None else self.guard.describe(silence_ms),
+            "mode_before": self._mode,
+            "mapping": [str(record) for record in self._pdos],
+            "mapping_before": [str(record) for record in self._pdos_before.values()],
+        }

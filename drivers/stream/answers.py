@@ -1,0 +1,145 @@
+"""The answers of the axes to SYNC: the values in each TPDO, and the SYNC to which it belongs.
+
+A TPDO carries no cycle number. An answer that comes after the next SYNC can be distinguished from that SYNC's own
+answer only by waiting for both. After a missing frame this is done for one cycle, before the frame counts as lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from struct import Struct
+
+from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
+from drivers.profiles.profile import Axis
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatistics:
+    """Counts of frames up to now; a run is sound when all from `missing` to `backlog_dropped` are zero.
+
+    Attributes:
+        cycles: SYNCs sent, or followed.
+        frames: answers used.
+        missing: answers that did not come in their cycle.
+        late: answers that came in a later cycle, where that could be known.
+        duplicate: second answers of an axis to one SYNC.
+        surplus: PDOs of an axis of the cell that are not mapped.
+        wrong_length: answers whose length differs from the mapping; they count as missing too.
+        skipped_periods: periods without a SYNC because the schedule slipped, or a followed SYNC did not come.
+        kernel_dropped: frames of any kind that the kernel dropped because its receive buffer was full.
+        interface_dropped: frames dropped by the interface, before the buffer.
+        backlog_dropped: frames that the capture process dropped because this process did not read them.
+        foreign: PDOs that are explained: of nodes that are no axes of the cell, or from before the first SYNC.
+    """
+
+    cycles: int = 0
+    frames: int = 0
+    missing: int = 0
+    late: int = 0
+    duplicate: int = 0
+    surplus: int = 0
+    wrong_length: int = 0
+    skipped_periods: int = 0
+    kernel_dropped: int = 0
+    interface_dropped: int = 0
+    backlog_dropped: int = 0
+    foreign: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Place of the values of one TPDO; column = field × axes + axis, with fields position, current, statusword."""
+
+    axis: int
+    bit: int
+    length: int
+    layout: Struct
+    columns: tuple[int, ...]
+
+
+def slots_of(axes: Sequence[Axis]) -> dict[int, Slot]:
+    """Return the slot of each COB-ID."""
+    slots: dict[int, Slot] = {}
+    for number, axis in enumerate(axes):
+        entries = feedback_entries(axis)
+        pdos = pack(entries)
+        for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True):
+            form = layout(pdo)
+            columns = tuple(entries.index(entry) * len(axes) + number for entry in pdo)
+            slots[record.cob_id] = Slot(number, 1 << len(slots), form.size, form, columns)
+    return slots
+
+
+class Answers:
+    """Assigns answers to cycles and counts them.
+
+    Attributes:
+        slots: by COB-ID.
+        values: last value of each column.
+        seen: bits of the slots that answered the last cycle.
+        frames, missing, late, duplicate: as StreamStatistics.
+    """
+
+    def __init__(self, axes: Sequence[Axis]) -> None:
+        self.slots = slots_of(axes)
+        self.values = [0] * (3 * len(axes))
+        self.seen = 0
+        self.frames = self.missing = self.late = self.duplicate = 0
+        self._all = (1 << len(self.slots)) - 1
+        self._debt = 0  # slots whose answer to an earlier SYNC may still come
+        self._open_debt = self._now = 0
+        self._last_data: dict[int, bytearray] = {}
+
+    def begin(self) -> None:
+        """Begin a cycle."""
+        self._open_debt, self._now = self._debt, 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether all answers of the cycle have come, and none of an earlier one is open."""
+        return self._now == self._all and not self._open_debt
+
+    @property
+    def any(self) -> bool:
+        """Whether an answer of the cycle has come."""
+        return bool(self._now)
+
+    def take(self, identifier: int, slot: Slot, data: bytearray) -> None:
+        """Accept an answer within a cycle."""
+        if self._now & slot.bit:
+            if self._open_debt & slot.bit:
+                # The first one was the late answer to an earlier SYNC, this one belongs to the current SYNC.
+                self._open_debt &= ~slot.bit
+                self.late += 1
+            else:
+                self.duplicate += 1
+                if self._last_data.get(identifier) == data:
+                    return
+                # The second answer differs: the first may have been a repetition of the cycle before.
+        self._now |= slot.bit
+        self._last_data[identifier] = data
+        for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
+            self.values[column] = value
+
+    def take_between(self, slot: Slot) -> None:
+        """Count an answer that is read before the next SYNC, and so belongs to none that is open."""
+        if self._debt & slot.bit:
+            self._debt &= ~slot.bit
+            self.late += 1
+        else:
+            self.duplicate += 1
+
+    def end(self) -> int:
+        """End a cycle; returns the axes without a complete answer, bit i for axis i."""
+        self.seen = self._now
+        # With one answer and a debt at the end, the owed frame was lost for good, and the answer is this cycle's.
+        self._debt = self._all & ~self._now
+        self.frames += self._now.bit_count()
+        absent = 0
+        if self._debt:
+            for slot in self.slots.values():
+                if self._debt & slot.bit:
+                    absent |= 1 << slot.axis
+                    self.missing += 1
+        return absent
