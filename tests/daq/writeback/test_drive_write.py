@@ -413,7 +413,7 @@ def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path
     with simulated(address) as simulation, network_of(cell, address) as network:
         network.axes = tuple(replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes)
         with pytest.raises(ParameterRefused, match="is not described in its profile"):
-            apply_to_drives(_propose(cell, network), network, NOW, saving=Saving.ANY)
+            _apply(_propose(cell, network), DriveTarget(cell, network, Saving.ANY))
         assert _gains(simulation) == IN_DRIVES
 
 
