@@ -1,4 +1,4 @@
-"""A cell: robot, drive train, bus, axes, payloads, filters and the controller that gets the gains."""
+"""A cell in SI units: robot, drive train, buses, axes, payloads, filters and the destination of the gains."""
 
 from __future__ import annotations
 
@@ -7,32 +7,35 @@ from dataclasses import dataclass
 from enum import Enum
 from math import pi
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from daq.config.clearance import Clearance
 from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace
 from daq.config.recalibration import Recalibration
+from daq.config.yaml_file import FileName, Name
 from drivers.profiles.profile import DriveProfile, Identity
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import JointKind, robot_from_urdf
 
-# In which unit people read a joint: degrees, or mm where it is prismatic. Inside, everything is in SI.
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class JointUnit:
-    """Of the positions of a joint; its speeds are so much a second.
+    """Unit in which people read a joint. Inside, everything is in SI.
 
     Attributes:
-        name: as people write it.
-        si: one of it, in rad or m.
+        name: unit of positions; speeds are per second.
+        si: one unit, in rad or m.
         si_name: rad or m.
-        force: what acts along the joint, Nm or N; a drive gain is that per unit of the current reference.
+        force: Nm or N; a drive gain is that per unit of the current reference.
     """
 
     name: str
@@ -41,7 +44,7 @@ class JointUnit:
     force: str
 
     def spell(self, value: float) -> str:
-        """A position (a speed, when "/s" is added) in SI as people read it: `12.5 deg`."""
+        """Format a position (or, with "/s" appended, a speed) given in SI: `12.5 deg`."""
         return f"{value / self.si:.5g} {self.name}"
 
 
@@ -50,11 +53,8 @@ MILLIMETRE = JointUnit("mm", 1e-3, "m", "N")
 
 
 def joint_unit(kind: JointKind) -> JointUnit:
-    """The unit of a kind of joint."""
+    """Return the unit of a kind of joint."""
     return MILLIMETRE if kind is JointKind.PRISMATIC else DEGREE
-
-
-FloatArray = NDArray[np.float64]
 
 
 class Pacing(Enum):
@@ -64,37 +64,40 @@ class Pacing(Enum):
     TIMED = "timed"
 
 
-@dataclass(frozen=True, slots=True)
-class Bus:
-    """How a bus is reached, as python-can names it; host and port are those of a socketcand hub.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnnamedBus:
+    """A bus, in the terms of python-can; host and port are those of a socketcand hub."""
 
-    The name is what people call it; the only bus of a cell has that of its channel.
-    """
+    interface: Name
+    channel: FileName
+    bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 29536
 
-    name: str
-    interface: str
-    channel: str
-    bitrate_bit_s: int
-    host: str
-    port: int
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bus(UnnamedBus):
+    """A bus with its name; the only bus of a cell is named after its channel."""
+
+    name: FileName
 
 
 RECORDER, KERNEL = "recorder", "kernel"
-"""Producers of SYNC that are no axis: the recording program, or this machine's kernel (SocketCAN's BCM)."""
+"""SYNC producers other than an axis: the recording program, or this machine's kernel (SocketCAN's BCM)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sync:
-    """The sampling period [µs], what paces it, and who sends it: RECORDER, KERNEL or the name of an axis."""
+    """Sampling period [µs], its pacing, and the producer of SYNC: RECORDER, KERNEL or the name of an axis."""
 
-    period_us: int
-    pacing: Pacing
-    producer: str = RECORDER
+    period_us: Annotated[int, Field(ge=250, le=1_000_000)]
+    pacing: Pacing = Pacing.TIMED
+    producer: Name = RECORDER
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of a joint, in SI: rad, or m where it is prismatic.
+    """Limits of a joint, in SI: rad, or m for a prismatic joint.
 
     Attributes:
         position: lower and upper end [rad or m].
@@ -112,15 +115,15 @@ class Axis:
     """One motor with its amplifier, and the joint of the same number.
 
     Attributes:
-        name: of the axis.
+        name: name of the axis.
         node_id, drive, profile, identity: of the amplifier; None in a cell that only imports recordings.
-        bus: name of the one that its amplifier is on; None in such a cell.
-        counts_per_revolution: encoder counts a motor revolution; None where the import chooses its own count.
-        unit: in which people read the joint: degrees, or mm where it is prismatic.
+        bus: name of the amplifier's bus; None in such a cell.
+        counts_per_revolution: encoder counts of a motor revolution; None where the import defines its own count.
+        unit: unit of the joint's positions for people: degrees, or mm for a prismatic joint.
         zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint].
         nameplate_gain: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed.
         gain_unit: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference.
-        limits: of the joint.
+        limits: limits of the joint.
     """
 
     name: str
@@ -144,7 +147,7 @@ class WeighedPayload:
     Attributes:
         name, mounting: the body, and the one way in which it is mounted.
         mass_kg, mass_tolerance_kg: as weighed [kg].
-        known: further inertial parameters, from its drawing, by their names in ident.link.LINK_PARAMETERS.
+        known: further inertial parameters, from its drawing, by their names in ident.model.bodies.LINK_PARAMETERS.
     """
 
     name: str
@@ -155,48 +158,48 @@ class WeighedPayload:
 
     @property
     def payload(self) -> Payload:
-        """As a log and, unless told otherwise, the identification take it: of its mass alone (paper, case 4)."""
+        """The payload with its mass alone, as in a log and by default in the identification (paper, case 4)."""
         return Payload(self.name, self.mounting, {"m": self.mass_kg})
 
     @property
     def drawn(self) -> Payload:
-        """With all that its drawing says."""
+        """The payload with all parameters of its drawing."""
         return Payload(self.name, self.mounting, {**self.known, "m": self.mass_kg})
 
 
 class MotionPolicy(Enum):
-    """Whose leave a recording needs to move the axes."""
+    """Permission that a recording needs to move the axes."""
 
     ASK = "ask"
-    """Somebody's, every time: --enable-motion."""
+    """The operator's, every time: --enable-motion."""
     ALLOWED = "allowed"
-    """The cell's own: a fenced cell whose safety chain does not depend on this program, for scheduled recordings."""
+    """None: a fenced cell whose safety chain does not depend on this program, for scheduled recordings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
-    """Everything that is declared of a cell, in SI units.
+    """A cell as declared, in SI units.
 
     Attributes:
-        name: of the cell.
+        name: name of the cell.
         urdf: text of the URDF.
         gravity_m_s2: in the base frame.
         ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m for a prismatic joint.
-        buses: on which the amplifiers are, nearly always one; none in a cell that only imports recordings.
-        sync: None in such a cell.
-        axes: n of them.
+        buses: buses of the amplifiers, usually one; empty in a cell that only imports recordings.
+        sync: sampling; None in such a cell.
+        axes: n axes.
         payloads: bodies that can be mounted.
         conditioning: the filters.
-        controller: None where nothing is written back.
-        clearance: the room around the arm, None where nothing is said of it.
-        motion: whose leave a recording needs.
-        apply: what is let through to the controller, and who may let it through.
-        history: where what became of its calibrations is kept; None for a cell that was read from a log.
-        recalibration: what a scheduled job does; None where there is none, or the cell was read from a log.
-        folder: of the cell file; None for a cell that was read from a log.
+        controller: destination of the gains, None without write-back.
+        clearance: the room around the arm, None if it is not declared.
+        folder: folder of the cell file; None for a cell from a log.
         digest: sha256 of the cell file and all files it refers to, hex.
-        recording_digest: the same of what they say and a recording or its fit depends on: without comments, and without
-            what becomes of a calibration later (`policy`, `history`, `recalibration`).
+        recording_digest: sha256 of the content that a recording or its fit depends on: without comments, and without
+            the later use of a calibration (`policy`, `history`, `recalibration`).
+        motion: permission that a recording needs.
+        apply: bounds and permissions of the write-back.
+        history: files of the history; None for a cell from a log.
+        recalibration: the scheduled job; None without one, or for a cell from a log.
     """
 
     name: str
@@ -220,9 +223,9 @@ class Cell:
 
     @property
     def controller_path(self) -> Path | None:
-        """The controller's file as the cell file names it, where it is known.
+        """The controller's file under the name in the cell file, None if it is unknown.
 
-        Symbolic links in that name are left alone: `daq.writeback.file_access` decides which of them may be followed.
+        Symbolic links in that name are not resolved: `daq.writeback.file_access` decides which of them may be followed.
         """
         if self.controller is None or self.controller.file is None or self.folder is None:
             return None
@@ -233,20 +236,17 @@ class Cell:
 
     @property
     def wiring(self) -> tuple[tuple[Bus, tuple[Axis, ...]], ...]:
-        """Each bus with the axes on it."""
+        """Each bus with its axes."""
         return tuple((bus, tuple(axis for axis in self.axes if axis.bus == bus.name)) for bus in self.buses)
 
     @property
     def axis_names(self) -> tuple[str, ...]:
-        """In the order of the axes."""
+        """Names in the order of the axes."""
         return tuple(axis.name for axis in self.axes)
 
 
-# A cell as ident takes it: its declared model.
-
-
 def model_of(cell: Cell) -> Model:
-    """Geometry of the URDF, gravity and drive train.
+    """Build the declared model for `ident`: geometry of the URDF, gravity and drive train.
 
     Raises:
         ModelError: the URDF or the drive train describes no robot.

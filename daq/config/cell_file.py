@@ -1,4 +1,4 @@
-"""From a cell file, or from the copy of it that a log carries, to a `Cell`."""
+"""Read a cell file, or the copy of it in a log, as a `Cell`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.cell import MILLIMETRE, Axis, Bus, Cell, Limits, Sync, WeighedPayload
+from daq.config.cell import MILLIMETRE, Axis, Cell, Limits, WeighedPayload
 from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, PayloadModel, ratio_of
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
 from daq.config.drive import drive_from_text
-from daq.config.policy import history_place, max_change_faults
+from daq.config.policy import max_change_faults
 from daq.config.yaml_file import describe, parse_yaml, read_bytes, read_model
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing
@@ -40,7 +40,7 @@ def load_cell(path: Path) -> Cell:
 
 
 def bundle(path: Path) -> dict[str, bytes]:
-    """The texts of a cell file and of all files that it refers to, by fixed names; what a log carries.
+    """Read a cell file and all files that it refers to, by fixed names, for a log.
 
     Raises:
         ConfigurationError: a file is missing, or the cell file is not what its schema says.
@@ -51,12 +51,12 @@ def bundle(path: Path) -> dict[str, bytes]:
 def cell_from_bundle(
     files: Mapping[str, bytes], file: Path | None = None, names: Mapping[str, str] | None = None
 ) -> Cell:
-    """The cell that a bundle describes.
+    """Build the cell that a bundle describes.
 
     Args:
-        files: as `bundle` made them; other entries (a log has more attachments) are passed over.
-        file: the cell file, where there is one.
-        names: what to call the files in messages.
+        files: as returned by `bundle`; other entries (a log has more attachments) are ignored.
+        file: path of the cell file, None for a log.
+        names: names of the files in messages.
 
     Raises:
         ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
@@ -79,8 +79,8 @@ def cell_from_bundle(
         urdf=urdf,
         gravity_m_s2=model.robot.gravity_m_s2,
         ratio=ratio_of(model),
-        buses=tuple(Bus(**bus.model_dump()) for bus in model.buses),
-        sync=None if model.sync is None else Sync(**model.sync.model_dump()),
+        buses=model.buses,
+        sync=model.sync,
         axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
         payloads=tuple(_payload(payload) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
@@ -90,14 +90,14 @@ def cell_from_bundle(
         digest=digest({name: files[name] for name in used}),
         recording_digest=_recording_digest({name: files[name] for name in used}),
         motion=model.policy.motion,
-        apply=model.policy.apply.policy,
-        history=None if file is None else history_place(model.history, file),
+        apply=model.policy.apply,
+        history=None if file is None else model.history.place(file),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
     )
 
 
 def digest(files: Mapping[str, bytes]) -> str:
-    """sha256 over names and contents, in the order of the names, hex."""
+    """Return the sha256 over names and contents, in the order of the names, hex."""
     total = hashlib.sha256()
     for name in sorted(files):
         total.update(f"{name}\0{len(files[name])}\0".encode())
@@ -106,11 +106,11 @@ def digest(files: Mapping[str, bytes]) -> str:
 
 
 _AFTERWARDS = ("policy", "history", "recalibration")
-"""Keys of a cell file that say what becomes of a calibration; no recording and no fit asks for them."""
+"""Keys for the use of a calibration; no recording and no fit depends on them."""
 
 
 def _recording_digest(files: Mapping[str, bytes]) -> str:
-    """`digest` of what the files say, not of how: comments, line breaks and the order of keys do not count."""
+    """Return the `digest` of the content: comments, line breaks and the order of keys do not count."""
     return digest({name: _canonical(name, content) for name, content in files.items()})
 
 
@@ -126,7 +126,7 @@ def _canonical(name: str, content: bytes) -> bytes:
 
 
 def _sources(path: Path) -> dict[str, Path]:
-    """Where the members of a cell's bundle are on disk."""
+    """Locate the members of a cell's bundle on disk."""
     model = read_model(parse_yaml(read_bytes(path), str(path)), CellModel)
     sources = {CELL: path, URDF: path.parent / model.robot.urdf}
     for drive in model.drives:
@@ -136,14 +136,14 @@ def _sources(path: Path) -> dict[str, Path]:
 
 
 def _eds_of(profile: Path) -> tuple[str, ...]:
-    """The electronic data sheet that a profile names beside itself, if it does; the schema is checked elsewhere."""
+    """Return the electronic data sheet named in a profile, if any; the schema is checked elsewhere."""
     tree = parse_yaml(read_bytes(profile), str(profile)).tree
     named = tree.get("eds") if isinstance(tree, dict) else None
     return (named,) if isinstance(named, str) and named else ()
 
 
 def _drive_path(folder: Path, drive: str) -> Path:
-    """A profile beside the cell (drives/ or ../drives/), else the shipped one."""
+    """Find a profile beside the cell (drives/ or ../drives/), else the shipped one."""
     file = f"{drive}.yaml"
     candidates = (folder / "drives" / file, folder.parent / "drives" / file, shipped_configurations() / "drives" / file)
     for candidate in candidates:
@@ -171,11 +171,11 @@ def _member(files: Mapping[str, bytes], member: str, names: Mapping[str, str]) -
 
 def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile]) -> Axis:
     limits, unit = model.limits, model.limits.unit
-    # The schema lets exactly one of the three be given, the checks only those of the joint's kind.
+    # The schema requires exactly one of the three, the checks that it matches the kind of joint.
     gains = (model.nameplate_gain_nm_per_a, model.nameplate_gain_n_per_a, model.nameplate_gain)
     per_newton = model.nameplate_gain_n_per_a is not None
     profile = None if model.drive is None else profiles[model.drive]
-    # A gain by the actual current is another quantity: whoever shows it or its calibration file shows the unit.
+    # A gain by the actual current is another quantity, so its unit must show it.
     ampere = "A(actual)" if profile is not None and profile.tap is TapPoint.ACTUAL else "A"
     return Axis(
         name=model.name,
@@ -198,7 +198,7 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
 
 
 def _conditioning(model: ConditioningModel) -> Conditioning:
-    """Each joint's standstill speed stands in the list of its kind, as the checks have made sure."""
+    """Merge the two lists of standstill speeds; the checks guarantee that each joint is in the list of its kind."""
     millimetres = model.standstill_mm_s or (None,) * len(model.standstill_rad_s)
     radians = model.standstill_rad_s or (None,) * len(millimetres)
     rest = model.model_dump(exclude={"standstill_rad_s", "standstill_mm_s"})
@@ -219,11 +219,11 @@ def _payload(model: PayloadModel) -> WeighedPayload:
 def drawn_parameters(
     mass_kg: float, centre_m: tuple[float, ...], about_centre_kg_m2: tuple[float, ...] | None
 ) -> dict[str, float]:
-    """First moments and, where it is given, the inertia moved to the frame's origin (Steiner), by LINK_PARAMETERS.
+    """Return first moments and, if given, the inertia about the frame's origin (Steiner), by LINK_PARAMETERS names.
 
     Args:
-        mass_kg: of the body.
-        centre_m: of mass, shape (3,).
+        mass_kg: mass of the body.
+        centre_m: centre of mass, shape (3,).
         about_centre_kg_m2: xx, xy, xz, yy, yz, zz about the centre of mass, in the directions of the frame.
     """
     centre = np.array(centre_m)

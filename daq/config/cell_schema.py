@@ -1,7 +1,12 @@
-"""What may stand in a cell file, key by key (configs/cells/demo.yaml shows all of it)."""
+"""Schema of a cell file, key by key (configs/cells/demo.yaml shows all of it).
+
+Sections whose fields mean the same in the program are its own classes (`Sync`, `ApplyPolicy`, ...). The classes here
+differ: degrees and mm instead of SI, and optional keys of which the checks accept only some combinations.
+"""
 
 from __future__ import annotations
 
+from dataclasses import fields
 from math import pi
 from typing import Annotated
 
@@ -9,16 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from daq.config.cell import DEGREE, MILLIMETRE, RECORDER, JointUnit, MotionPolicy, Pacing
-from daq.config.clearance import ClearanceModel, WorkspaceModel
-from daq.config.controller import ControllerModel
-from daq.config.policy import ApplyPolicyModel, HistoryModel
-from daq.config.recalibration import RecalibrationModel
-from daq.config.yaml_file import StrictModel, not_in_file
+from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
+from daq.config.clearance import ClearanceSection, WorkspaceSection
+from daq.config.controller import ControllerSection
+from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection
+from daq.config.recalibration import RecalibrationSection
+from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
 
-Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
-FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
-Positive = Annotated[float, Field(gt=0)]
+FloatArray = NDArray[np.float64]
 ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
@@ -36,40 +39,16 @@ class DriveTrainModel(StrictModel):
     ratio: Annotated[tuple[tuple[float, ...], ...], Field(min_length=1, max_length=32)]
 
 
-class BusModel(StrictModel):
-    """A python-can bus."""
-
-    interface: Name
-    channel: FileName
-    bitrate_bit_s: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
-    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=1, le=65535)] = 29536
-
-
-class NamedBusModel(BusModel):
-    """One of several buses; the only one of a cell has the name of its channel."""
-
-    name: FileName
-
-
 def _how_many(value: object) -> str:
     return SEVERAL_BUSES if isinstance(value, list | tuple) else ONE_BUS
 
 
 Buses = Annotated[
-    Annotated[BusModel, Tag(ONE_BUS)]
-    | Annotated[tuple[NamedBusModel, ...], Tag(SEVERAL_BUSES), Field(min_length=1, max_length=8)],
+    Annotated[UnnamedBus, Tag(ONE_BUS)]
+    | Annotated[tuple[Bus, ...], Tag(SEVERAL_BUSES), Field(min_length=1, max_length=8)],
     Discriminator(_how_many),
 ]
-"""One bus, or a list of named ones."""
-
-
-class SyncModel(StrictModel):
-    """The sampling."""
-
-    period_us: Annotated[int, Field(ge=250, le=1_000_000)]
-    pacing: Pacing = Pacing.TIMED
-    producer: Name = RECORDER
+"""One bus, or a list of named buses."""
 
 
 class IdentityModel(StrictModel):
@@ -81,7 +60,7 @@ class IdentityModel(StrictModel):
 
 
 class LimitsModel(StrictModel):
-    """Of a joint as people read them: in degrees, or in mm where it is prismatic."""
+    """Limits of a joint in degrees, or in mm for a prismatic joint."""
 
     position_deg: tuple[float, float] | None = None
     velocity_deg_s: Positive | None = None
@@ -91,7 +70,7 @@ class LimitsModel(StrictModel):
     acceleration_mm_s2: Positive | None = None
 
     @model_validator(mode="after")
-    def _one_unit(self) -> LimitsModel:
+    def _check_unit(self) -> LimitsModel:
         degrees = (self.position_deg, self.velocity_deg_s, self.acceleration_deg_s2)
         millimetres = (self.position_mm, self.velocity_mm_s, self.acceleration_mm_s2)
         if sorted(part.count(None) for part in (degrees, millimetres)) != [0, 3]:
@@ -103,13 +82,13 @@ class LimitsModel(StrictModel):
 
     @property
     def unit(self) -> JointUnit:
-        """Of the numbers."""
+        """Unit of the numbers."""
         return DEGREE if self.position_mm is None else MILLIMETRE
 
     @property
     def position(self) -> tuple[float, float]:
         """Lower and upper end, in the unit."""
-        # The validator has seen to it that one of the two is there.
+        # The validator guarantees one of the two.
         return self.position_mm or self.position_deg or (0.0, 0.0)
 
     @property
@@ -142,13 +121,13 @@ class AxisModel(StrictModel):
     limits: LimitsModel
 
     @model_validator(mode="after")
-    def _moving(self) -> AxisModel:
+    def _check_lead(self) -> AxisModel:
         if self.lead_mm == 0.0:
-            raise ValueError("a lead_mm that is not zero: the way for a turn, negative for a left-handed screw")
+            raise ValueError("a lead_mm that is not zero: the travel of one turn, negative for a left-handed screw")
         return self
 
     @model_validator(mode="after")
-    def _one_gain(self) -> AxisModel:
+    def _check_gain(self) -> AxisModel:
         gains = (self.nameplate_gain_nm_per_a, self.nameplate_gain_n_per_a, self.nameplate_gain)
         if gains.count(None) != 2 or (self.nameplate_gain is None) != (self.gain_unit is None):
             raise ValueError(
@@ -172,7 +151,7 @@ class KnownModel(StrictModel):
 
 
 class PayloadModel(StrictModel):
-    """A weighed body, and what its drawing says of it.
+    """A weighed body, and the parameters of its drawing.
 
     The centre of mass is in the last joint's frame; the inertia xx, xy, xz, yy, yz, zz is about the centre of mass, in
     the directions of that frame, as a URDF has it (xy = −∫xy dm).
@@ -187,7 +166,7 @@ class PayloadModel(StrictModel):
     known: KnownModel | None = None
 
     @model_validator(mode="after")
-    def _one_form(self) -> PayloadModel:
+    def _check_form(self) -> PayloadModel:
         if self.inertia_kg_m2 is not None and self.centre_m is None:
             raise ValueError("centre_m beside inertia_kg_m2: the inertia is about the centre of mass")
         if self.centre_m is not None and self.known is not None:
@@ -207,10 +186,10 @@ class ConditioningModel(StrictModel):
 
 
 class PolicyModel(StrictModel):
-    """What may be done in this cell without asking."""
+    """Actions that are permitted in this cell."""
 
     motion: MotionPolicy = MotionPolicy.ASK
-    apply: ApplyPolicyModel = ApplyPolicyModel()
+    apply: ApplyPolicy = DEFAULT_APPLY_POLICY
 
 
 class CellModel(StrictModel):
@@ -220,42 +199,37 @@ class CellModel(StrictModel):
     robot: RobotModel
     drive_train: DriveTrainModel
     bus: Buses | None = None
-    sync: SyncModel | None = None
+    sync: Sync | None = None
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
     conditioning: ConditioningModel
-    controller: ControllerModel | None = None
-    workspace: WorkspaceModel | None = None
-    clearance: ClearanceModel | None = None
+    controller: ControllerSection | None = None
+    workspace: WorkspaceSection | None = None
+    clearance: ClearanceSection | None = None
     policy: PolicyModel = PolicyModel()
-    history: HistoryModel = HistoryModel()
-    recalibration: RecalibrationModel | None = None
+    history: HistorySection = HistorySection()
+    recalibration: RecalibrationSection | None = None
 
     @property
-    def buses(self) -> tuple[NamedBusModel, ...]:
-        """All of them, by their names; none in a cell that only imports recordings."""
+    def buses(self) -> tuple[Bus, ...]:
+        """All buses, with names; empty in a cell that only imports recordings."""
         if self.bus is None or isinstance(self.bus, tuple):
             return self.bus or ()
-        return (NamedBusModel(name=self.bus.channel, **self.bus.model_dump()),)
+        declared = {key.name: getattr(self.bus, key.name) for key in fields(UnnamedBus)}
+        return (Bus(name=self.bus.channel, **declared),)
 
     def bus_of(self, axis: AxisModel) -> str | None:
-        """Name of the bus of an axis; the only one needs not be named."""
+        """Return the name of an axis's bus; the only bus of a cell need not be named."""
         return axis.bus or (self.buses[0].name if len(self.buses) == 1 else None)
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """Names of the drive profiles that the axes use, each once."""
+        """Names of the drive profiles in use, each once."""
         return tuple(dict.fromkeys(axis.drive for axis in self.axes if axis.drive))
 
 
-# The drive train as a cell file writes it, and which joint the gain of each motor speaks of.
-
-
-FloatArray = NDArray[np.float64]
-
-
 def ratio_of(model: CellModel) -> FloatArray:
-    """R of q_motor = R q_joint (paper eq. 24), rad a rad, or rad a metre of a prismatic joint, shape (n, n).
+    """Return R of q_motor = R q_joint (paper eq. 24), rad/rad, or rad/m for a prismatic joint, shape (n, n).
 
     Where a prismatic axis has a `lead_mm`, its column is written in turns: one turn of screw or pinion moves the joint
     by the lead, so R = ratio · 2π / lead.
@@ -269,10 +243,6 @@ def ratio_of(model: CellModel) -> FloatArray:
 
 
 def gain_joints(ratio: FloatArray) -> tuple[int, ...]:
-    """Index of the joint whose torque or force the gain of each motor speaks of: that of its reduction N.
-
-    Args:
-        ratio: R, shape (n, n).
-    """
-    # The rule of ident.drive_train.DriveTrain.reduction.
+    """Return the index of the joint that the gain of each motor refers to: that of its reduction N."""
+    # The rule of ident.model.model.DriveTrain.reduction.
     return tuple(motor if row[motor] != 0.0 else int(np.argmax(np.abs(row))) for motor, row in enumerate(ratio))

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from daq.config.bus import LARGEST_MEAN, bus_load, shortest_period_us, split_answers
-from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Pacing, joint_unit
-from daq.config.cell_schema import AxisModel, CellModel, NamedBusModel, PayloadModel, gain_joints, ratio_of
+from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, Pacing, joint_unit
+from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
 from daq.config.controller import controller_faults
 from daq.config.yaml_file import Document, Fault, Location, describe
@@ -267,9 +267,7 @@ def _refresh_faults(model: CellModel, period_us: int, profiles: Mapping[str, Dri
             )
 
 
-def _load_faults(
-    model: CellModel, period_us: int, bus: NamedBusModel, profiles: Mapping[str, DriveProfile]
-) -> Iterator[Fault]:
+def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
     """In lockstep the next SYNC waits for the answers, however long they take; a timed one does not."""
     used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None and model.bus_of(axis) == bus.name]
     load = bus_load(used, bus.bitrate_bit_s, period_us)
@@ -291,7 +289,7 @@ def _load_faults(
     )
 
 
-def _where(bus: NamedBusModel) -> tuple[str | int, ...]:
+def _where(bus: Bus) -> tuple[str | int, ...]:
     hub = (bus.host, bus.port) if bus.interface == "socketcand" else ()
     return (bus.interface, bus.channel, *hub)
 

@@ -1,4 +1,4 @@
-"""What a cell file says of the room around the arm: its workspace, its shape and what stands in its way."""
+"""`workspace` and `clearance` of a cell file: the room around the arm, its shape, and the obstacles."""
 
 from __future__ import annotations
 
@@ -8,58 +8,23 @@ from typing import Annotated
 
 from pydantic import Field
 
-from daq.config.yaml_file import Fault, StrictModel
+from daq.config.yaml_file import Fault, Name
 from ident.planning.clearance import BASE, Box, Capsule
 
 BASE_LINK = "base"
 DEFAULT_MINIMUM_M = 0.01
 
 Point = tuple[float, float, float]
-Label = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
-Metres = Annotated[float, Field(gt=0, le=10)]
-
-
-class WorkspaceModel(StrictModel):
-    """A box in the base frame in which everything on the last link must stay."""
-
-    lower_m: Point
-    upper_m: Point
-
-
-class CapsuleModel(StrictModel):
-    """All points within a radius of a segment, in the frame of the joint that moves it (or of the base)."""
-
-    name: Label
-    link: Label
-    from_m: Point
-    to_m: Point
-    radius_m: Metres
-
-
-class ObstacleModel(StrictModel):
-    """A box in the base frame."""
-
-    name: Label
-    lower_m: Point
-    upper_m: Point
-
-
-class ClearanceModel(StrictModel):
-    """What must keep apart; without capsules the arm's shape is guessed from its joint chain."""
-
-    minimum_m: Annotated[float, Field(ge=0, le=1)] = DEFAULT_MINIMUM_M
-    capsules: Annotated[tuple[CapsuleModel, ...], Field(max_length=64)] = ()
-    obstacles: Annotated[tuple[ObstacleModel, ...], Field(max_length=64)] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Clearance:
-    """The same in the terms of ident/planning/clearance.py.
+    """The room around the arm, in the types of `ident.planning.clearance`.
 
     Attributes:
-        workspace: in which everything on the last link must stay, None where it is not declared.
-        minimum_m: distance to keep.
-        capsules: none where the arm's shape is not declared.
+        workspace: box for everything on the last link, None if it is not declared.
+        minimum_m: smallest distance [m].
+        capsules: shape of the arm; empty if it is not declared.
         obstacles: boxes in the base frame.
     """
 
@@ -69,26 +34,61 @@ class Clearance:
     obstacles: tuple[Box, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class WorkspaceSection:
+    """A box in the base frame in which everything on the last link must stay."""
+
+    lower_m: Point
+    upper_m: Point
+
+
+@dataclass(frozen=True, slots=True)
+class CapsuleSection:
+    """All points within a radius of a segment, in the frame of the named axis (or of the base)."""
+
+    name: Name
+    link: Name
+    from_m: Point
+    to_m: Point
+    radius_m: Annotated[float, Field(gt=0, le=10)]
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle(Box):
+    """A box in the base frame."""
+
+    name: Name
+
+
+@dataclass(frozen=True, slots=True)
+class ClearanceSection:
+    """Bodies to keep apart; without capsules the arm's shape is derived from its joint chain."""
+
+    minimum_m: Annotated[float, Field(ge=0, le=1)] = DEFAULT_MINIMUM_M
+    capsules: Annotated[tuple[CapsuleSection, ...], Field(max_length=64)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], Field(max_length=64)] = ()
+
+
 def clearance_of(
-    workspace: WorkspaceModel | None, clearance: ClearanceModel | None, axis_names: Sequence[str]
+    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, axis_names: Sequence[str]
 ) -> Clearance | None:
-    """From the cell file's sections; None where it has neither."""
+    """Convert the sections of the cell file; None if it has neither."""
     if workspace is None and clearance is None:
         return None
-    declared = clearance or ClearanceModel()
+    declared = clearance or ClearanceSection()
     links = {BASE_LINK: BASE, **{name: index for index, name in enumerate(axis_names)}}
     return Clearance(
         workspace=None if workspace is None else Box("workspace", workspace.lower_m, workspace.upper_m),
         minimum_m=declared.minimum_m,
         capsules=tuple(Capsule(c.name, links[c.link], c.from_m, c.to_m, c.radius_m) for c in declared.capsules),
-        obstacles=tuple(Box(box.name, box.lower_m, box.upper_m) for box in declared.obstacles),
+        obstacles=declared.obstacles,
     )
 
 
 def clearance_faults(
-    workspace: WorkspaceModel | None, clearance: ClearanceModel | None, axis_names: Sequence[str]
+    workspace: WorkspaceSection | None, clearance: ClearanceSection | None, axis_names: Sequence[str]
 ) -> Iterator[Fault]:
-    """Boxes turned inside out, and capsules on links that the cell does not have."""
+    """Find boxes with exchanged corners, and capsules on links that the cell does not have."""
     if workspace is not None:
         yield from _box_faults(("workspace",), workspace)
     if clearance is None:
@@ -101,7 +101,7 @@ def clearance_faults(
             yield Fault(("clearance", "capsules", index, "link"), capsule.link, expected)
 
 
-def _box_faults(path: tuple[str | int, ...], box: WorkspaceModel | ObstacleModel) -> Iterator[Fault]:
+def _box_faults(path: tuple[str | int, ...], box: WorkspaceSection | Box) -> Iterator[Fault]:
     for axis, lower, upper in zip("xyz", box.lower_m, box.upper_m, strict=True):
         if not lower < upper:
             found = f"{axis} from {lower:g} to {upper:g} m"

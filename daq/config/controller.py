@@ -1,4 +1,4 @@
-"""Where the gains of a cell go: a file of its controller, objects of its drives, or both (`controller`)."""
+"""`controller` of a cell file: the controller file, the objects of the drives, or both, that receive the gains."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from daq.config.yaml_file import Fault, StrictModel, not_in_file
+from daq.config.yaml_file import Fault, FileName, not_in_file
 from drivers.profiles.profile import Parameter, ParameterKind
 
-_FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 _Factor = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ControllerFormat(Enum):
-    """How a controller's file is written."""
+    """Format of a controller file."""
 
     YAML = "yaml"
     JSON = "json"
@@ -28,7 +27,7 @@ class ControllerFormat(Enum):
 
 @dataclass(frozen=True, slots=True)
 class GainObject:
-    """Where a drive keeps its gain: number in the drive = gain × factor."""
+    """Object of a drive that holds its gain: number in the drive = gain × factor."""
 
     parameter: Parameter
     factor: float
@@ -36,14 +35,14 @@ class GainObject:
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """Where the gains are written.
+    """Destination of the gains.
 
     Attributes:
-        file: of the controller, relative to the cell file; None where they only go into the drives.
-        gains: in it, key of each axis's number; none without a file.
+        file: the controller file, relative to the cell file; None if the gains go only to the drives.
+        gains: key of each axis's number in the file; empty without a file.
         factors: number in the file = gain × factor, one for each of `gains`.
-        format: of the file; None where its suffix tells.
-        objects: in the drives, one for each axis; none where nothing is written there.
+        format: format of the file; None to derive it from the suffix.
+        objects: objects of the drives, one for each axis; empty if the drives are not written.
     """
 
     file: str | None
@@ -53,14 +52,19 @@ class Controller:
     objects: tuple[GainObject, ...] = ()
 
 
-class GainKeyModel(StrictModel):
+# The file writes a key alone or with its factor, and an object without the classes of `drivers`.
+
+
+@dataclass(frozen=True, slots=True)
+class GainKey:
     """A key of a controller that keeps its gains in another unit, or with another sign."""
 
-    key: _FileName
+    key: FileName
     factor: _Factor = 1.0
 
 
-class GainObjectModel(StrictModel):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GainObjectSection:
     """An object of a drive."""
 
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
@@ -73,25 +77,24 @@ _KEY, _KEY_AND_FACTOR = not_in_file("key"), not_in_file("key and factor")
 
 
 def _entry_kind(value: object) -> str:
-    return _KEY_AND_FACTOR if isinstance(value, dict | GainKeyModel) else _KEY
+    return _KEY_AND_FACTOR if isinstance(value, dict | GainKey) else _KEY
 
 
-_Gain = Annotated[
-    Annotated[_FileName, Tag(_KEY)] | Annotated[GainKeyModel, Tag(_KEY_AND_FACTOR)], Discriminator(_entry_kind)
-]
+_Gain = Annotated[Annotated[FileName, Tag(_KEY)] | Annotated[GainKey, Tag(_KEY_AND_FACTOR)], Discriminator(_entry_kind)]
 """A key alone, or {key: ..., factor: ...}."""
 
 
-class ControllerModel(StrictModel):
+@dataclass(frozen=True, slots=True)
+class ControllerSection:
     """`controller`."""
 
-    file: _FileName | None = None
+    file: FileName | None = None
     format: ControllerFormat | None = None
     gains: tuple[_Gain, ...] = ()
-    objects: tuple[GainObjectModel, ...] = ()
+    objects: tuple[GainObjectSection, ...] = ()
 
     @model_validator(mode="after")
-    def _one_target_at_least(self) -> ControllerModel:
+    def _check_targets(self) -> ControllerSection:
         if (self.file is None) != (not self.gains) or (self.file is None and not self.objects):
             raise ValueError("file and gains of the controller, objects of the drives, or all three")
         if self.file is None and self.format is not None:
@@ -99,41 +102,39 @@ class ControllerModel(StrictModel):
         return self
 
     @property
+    def keys(self) -> tuple[GainKey, ...]:
+        """Each key with its factor."""
+        return tuple(gain if isinstance(gain, GainKey) else GainKey(gain) for gain in self.gains)
+
+    @property
     def controller(self) -> Controller:
-        """As the write-back takes it."""
-        gain_entry = tuple(gain if isinstance(gain, GainKeyModel) else GainKeyModel(key=gain) for gain in self.gains)
+        """The controller for the write-back."""
         return Controller(
             file=self.file,
-            gains=tuple(gain.key for gain in gain_entry),
-            factors=tuple(gain.factor for gain in gain_entry),
+            gains=tuple(gain.key for gain in self.keys),
+            factors=tuple(gain.factor for gain in self.keys),
             format=self.format,
-            objects=tuple(
-                GainObject(Parameter(gain_entry.index, gain_entry.subindex, gain_entry.type), gain_entry.factor)
-                for gain_entry in self.objects
-            ),
+            objects=tuple(GainObject(Parameter(o.index, o.subindex, o.type), o.factor) for o in self.objects),
         )
 
 
-def controller_faults(model: ControllerModel, axes: int, *, on_a_bus: bool) -> Iterator[Fault]:
-    """What is well-formed and fits no cell of so many axes.
+def controller_faults(section: ControllerSection, axes: int, *, on_a_bus: bool) -> Iterator[Fault]:
+    """Find keys and objects that do not match the axes, and factors of zero.
 
     Args:
-        model: of the cell file.
-        axes: how many.
+        section: `controller` of the cell file.
+        axes: number of axes.
         on_a_bus: whether every axis has a node id and a drive profile.
     """
-    if model.gains and len(model.gains) != axes:
-        yield Fault(("controller", "gains"), f"{len(model.gains)} keys", f"{axes}, one for each axis")
-    if model.objects and len(model.objects) != axes:
-        yield Fault(("controller", "objects"), f"{len(model.objects)} objects", f"{axes}, one for each axis")
-    if model.objects and not on_a_bus:
-        yield Fault(
-            ("controller", "objects"),
-            "objects of drives that no bus leads to",
-            "bus, and node_id and drive of each axis",
-        )
-    factors = [(("gains", i), entry.factor) for i, entry in enumerate(model.gains) if isinstance(entry, GainKeyModel)]
-    factors += [(("objects", i), entry.factor) for i, entry in enumerate(model.objects)]
-    for (kind, index), factor in factors:
-        if factor == 0.0 or not math.isfinite(factor):
-            yield Fault(("controller", kind, index, "factor"), f"{factor:g}", "a factor that is not zero")
+    if section.gains and len(section.gains) != axes:
+        yield Fault(("controller", "gains"), f"{len(section.gains)} keys", f"{axes}, one for each axis")
+    if section.objects and len(section.objects) != axes:
+        yield Fault(("controller", "objects"), f"{len(section.objects)} objects", f"{axes}, one for each axis")
+    if section.objects and not on_a_bus:
+        expected = "bus, and node_id and drive of each axis"
+        yield Fault(("controller", "objects"), "objects of drives that no bus leads to", expected)
+    factors = {"gains": [key.factor for key in section.keys], "objects": [entry.factor for entry in section.objects]}
+    for kind, values in factors.items():
+        for index, factor in enumerate(values):
+            if factor == 0.0 or not math.isfinite(factor):
+                yield Fault(("controller", kind, index, "factor"), f"{factor:g}", "a factor that is not zero")

@@ -1,4 +1,4 @@
-"""An import description: how the CSV files of another controller are to be read (configs/imports/tx40.yaml)."""
+"""An import description: the layout of the CSV files of another controller (configs/imports/tx40.yaml)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.config.cell_schema import FileName, Name
-from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import Fault, FileName, Name, StrictModel, describe, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent
+
+Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
+"""Name in the header, or number counted from 1."""
+SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
 class PositionUnit(Enum):
-    """Of the numbers in the position columns."""
+    """Unit of the position columns."""
 
     RAD = "rad"
     DEG = "deg"
@@ -23,14 +26,14 @@ class PositionUnit(Enum):
 
 
 class Side(Enum):
-    """On which side of the gears the positions are: q_motor = R q_joint."""
+    """Side of the gears that the positions refer to: q_motor = R q_joint."""
 
     MOTOR = "motor"
     JOINT = "joint"
 
 
 class TimeUnit(Enum):
-    """Of the numbers in the time column."""
+    """Unit of the time column."""
 
     SECOND = "s"
     MILLISECOND = "ms"
@@ -43,76 +46,16 @@ class TimeUnit(Enum):
         return {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[self.value]
 
 
-Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
-"""Name in the header, or number counted from 1."""
-
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """Some columns of one file, one an axis, by header name or by number from 1."""
-
-    file: str
-    columns: tuple[str | int, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class TimeColumn:
-    """Where the time stands, instead of a rate."""
-
-    columns: Columns
-    unit: TimeUnit
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """How the files are laid out.
+    """Layout of the files.
 
     Attributes:
-        delimiter: between fields; " " stands for any white space.
+        delimiter: between fields; " " means any white space.
         decimal: point or comma.
         skip_rows: lines before the header.
-        header: whether a line of names comes before the numbers.
+        header: whether a line of names precedes the numbers.
     """
-
-    delimiter: str
-    decimal: str
-    skip_rows: int
-    header: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ImportDescription:
-    """A whole import description.
-
-    Attributes:
-        name: of the recording.
-        cell: path of the cell file.
-        table: layout of the files.
-        position, position_unit, side: joint or motor positions.
-        current, current_unit, current_factor: the current-loop reference; numbers × factor are in the unit, which is
-            the one of the cell's gains.
-        rate: samples a second, or the column that tells it.
-        payload, mounting: name of what was mounted and how, as in the cell; None without load.
-        operator: who recorded it.
-    """
-
-    name: str
-    cell: Path
-    table: Table
-    position: Columns
-    position_unit: PositionUnit
-    side: Side
-    current: Columns
-    current_unit: str
-    current_factor: float
-    rate: float | TimeColumn
-    payload: str | None
-    mounting: str | None
-    operator: str
-
-
-class TableModel(StrictModel):
-    """Layout of the files."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
     decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."
@@ -120,48 +63,61 @@ class TableModel(StrictModel):
     header: bool = True
 
     @model_validator(mode="after")
-    def _distinct(self) -> TableModel:
+    def _check_delimiter(self) -> Table:
         if self.delimiter == self.decimal:
             raise ValueError("a delimiter that is not the decimal sign")
         return self
 
 
-class PositionModel(StrictModel):
-    """The position columns."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PositionColumns:
+    """Position columns, one for each axis."""
 
     file: FileName
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)]
+    columns: SomeColumns
     unit: PositionUnit
     side: Side
 
 
-class CurrentModel(StrictModel):
-    """The current columns."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurrentColumns:
+    """Columns of the current-loop reference, one for each axis; numbers × factor are in the gains' unit."""
 
     file: FileName
-    columns: Annotated[tuple[Column, ...], Field(min_length=1)]
+    columns: SomeColumns
     unit: Annotated[str, Field(min_length=1)]
     factor: Annotated[float, Field(ge=-1e9, le=1e9)] = 1.0
 
 
-class TimeModel(StrictModel):
-    """The time column."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeColumn:
+    """The time column, instead of a rate."""
 
     file: FileName
     column: Column
     unit: TimeUnit
 
 
-class ImportModel(StrictModel):
-    """A whole import description."""
+class ImportDescription(StrictModel):
+    """A whole import description.
+
+    Attributes:
+        name: name of the recording.
+        cell: cell file, relative to this one.
+        table: layout of the files.
+        position, current: the columns.
+        rate_hz, time: sampling rate [Hz], or the time column; exactly one of the two.
+        payload, mounting: mounted payload, named as in the cell; None without load.
+        operator: person who recorded it.
+    """
 
     name: Name
     cell: FileName
-    table: TableModel = TableModel()
-    position: PositionModel
-    current: CurrentModel
+    table: Table = Table()
+    position: PositionColumns
+    current: CurrentColumns
     rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
-    time: TimeModel | None = None
+    time: TimeColumn | None = None
     payload: Name | None = None
     mounting: Name | None = None
     operator: str = ""
@@ -174,50 +130,28 @@ def load_import(path: Path) -> ImportDescription:
         ConfigurationError: the file is missing or wrong.
     """
     document = parse_yaml(read_bytes(path), str(path))
-    model = read_model(document, ImportModel)
-    faults = _faults(model)
+    description = read_model(document, ImportDescription)
+    faults = _faults(description)
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the import description")
-    return ImportDescription(
-        name=model.name,
-        cell=path.parent / model.cell,
-        table=Table(**model.table.model_dump()),
-        position=Columns(model.position.file, model.position.columns),
-        position_unit=model.position.unit,
-        side=model.position.side,
-        current=Columns(model.current.file, model.current.columns),
-        current_unit=model.current.unit,
-        current_factor=model.current.factor,
-        rate=_rate(model, document),
-        payload=model.payload,
-        mounting=model.mounting,
-        operator=model.operator,
-    )
+    return description
 
 
-def _rate(model: ImportModel, document: Document) -> float | TimeColumn:
-    if model.time is not None:
-        return TimeColumn(Columns(model.time.file, (model.time.column,)), model.time.unit)
-    if model.rate_hz is not None:
-        return model.rate_hz
-    faults = [Fault(("rate_hz",), "neither rate_hz nor time", "one of them")]
-    raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the import description")
-
-
-def _faults(model: ImportModel) -> list[Fault]:
+def _faults(wanted: ImportDescription) -> list[Fault]:
     faults = []
-    if model.rate_hz is not None and model.time is not None:
+    if wanted.rate_hz is not None and wanted.time is not None:
         faults.append(Fault(("time",), "both rate_hz and time", "one of them"))
-    if model.position.unit is PositionUnit.COUNTS and model.position.side is Side.JOINT:
-        faults.append(
-            Fault(("position", "side"), "joint, with encoder counts", "motor; counts are of the motor encoder")
-        )
-    if model.current.factor == 0.0:
+    if wanted.rate_hz is None and wanted.time is None:
+        faults.append(Fault(("rate_hz",), "neither rate_hz nor time", "one of them"))
+    if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
+        expected = "motor; counts are of the motor encoder"
+        faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
+    if wanted.current.factor == 0.0:
         faults.append(Fault(("current", "factor"), "0", "the unit of the gain for each unit in the file"))
-    if len(model.position.columns) != len(model.current.columns):
-        found = f"{len(model.current.columns)} columns"
-        faults.append(Fault(("current", "columns"), found, f"{len(model.position.columns)}, as many as of position"))
-    named = [c for c in (*model.position.columns, *model.current.columns) if isinstance(c, str)]
-    if named and not model.table.header:
+    if len(wanted.position.columns) != len(wanted.current.columns):
+        found = f"{len(wanted.current.columns)} columns"
+        faults.append(Fault(("current", "columns"), found, f"{len(wanted.position.columns)}, as many as of position"))
+    named = [c for c in (*wanted.position.columns, *wanted.current.columns) if isinstance(c, str)]
+    if named and not wanted.table.header:
         faults.append(Fault(("table", "header"), f"false, and column {named[0]!r} by name", "column numbers from 1"))
     return faults

@@ -1,46 +1,44 @@
-"""What a scheduled recalibration does, and when it may: `recalibration` of the cell file."""
+"""`recalibration` of a cell file: the steps of a scheduled recalibration, and its limits."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import StrictModel
-
 Argument = Annotated[str, Field(max_length=4000, pattern=r"^[^\x00]+$")]
+Arguments = Annotated[tuple[Argument, ...], Field(min_length=1, max_length=100)]
 FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 RunName = Annotated[str, Field(max_length=40, pattern=r"^[a-z0-9][a-z0-9_-]*$")]
 Seconds = Annotated[float, Field(gt=0, le=24 * 3600)]
 Hours = Annotated[float, Field(ge=0, le=100_000)]
-NotNegative = Annotated[float, Field(ge=0)]
 RESERVED = ("warm-up",)
-"""Names of logs that are no run of the fit."""
+"""Names of logs that are not runs of the fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A program of the cell's own.
+    """A program of the cell.
 
     Attributes:
-        arguments: program and arguments; no shell reads them.
-        timeout_s: after which it is ended and has failed [s].
+        command: program and arguments; no shell is involved.
+        timeout_s: time after which the program is killed and counts as failed [s].
     """
 
-    arguments: tuple[str, ...]
-    timeout_s: float
+    command: Arguments
+    timeout_s: Seconds = 900.0
 
 
 @dataclass(frozen=True, slots=True)
 class InterlockFile:
-    """A file that a safety controller's gateway renews while the cell is closed.
+    """A file that the gateway of a safety controller renews while the cell is closed.
 
     Attributes:
-        path: of it, absolute.
-        says: its first line while the robot may move.
-        max_age_s: an older one releases nothing [s].
+        path: absolute.
+        says: first line of the file while the robot may move.
+        max_age_s: an older file releases nothing [s].
     """
 
     path: Path
@@ -50,7 +48,7 @@ class InterlockFile:
 
 @dataclass(frozen=True, slots=True)
 class Interlock:
-    """Who is asked whether the cell is closed, in automatic mode and empty; one of the two, or both must say yes."""
+    """Sources that confirm that the cell is closed, empty and in automatic mode. If both are given, both must agree."""
 
     command: Command | None
     file: InterlockFile | None
@@ -61,12 +59,13 @@ class PlannedRun:
     """One recording of a session.
 
     Attributes:
-        name: of its log.
-        payload: what is mounted, None without load.
-        mass_kg: the payload's mass as entered for this job, beside that of the cell's payload [kg]; None without load.
-        plan_file: approved moves, absolute; None where they are planned from a seed.
-        seed, duration_s: of the moves that are planned [s].
-        holdout: the fit does not see it.
+        name: name of its log.
+        payload: mounted payload, None without load.
+        mass_kg: mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without load.
+        plan_file: approved moves, absolute; None if they are planned from a seed.
+        seed: seed of the planned moves.
+        duration_s: duration of the planned moves [s].
+        holdout: the run is held out of the fit.
     """
 
     name: str
@@ -78,92 +77,101 @@ class PlannedRun:
     holdout: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Recalibration:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bounds:
+    """Keys that mean the same in the file and in the program.
+
+    Attributes:
+        mount: called before each run with the payload's name, or "none", as last argument.
+        warm_up_min: duration of the moves before the first run, which are not logged [min].
+        every_h: nothing is due while the last good calibration is younger [h].
+        max_duration_min: longest duration of a job [min].
+        resume_within_h: largest age of a session that is resumed [h].
+        retries: further attempts of a run that its recorder marked invalid.
+        min_free_mb: free space on the disk required at the start [MB].
+        keep_sessions: number of ended sessions whose logs are kept.
+        seed: seed of the significance test.
+    """
+
+    mount: Command
+    warm_up_min: Annotated[float, Field(ge=0, le=240)] = 10.0
+    every_h: Hours = 144.0
+    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0
+    resume_within_h: Hours = 12.0
+    retries: Annotated[int, Field(ge=0, le=5)] = 1
+    min_free_mb: Annotated[float, Field(ge=0)] = 1000.0
+    keep_sessions: Annotated[int, Field(ge=1)] = 20
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recalibration(_Bounds):
     """A scheduled recalibration.
 
     Attributes:
-        folder: where its sessions are, each with logs, state and report; absolute.
+        folder: parent of its sessions, each with logs, state and report; absolute.
         runs: in the order of their recording.
-        interlock: asked before each of them.
-        mount: called before each of them with the payload's name, or "none", as its last argument.
-        warm_up_min: moves before the first of them that no log keeps [min].
-        every_h: nothing is due while the last good calibration is younger [h].
-        max_duration_min: of a whole job [min].
-        resume_within_h: age of a session that is still taken up [h].
-        retries: of a run that its recorder does not stand for.
-        min_free_mb: room on the disk of the folder before anything begins [MB].
-        keep_sessions: ended ones whose logs stay.
-        seed: of the significance test.
-        metrics: folder for Prometheus' textfile collector, None where nobody collects.
-        working_folder: where commands run: that of the cell file.
+        interlock: checked before each run.
+        metrics: folder of Prometheus' textfile collector, None without one.
+        working_folder: folder in which commands run: that of the cell file.
     """
 
     folder: Path
     runs: tuple[PlannedRun, ...]
     interlock: Interlock
-    mount: Command
-    warm_up_min: float
-    every_h: float
-    max_duration_min: float
-    resume_within_h: float
-    retries: int
-    min_free_mb: float
-    keep_sessions: int
-    seed: int
     metrics: Path | None
     working_folder: Path
 
 
-class CommandModel(StrictModel):
-    """`mount`."""
-
-    command: Annotated[tuple[Argument, ...], Field(min_length=1, max_length=100)]
-    timeout_s: Seconds = 900.0
+# The file writes three parts differently: file names are relative to the cell file, the interlock is one mapping, and
+# a run has a plan or a plan file.
 
 
-class InterlockModel(StrictModel):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InterlockSection:
     """`interlock`."""
 
-    command: Annotated[tuple[Argument, ...], Field(min_length=1, max_length=100)] | None = None
+    command: Arguments | None = None
     timeout_s: Seconds = 10.0
     file: FileName | None = None
     says: Annotated[str, Field(min_length=1, max_length=200)] = "closed"
     max_age_s: Seconds = 10.0
 
     @model_validator(mode="after")
-    def _asked(self) -> InterlockModel:
+    def _check_sources(self) -> InterlockSection:
         if self.command is None and self.file is None:
             raise ValueError("a command, a file, or both: no job moves a robot unasked")
         return self
 
     def interlock(self, folder: Path) -> Interlock:
-        """With absolute paths."""
+        """Resolve paths."""
         return Interlock(
             None if self.command is None else Command(self.command, self.timeout_s),
             None if self.file is None else InterlockFile((folder / self.file).resolve(), self.says, self.max_age_s),
         )
 
 
-class SeededPlanModel(StrictModel):
-    """`plan` of a run: moves made anew from a seed."""
+@dataclass(frozen=True, slots=True)
+class SeededPlan:
+    """`plan` of a run: moves planned from a seed."""
 
     seed: Annotated[int, Field(ge=0)]
     duration_s: Annotated[float, Field(ge=5, le=3600)] = 40.0
 
 
-class RunModel(StrictModel):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSection:
     """One of `runs`."""
 
     name: RunName
     payload: Annotated[str, Field(min_length=1)] | None = None
     mass_kg: Annotated[float, Field(gt=0)] | None = None
-    plan: SeededPlanModel | None = None
+    plan: SeededPlan | None = None
     plan_file: FileName | None = None
     holdout: bool = False
 
     @model_validator(mode="after")
-    def _whole(self) -> RunModel:
+    def _check_plan_and_payload(self) -> RunSection:
         if self.name in RESERVED:
             raise ValueError(f"another name than {self.name}")
         if (self.payload is None) != (self.mass_kg is None):
@@ -173,31 +181,23 @@ class RunModel(StrictModel):
         return self
 
     def run(self, folder: Path) -> PlannedRun:
-        """With absolute paths."""
-        plan = self.plan or SeededPlanModel(seed=0)
+        """Resolve paths."""
+        plan = self.plan or SeededPlan(seed=0)
         file = None if self.plan_file is None else (folder / self.plan_file).resolve()
         return PlannedRun(self.name, self.payload, self.mass_kg, file, plan.seed, plan.duration_s, self.holdout)
 
 
-class RecalibrationModel(StrictModel):
-    """`recalibration`; paths are relative to the cell file (docs/how-to/schedule-recalibration.md has an example)."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecalibrationSection(_Bounds):
+    """`recalibration`; docs/how-to/schedule-recalibration.md has an example."""
 
     folder: FileName | None = None
-    runs: Annotated[tuple[RunModel, ...], Field(min_length=3, max_length=100)]
-    interlock: InterlockModel
-    mount: CommandModel
-    warm_up_min: Annotated[float, Field(ge=0, le=240)] = 10.0
-    every_h: Hours = 144.0
-    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0
-    resume_within_h: Hours = 12.0
-    retries: Annotated[int, Field(ge=0, le=5)] = 1
-    min_free_mb: NotNegative = 1000.0
-    keep_sessions: Annotated[int, Field(ge=1)] = 20
-    seed: Annotated[int, Field(ge=0)] = 0
+    runs: Annotated[tuple[RunSection, ...], Field(min_length=3, max_length=100)]
+    interlock: InterlockSection
     metrics: FileName | None = None
 
     @model_validator(mode="after")
-    def _fits(self) -> RecalibrationModel:
+    def _check_runs(self) -> RecalibrationSection:
         names = [run.name for run in self.runs]
         if len(set(names)) < len(names):
             raise ValueError("runs with names of their own")
@@ -209,22 +209,14 @@ class RecalibrationModel(StrictModel):
         return self
 
     def recalibration(self, cell_file: Path) -> Recalibration:
-        """With absolute paths."""
+        """Resolve paths."""
         folder = cell_file.parent
         return Recalibration(
-            # Of the cell file's name, as its history: two cells in one folder have sessions of their own.
+            **{bound.name: getattr(self, bound.name) for bound in fields(_Bounds)},
+            # Named after the cell file, as its history: two cells in one folder have separate sessions.
             folder=(folder / (self.folder or f"{cell_file.stem}.recalibration")).resolve(),
             runs=tuple(run.run(folder) for run in self.runs),
             interlock=self.interlock.interlock(folder),
-            mount=Command(self.mount.command, self.mount.timeout_s),
-            warm_up_min=self.warm_up_min,
-            every_h=self.every_h,
-            max_duration_min=self.max_duration_min,
-            resume_within_h=self.resume_within_h,
-            retries=self.retries,
-            min_free_mb=self.min_free_mb,
-            keep_sessions=self.keep_sessions,
-            seed=self.seed,
             metrics=None if self.metrics is None else (folder / self.metrics).resolve(),
             working_folder=folder.resolve(),
         )

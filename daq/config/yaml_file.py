@@ -1,7 +1,14 @@
-"""Strict YAML: what is misspelt, doubled or of the wrong type is refused with its line, never guessed."""
+"""Strict YAML: misspelt or duplicate keys and wrong types are refused with their line, never guessed.
+
+A document has one schema: a `StrictModel` for the whole file, whose sections are plain frozen dataclasses wherever the
+file and the program mean the same. pydantic checks these dataclasses as strictly as the model they are in, and a
+constraint (`Annotated[float, Field(gt=0)]`) is part of the field's type. A section has a second class only where the
+program's shape differs: other units, absolute paths, objects of another package.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import json
 import os
@@ -9,31 +16,35 @@ import re
 import stat
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
 
 Location = tuple[str | int, ...]
 MAX_BYTES = 4 * 2**20
-"""No configuration is larger; a file that is must be something else."""
+"""Largest configuration [bytes]."""
 MAX_DEPTH = 40
-"""Lists in lists; deeper ones take time and memory beyond their size."""
+"""Deepest nesting; more takes time and memory beyond the size of the file."""
 MAX_VALUES = 50_000
-"""Keys and values; the largest configuration has a hundredth of that, and a file of 4 MiB could hold two million."""
+"""Largest number of keys and values; the largest shipped configuration has a hundredth of that."""
 MAX_BITS = 64
-"""Of an integer: no object of an amplifier is longer, and Python refuses to write out what is much longer."""
+"""Longest integer: no object of an amplifier is longer."""
 MAX_EXPLAINED = 100
-"""Faults for which the nearest known key is looked up; a hostile file has tens of thousands."""
+"""Faults for which the nearest known key is searched; a hostile file has tens of thousands."""
 MAX_SHOWN = 8
 """Faults listed in one message."""
 _NOT_IN_FILE = "\0"
 
+Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
+FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
+Positive = Annotated[float, Field(gt=0)]
+
 
 class StrictModel(BaseModel):
-    """Schema of one mapping: nothing unknown, nothing converted, no NaN. Lives at the file border only."""
+    """Schema of a whole file, and of its sections: no unknown keys, no conversions, no NaN."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -46,7 +57,7 @@ class Document:
     """A parsed file.
 
     Attributes:
-        name: what to call it in messages.
+        name: name in messages.
         tree: mappings, lists and scalars.
         lines: line number of every value, from 1, by its path.
     """
@@ -56,7 +67,7 @@ class Document:
     lines: dict[Location, int]
 
     def where(self, path: Location) -> str:
-        """'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the file."""
+        """Return 'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the file."""
         known = path
         while known not in self.lines and known:
             known = known[:-1]
@@ -66,7 +77,7 @@ class Document:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One thing wrong at one place of a file."""
+    """One fault at one place of a file."""
 
     path: Location
     found: str
@@ -130,12 +141,12 @@ def parse_yaml(text: bytes, name: str) -> Document:
     """Parse one YAML document.
 
     Args:
-        text: of the file.
-        name: what to call it in messages.
+        text: content of the file.
+        name: name of the file in messages.
 
     Raises:
-        YamlInvalid: it is no single YAML document, has duplicate keys, aliases, tags, keys that are not text, or is too
-            large, too deep or of too many values.
+        YamlInvalid: not a single YAML document; duplicate keys, aliases, tags or keys that are not text; too large, too
+            deep, or too many values.
     """
     if len(text) > MAX_BYTES:
         raise YamlInvalid(
@@ -171,18 +182,18 @@ def parse_yaml(text: bytes, name: str) -> Document:
 
 
 def not_in_file(kind: str) -> str:
-    """Tag of one kind of value where a key may have several: a part of pydantic's path that no file has."""
+    """Return the tag of one kind of value where a key allows several: a part of pydantic's path, not of the file's."""
     return _NOT_IN_FILE + kind
 
 
 def read_bytes(path: Path) -> bytes:
-    """Bytes of a configuration file; no more than MAX_BYTES are ever read of it.
+    """Read a configuration file of at most MAX_BYTES.
 
     Raises:
-        ConfigurationMissing: there is no such file, it is no regular one, too large, or cannot be read.
+        ConfigurationMissing: the file does not exist, is not a regular file, is too large, or cannot be read.
     """
     try:
-        # Without waiting: a pipe is opened for reading only when somebody writes to it, and a device may never end.
+        # Without blocking: opening a pipe waits for its writer, and a device may never end.
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as stream:
             regular = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
             content = stream.read(MAX_BYTES + 1) if regular else b""
@@ -191,7 +202,7 @@ def read_bytes(path: Path) -> bytes:
             str(path),
             found=(error.strerror or type(error).__name__).lower(),
             expected="a readable file",
-            remedy="check the name and the folder it is meant from",
+            remedy="check the name; it is relative to the file that names it",
         ) from error
     if not regular or len(content) > MAX_BYTES:
         raise ConfigurationMissing(
@@ -210,7 +221,7 @@ def read_model(document: Document, model: type[Model]) -> Model:
         SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest known key.
     """
     try:
-        # By way of JSON, where a list may become a tuple and a word an enum although everything else is strict.
+        # Through JSON, where a list may become a tuple and a word an enum although everything else is strict.
         return model.model_validate_json(json.dumps(document.tree))
     except ValidationError as error:
         items = error.errors(include_url=False)
@@ -219,7 +230,7 @@ def read_model(document: Document, model: type[Model]) -> Model:
 
 
 def _mismatch(document: Document, faults: list[Fault], others: int) -> SchemaMismatch:
-    # A list counts as empty when its items are wrong; what is wrong inside says enough.
+    # A list counts as empty when its items are wrong; the faults inside say enough.
     outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
     inner = [fault for fault in faults if fault.path not in outer]
     remedy = "correct the file; `drivegain init` shows every key"
@@ -229,7 +240,7 @@ def _mismatch(document: Document, faults: list[Fault], others: int) -> SchemaMis
 
 
 def describe(document: Document, faults: list[Fault]) -> dict[str, str]:
-    """Subject, found and expected of an error that carries some faults; several are listed one a line."""
+    """Return subject, found and expected of an error with these faults, one a line."""
     if len(faults) == 1:
         only = faults[0]
         return {"subject": document.where(only.path), "found": only.found, "expected": only.expected}
@@ -239,13 +250,13 @@ def describe(document: Document, faults: list[Fault]) -> dict[str, str]:
 
 
 def spell(path: Location) -> str:
-    """A path as people write it: axes[3].limits.velocity_deg_s (counted from 0)."""
+    """Write a path as axes[3].limits.velocity_deg_s (counted from 0)."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return text.lstrip(".") or "the whole file"
 
 
 def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines: dict[Location, int]) -> Any:
-    """A node as plain Python, noting lines and refusing what YAML allows and a configuration must not."""
+    """Convert a node to plain Python and note its lines; refuse YAML features that a configuration must not use."""
     line = node.start_mark.line + 1
     lines[path] = line
     if node.tag not in _TAGS:
@@ -264,7 +275,7 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
                     f"{name}:{key_node.start_mark.line + 1}: {spell(path)}",
                     found=f"key {key_node.value!r}",
                     expected="a key that is text",
-                    remedy="quote it if it is meant so",
+                    remedy="quote it if this is intended",
                 )
             if key in mapping:
                 raise YamlInvalid(
@@ -290,9 +301,9 @@ def _convert(loader: _Loader, node: yaml.Node, path: Location, name: str, lines:
 
 
 def _fault(item: Any, model: type[BaseModel]) -> Fault:
-    """A validation error of pydantic as found and expected."""
+    """Translate a validation error of pydantic to found and expected."""
     path: Location = tuple(part for part in item["loc"] if not str(part).startswith(_NOT_IN_FILE))
-    if item["type"] == "extra_forbidden":
+    if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
         known = _known_keys(model, path[:-1])
         near = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
         hint = f"{near[0]} (did you mean that?)" if near else f"one of {', '.join(known)}"
@@ -310,16 +321,25 @@ def _show(value: Any) -> str:
 
 
 def _known_keys(model: type[BaseModel], path: Location) -> list[str]:
-    """Keys that the schema has at a path; list positions and names of a free mapping are passed over."""
-    current = model
+    """List the keys that the schema has at a path; list positions and names of a free mapping are skipped."""
+    current: type[Any] = model
     for part in path:
-        if isinstance(part, str) and part in current.model_fields:
-            current = _nested(current.model_fields[part].annotation) or current
-    return list(current.model_fields)
+        if isinstance(part, str) and part in (keys := _keys(current)):
+            current = _nested(keys[part]) or current
+    return list(_keys(current))
 
 
-def _nested(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _keys(section: type[Any]) -> dict[str, Any]:
+    """Annotations of a section's fields, by name."""
+    if issubclass(section, BaseModel):
+        return {name: info.annotation for name, info in section.model_fields.items()}
+    hints = get_type_hints(section)
+    return {field.name: hints[field.name] for field in dataclasses.fields(section)}
+
+
+def _nested(annotation: Any) -> type[Any] | None:
+    """Find the first section in an annotation such as `tuple[Section, ...] | None`."""
+    if isinstance(annotation, type) and (dataclasses.is_dataclass(annotation) or issubclass(annotation, BaseModel)):
         return annotation
     found = (_nested(argument) for argument in get_args(annotation))
-    return next((model for model in found if model is not None), None)
+    return next((section for section in found if section is not None), None)

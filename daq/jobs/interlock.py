@@ -68,7 +68,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
     """
     try:
         process = subprocess.Popen(
-            (*command.arguments, *further),
+            (*command.command, *further),
             cwd=folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -76,7 +76,7 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
             start_new_session=True,
         )
     except OSError as error:
-        return Finished(None, f"{command.arguments[0]}: {(error.strerror or type(error).__name__).lower()}")
+        return Finished(None, f"{command.command[0]}: {(error.strerror or type(error).__name__).lower()}")
     with process:
         try:
             said = _said(process, command.timeout_s)
@@ -137,7 +137,7 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
     if interlock.command is not None:
         ended = run(interlock.command, (), folder)
         if ended.code != 0:
-            raise _held(f"interlock command {interlock.command.arguments[0]}", str(ended), "exit code 0")
+            raise _held(f"interlock command {interlock.command.command[0]}", str(ended), "exit code 0")
     if interlock.file is not None:
         _require_file(interlock.file, now)
 
@@ -152,7 +152,7 @@ def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
     ended = run(section.mount, (wanted,), section.working_folder)
     if ended.code != 0:
         raise JobHeld(
-            f"mount command {section.mount.arguments[0]} {wanted}",
+            f"mount command {section.mount.command[0]} {wanted}",
             found=str(ended),
             expected="exit code 0: it is mounted as the run needs it",
             remedy=f"mount {wanted} by hand or see to the changer; the next job goes on with run {planned.name}",

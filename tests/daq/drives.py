@@ -51,7 +51,7 @@ def demo_cell(folder: Path, *objects: GainObject) -> Cell:
 
 def on_its_own_bus(folder: Path, channel: str) -> Cell:
     """That cell on a virtual bus of a test's own."""
-    bus = Bus("the bus", "virtual", channel, 1_000_000, "127.0.0.1", 29536)
+    bus = Bus(name="the bus", interface="virtual", channel=channel)
     declared = demo_cell(folder)
     axes = tuple(replace(axis, bus=bus.name) for axis in declared.axes)
     return replace(declared, folder=folder, buses=(bus,), axes=axes)

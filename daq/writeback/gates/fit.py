@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from daq.config.policy import ApplyPolicy, HoldOut
+from daq.config.policy import ApplyPolicy
 from daq.writeback.gates.table import Gate, Refusal
 from ident.calibration import Calibration
 from ident.estimators.estimate import RelativeError
@@ -124,7 +124,7 @@ def _size_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusa
 def _holdout_refusals(calibration: Calibration, policy: ApplyPolicy) -> list[Refusal]:
     held, nameplate = calibration.holdout_error_percent, calibration.nameplate_holdout_error_percent
     if held is None:
-        if policy.holdout is HoldOut.OPTIONAL:
+        if not policy.requires_holdout:
             return []
         return [
             Refusal(

@@ -173,7 +173,8 @@ def test_init_makes_a_cell_that_can_be_read(tmp_path: Path, capsys: pytest.Captu
     assert [(bus.interface, bus.channel) for bus in cell.buses] == [("socketcan", "can0")]
     assert cell.controller_path == folder / "controllers/press-4.yaml"
     assert cell.controller_path.is_file()
-    assert load_import(folder / "imports/press-4.yaml").cell.resolve() == folder / "cells/press-4.yaml"
+    description = folder / "imports/press-4.yaml"
+    assert (description.parent / load_import(description).cell).resolve() == folder / "cells/press-4.yaml"
     for path in folder.rglob("*.yaml"):
         head = re.match(r"(#.*\n)+", path.read_text(encoding="utf-8"))
         assert head, path

@@ -96,7 +96,7 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
 
         def asking(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
             ended = run_command(command, further, folder)
-            if command.arguments[0] == "test":
+            if command.command[0] == "test":
                 cycles.append(cell.cycles)
                 if len(cycles) == 2:
                     rig.closed.unlink()
@@ -478,7 +478,7 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_pat
     asked = []
 
     def asking(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
-        asked.append(command.arguments[0])
+        asked.append(command.command[0])
         return run_command(command, further, folder)
 
     rig.tools = replace(rig.tools, record=noting, run=asking)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from pydantic import TypeAdapter
 
 from daq.config.cell_file import load_cell
-from daq.config.recalibration import RecalibrationModel, RunModel
+from daq.config.recalibration import RecalibrationSection, RunSection
 from daq.errors import SchemaMismatch
 from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, resumable_session, save, sessions
 from tests.daq.jobs.rig import BEGAN, make_rig
@@ -74,10 +75,10 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
 
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
     (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
-    RecalibrationModel.model_validate_json(json.dumps(yaml.safe_load(example)["recalibration"]))
-    for model in (RecalibrationModel, RunModel):
-        for key in model.model_fields:
-            assert re.search(rf"\b{key}:", example), key
+    TypeAdapter(RecalibrationSection).validate_json(json.dumps(yaml.safe_load(example)["recalibration"]))
+    for section in (RecalibrationSection, RunSection):
+        for key in fields(section):
+            assert re.search(rf"\b{key.name}:", example), key.name
 
 
 def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) -> None:

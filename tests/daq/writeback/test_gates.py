@@ -14,7 +14,8 @@ import pytest
 
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
-from daq.config.policy import AppliedBy, ApplyPolicy, ApplyPolicyModel, HoldOut
+from daq.config.cell_schema import PolicyModel
+from daq.config.policy import AppliedBy, ApplyPolicy, HoldOut
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, exit_code
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read
@@ -485,17 +486,17 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("told", "wanted"),
     [
-        ({}, HoldOut.OPTIONAL),
-        ({"holdout": "required"}, HoldOut.REQUIRED),
-        ({"by": "job"}, HoldOut.REQUIRED),
-        ({"by": "job", "holdout": "required"}, HoldOut.REQUIRED),
+        ({}, False),
+        ({"holdout": "required"}, True),
+        ({"by": "job"}, True),
+        ({"by": "job", "holdout": "required"}, True),
     ],
 )
-def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: HoldOut) -> None:
-    policy = ApplyPolicyModel.model_validate_json(json.dumps(told)).policy
-    assert (policy.holdout, policy.by) == (wanted, AppliedBy(told.get("by", "person")))
+def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: bool) -> None:
+    policy = PolicyModel.model_validate_json(json.dumps({"apply": told})).apply
+    assert (policy.requires_holdout, policy.by) == (wanted, AppliedBy(told.get("by", "person")))
     with pytest.raises(ValueError, match="holdout: required"):
-        ApplyPolicyModel.model_validate_json('{"by": "job", "holdout": "optional"}')
+        PolicyModel.model_validate_json('{"apply": {"by": "job", "holdout": "optional"}}')
 
 
 def test_a_bound_of_an_axis_that_is_not_there_is_refused_with_its_line(tmp_path: Path) -> None:
