@@ -159,7 +159,7 @@ def _refuse_running(damaged: Path) -> None:
         except BlockingIOError as error:
             raise UsageError(
                 str(damaged),
-                found="a recording that is still running",
+                found="a recording that still runs",
                 expected="one whose recorder has ended",
                 remedy="wait for its end, or interrupt it with Ctrl-C, which stops the axes",
             ) from error
