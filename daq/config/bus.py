@@ -1,4 +1,4 @@
-"""A cell as drivers takes it: the address of its bus, or of its buses, and its amplifiers."""
+"""The buses of a cell for `drivers`: addresses, amplifiers, and the load of a recording on each bus."""
 
 from __future__ import annotations
 
@@ -14,32 +14,29 @@ from drivers.canopen.pdo import SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
 from drivers.stream.split_bus import BusPart, CellAddress, SplitAddress
 
-# How much of a CAN bus a recording takes: on average, at worst, and in the cycle in which all axes start.
-
-
 LARGEST_MEAN = 0.80
-"""Of a bus that a recording may take on average. What is left is for repeated frames, SDO, EMCY and other nodes; above
-it frames wait for each other so often that answers come after the next SYNC."""
+"""Largest mean load, as a share of the bus. The rest is for repeated frames, SDO, EMCY and other nodes; above it frames
+wait for each other so often that answers come after the next SYNC."""
 LARGEST_WORST = 1.0
-"""Of a period that SYNC and its answers may take when every frame is as long as stuffing can make it: an answer that
-comes after the next SYNC is late, and makes a run invalid."""
+"""Largest share of a period for SYNC and its answers at maximal bit stuffing: an answer after the next SYNC is late and
+makes a run invalid."""
 STUFFING = 13
-"""Of so many bits that are stuffed, one is doubled on average: positions and currents have runs of equal bits that
-random data have not (which double one in 30). tests/daq/config/test_bus_load.py compares it with real frames."""
+"""Number of bits for each stuff bit on average: positions and currents have longer runs of equal bits than random data,
+where it is 30. tests/daq/config/test_bus_load.py compares it with real frames."""
 MOVES_PER_S = 1.0
 SETPOINTS = 4
-"""Controlwords of an axis in a move: new set-point until acknowledged, taken back until seen; each twice as a rule."""
+"""Controlwords of an axis in a move: new set-point until acknowledged, cleared until confirmed; usually twice each."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """What a recording takes of one bus, as shares of it.
+    """Load of a recording on one bus, as shares of its capacity.
 
     Attributes:
-        mean: SYNC, the answers, heartbeats, and the set-points of a move a second, with usual stuffing.
-        worst: SYNC and the answers alone, of a period, with all the stuffing that can be.
-        start: of a period, of the cycle in which all axes are told to start, with usual stuffing. Above 1 that cycle
-            lasts longer than a period, and answers may be late.
+        mean: SYNC, answers, heartbeats, and the set-points of one move per second, with usual stuffing.
+        worst: SYNC and answers alone, with maximal stuffing.
+        start: the cycle in which all axes start, with usual stuffing. Above 1 it takes longer than a period, and
+            answers may be late.
     """
 
     mean: float
@@ -48,7 +45,7 @@ class BusLoad:
 
     @property
     def allowed(self) -> bool:
-        """Whether a recording may take that."""
+        """Whether a recording may have this load."""
         return self.mean <= LARGEST_MEAN and self.worst <= LARGEST_WORST
 
     def __str__(self) -> str:
@@ -56,37 +53,32 @@ class BusLoad:
 
 
 def frame_bits(data_bytes: int) -> int:
-    """Longest data frame of an 11-bit identifier with so much data, stuff bits and the space after it counted.
+    """Return the bits of the longest data frame with an 11-bit identifier, with stuff bits and interframe space.
 
-    Source: ISO 11898-1; of 34 + 8·d bits that are stuffed, one in four (the first alone needs five) can be doubled.
+    Source: ISO 11898-1; 34 + 8·d bits are stuffed, with at most one stuff bit for four of them (for the first, five).
     """
     stuffed = 34 + 8 * data_bytes
     return stuffed + 13 + (stuffed - 1) // 4
 
 
 def usual_bits(data_bytes: int) -> float:
-    """The same frame with as many stuff bits as a recording's frames have on average."""
+    """Return the bits of such a frame with the average number of stuff bits of a recording."""
     stuffed = 34 + 8 * data_bytes
     return stuffed + 13 + stuffed / STUFFING
 
 
 def answer_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> float:
-    """How long SYNC and one answer of each axis occupy the bus at worst [µs].
-
-    Args:
-        profiles: of the axes, one each.
-        bitrate_bit_s: of the bus.
-    """
+    """Return the longest time for SYNC and one answer of each axis [µs]."""
     return 1e6 * (frame_bits(0) + sum(map(frame_bits, _answers(profiles)))) / bitrate_bit_s
 
 
 def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: int) -> BusLoad:
-    """What a recording takes of a bus.
+    """Compute the load of a recording on a bus.
 
     Args:
-        profiles: of the axes on it, one each.
-        bitrate_bit_s: of the bus.
-        period_us: of SYNC.
+        profiles: drive profiles of the axes on it, one each.
+        bitrate_bit_s: bit rate of the bus.
+        period_us: period of SYNC.
     """
     period_bits = bitrate_bit_s * period_us * 1e-6
     cycle = _cycle_bits(profiles)
@@ -99,17 +91,17 @@ def bus_load(profiles: Sequence[DriveProfile], bitrate_bit_s: int, period_us: in
 
 
 def shortest_period_us(profiles: Sequence[DriveProfile], bitrate_bit_s: int) -> int | None:
-    """The shortest period at which a bus may carry a recording; None where heartbeats and moves alone are too much."""
+    """Return the shortest allowed period; None if heartbeats and moves alone are too much for the bus."""
     left_bits_s = LARGEST_MEAN * bitrate_bit_s - _steady_bits_s(profiles)
     if left_bits_s <= 0:
         return None
     mean_us = 1e6 * _cycle_bits(profiles) / left_bits_s
-    # A period that is exact up to rounding must not be refused by it.
+    # Rounding must not refuse a period that is exactly long enough.
     return ceil(max(mean_us, answer_us(profiles, bitrate_bit_s) / LARGEST_WORST) - 1e-6)
 
 
 def split_answers(profile: DriveProfile) -> bool:
-    """Whether one PDO cannot hold an axis's answer, which then takes two frames."""
+    """Return whether an axis's answer takes two PDOs."""
     return len(pack(_feedback(profile))) > 1
 
 
@@ -125,7 +117,7 @@ _SETPOINT_BYTES = tuple(map(_bytes, SETPOINT_PDOS))
 
 
 def _answers(profiles: Sequence[DriveProfile]) -> tuple[int, ...]:
-    """Bytes of every frame that answers one SYNC."""
+    """Return the data bytes of every frame that answers one SYNC."""
     return tuple(_bytes(pdo) for profile in profiles for pdo in pack(_feedback(profile)))
 
 
@@ -134,24 +126,24 @@ def _cycle_bits(profiles: Sequence[DriveProfile]) -> float:
 
 
 def _steady_bits_s(profiles: Sequence[DriveProfile]) -> float:
-    """Of heartbeats, the recorder's among them, and of set-points, whatever the period is [bit/s]."""
+    """Return the load of heartbeats (also the recorder's) and set-points, independent of the period [bit/s]."""
     heartbeats = (len(profiles) + 1) * usual_bits(1) * 1000.0 / HEARTBEAT_MS
     first, *others = map(usual_bits, _SETPOINT_BYTES)
     return heartbeats + MOVES_PER_S * len(profiles) * (SETPOINTS * first + sum(others))
 
 
 def cell_address(cell: Cell) -> CellAddress:
-    """Where the bus, or the buses, of a cell are.
+    """Return the address of a cell's bus, or of its buses.
 
     Raises:
-        ConfigurationInconsistent: the cell has no bus, it only imports recordings.
+        ConfigurationInconsistent: the cell only imports recordings.
     """
     parts = bus_parts(cell)
     return parts[0].address if len(parts) == 1 else SplitAddress(parts)
 
 
 def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
-    """Each bus of a cell with the nodes that should be on it.
+    """Return each bus of a cell with the nodes that should be on it.
 
     Raises:
         ConfigurationInconsistent: as `cell_address`.
@@ -165,7 +157,7 @@ def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
 
 
 def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:
-    """What a recording takes of each bus; in lockstep, what it would take of a real one."""
+    """Compute the load of a recording on each bus; in lockstep, the load of a real bus."""
     if cell.sync is None:
         return ()
     profiles = [[axis.profile for axis in axes if axis.profile is not None] for _, axes in cell.wiring]
@@ -176,11 +168,11 @@ def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:
 
 
 def load_warnings(cell: Cell) -> tuple[str, ...]:
-    """Buses on which the start of a move does not fit between two SYNCs."""
+    """Warn of buses on which the start of a move does not fit between two SYNCs."""
     if cell.sync is None or cell.sync.pacing is Pacing.LOCKSTEP:
         return ()
     return tuple(
-        f"{bus.name}: when all its axes are told to start, set-points and answers take {100 * load.start:.0f} % of a "
+        f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} % of a "
         "period, and a late answer makes the run invalid; a longer sync.period_us or a second bus has room for them"
         for bus, load in bus_loads(cell)
         if load.start > 1.0
@@ -188,10 +180,10 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
 
 
 def bus_address(cell: Cell) -> BusAddress:
-    """Where the bus of a cell that has one is.
+    """Return the address of the only bus of a cell.
 
     Raises:
-        ConfigurationInconsistent: the cell has none, or several.
+        ConfigurationInconsistent: the cell has no bus, or several.
     """
     if not cell.buses:
         raise _no_bus(cell, "no bus")
@@ -206,10 +198,10 @@ def bus_address(cell: Cell) -> BusAddress:
 
 
 def drive_axes(cell: Cell) -> tuple[Axis, ...]:
-    """The amplifiers of a cell.
+    """Return the amplifiers of a cell.
 
     Raises:
-        ConfigurationInconsistent: an axis has no node, the cell only imports recordings.
+        ConfigurationInconsistent: the cell only imports recordings.
     """
     axes = []
     for axis in cell.axes:

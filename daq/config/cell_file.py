@@ -15,10 +15,9 @@ from daq.config.cell_schema import AxisModel, CellModel, ConditioningModel, Payl
 from daq.config.checks import check
 from daq.config.clearance import clearance_of
 from daq.config.drive import drive_from_text
-from daq.config.policy import max_change_faults
-from daq.config.yaml_file import describe, parse_yaml, read_bytes, read_model
+from daq.config.yaml_file import parse_yaml, read_bytes, read_model
 from daq.environment import shipped_configurations
-from daq.errors import ConfigurationInconsistent, ConfigurationMissing
+from daq.errors import ConfigurationMissing
 from drivers.profiles.profile import DriveProfile, Identity, TapPoint
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import LINK_PARAMETERS
@@ -71,8 +70,6 @@ def cell_from_bundle(
         for member in (f"{DRIVES}{drive}.yaml",)
     }
     check(document, model, urdf, profiles)
-    if faults := list(max_change_faults(model.policy.apply, [axis.name for axis in model.axes])):
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
         name=model.name,

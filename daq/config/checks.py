@@ -1,4 +1,4 @@
-"""What is wrong with a cell although each of its values is well-formed."""
+"""Find contradictions in a cell file of well-formed values: robot, drive train, axes, buses, SYNC, payloads."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, Pacing, j
 from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
 from daq.config.controller import controller_faults
+from daq.config.policy import max_change_faults
 from daq.config.yaml_file import Document, Fault, Location, describe
 from daq.errors import ConfigurationInconsistent
 from daq.writeback.signature import public_keys
@@ -22,313 +23,10 @@ from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, robot_from_urdf
 
-# What is wrong with an axis, seen beside the joint of the URDF that it moves.
-
-
-@dataclass(frozen=True, slots=True)
-class Plausible:
-    """Positions that a joint can have, in its unit.
-
-    Attributes:
-        farthest, too_far: largest position, and what a larger one most likely is.
-        shortest, too_short: smallest range, and what a smaller one most likely is.
-    """
-
-    farthest: float
-    too_far: str
-    shortest: float
-    too_short: str
-
-
-_PLAUSIBLE = {
-    DEGREE: Plausible(720.0, "counts or motor degrees", 0.2, "revolutions"),
-    MILLIMETRE: Plausible(100_000.0, "counts or µm", 5.0, "m"),
-}
-
-
-def axis_faults(model: CellModel, joints: Sequence[Joint], urdf: str) -> Iterator[Fault]:
-    """Every axis that contradicts itself or its joint.
-
-    Args:
-        model: the cell file.
-        joints: of its robot; none where that could not be read.
-        urdf: text of the robot.
-    """
-    si_limits = _urdf_limits(urdf)
-    for index, axis in enumerate(model.axes):
-        path: Location = ("axes", index)
-        if index < len(joints):
-            yield from _kind_faults(path, axis, joints[index])
-        in_si = si_limits[index] if index < len(si_limits) else None
-        yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis, in_si)
-        for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
-            farthest = _PLAUSIBLE[unit].farthest
-            if offset is not None and abs(offset) > farthest:
-                yield Fault((*path, f"zero_offset_{unit.name}"), f"{offset:g}", f"at most ±{farthest:g} {unit.name}")
-    yield from _gain_faults(model, joints)
-    yield from _standstill_faults(model, joints)
-
-
-def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Fault]:
-    """Degrees for a revolute joint, mm for a prismatic one."""
-    unit, written = joint_unit(joint.kind), axis.limits.unit
-    what = f"joint {joint.name} of the URDF is {joint.kind.value}"
-    if written is not unit:
-        name = unit.name
-        yield Fault(
-            (*path, "limits"),
-            f"limits in {written.name}, and {what}",
-            f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
-        )
-    offsets = ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm))
-    for other, offset in offsets:
-        if offset is not None and other is not unit:
-            yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
-    if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
-        yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint moves so far a turn")
-
-
-def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
-    try:
-        gained = gain_joints(ratio_of(model))
-    except ValueError:
-        gained = ()  # the drive train is refused elsewhere
-    for index, axis in enumerate(model.axes):
-        gains = {
-            "nameplate_gain": axis.nameplate_gain,
-            "nameplate_gain_nm_per_a": axis.nameplate_gain_nm_per_a,
-            "nameplate_gain_n_per_a": axis.nameplate_gain_n_per_a,
-        }
-        key, value = next((key, value) for key, value in gains.items() if value is not None)
-        if not value:
-            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
-        if index >= len(gained) or gained[index] >= len(joints):
-            continue
-        joint = joints[gained[index]]
-        force = joint_unit(joint.kind).force
-        written = {"nameplate_gain_nm_per_a": "Nm", "nameplate_gain_n_per_a": "N"}.get(key)
-        if written is None:
-            key, written = "gain_unit", (axis.gain_unit or "").partition("/")[0].strip()
-        if written in {"Nm", "N"} and written != force:
-            yield Fault(
-                ("axes", index, key),
-                f"a gain in {written}, and it acts on joint {joint.name}, which is {joint.kind.value}",
-                f"{force} per unit of the current reference",
-            )
-
-
-def _limit_faults(path: Location, axis: AxisModel, in_si: tuple[float, float] | None) -> Iterator[Fault]:
-    (lower, upper), unit = axis.limits.position, axis.limits.unit
-    plausible = _PLAUSIBLE[unit]
-    found = f"[{lower:g}, {upper:g}] {unit.name}"
-    if lower >= upper:
-        yield Fault(path, found, "the lower limit first")
-    elif max(abs(lower), abs(upper)) > plausible.farthest:
-        yield Fault(path, found, f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?")
-    elif upper - lower < plausible.shortest:
-        yield Fault(
-            path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
-        )
-    elif in_si is not None and in_si[0] < in_si[1]:
-        tolerance = 0.1 * (in_si[1] - in_si[0])
-        if abs(lower - in_si[0]) < tolerance and abs(upper - in_si[1]) < tolerance:
-            remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
-            yield Fault(path, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
-
-
-def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
-    """One speed for each axis, in the list of its unit; without a prismatic axis the other list is left out."""
-    n = len(model.axes)
-    lists = {
-        "standstill_rad_s": model.conditioning.standstill_rad_s,
-        "standstill_mm_s": model.conditioning.standstill_mm_s,
-    }
-    prismatic = [joint.kind is JointKind.PRISMATIC for joint in joints] or [
-        axis.limits.unit is MILLIMETRE for axis in model.axes
-    ]
-    needed = {"standstill_rad_s": not all(prismatic), "standstill_mm_s": any(prismatic)}
-    complete = True
-    for key, speeds in lists.items():
-        if len(speeds) != n and (speeds or needed[key]):
-            complete = False
-            yield Fault(
-                ("conditioning", key), f"{len(speeds)} speeds", f"{n}, one for each axis (null in the other list)"
-            )
-    if not complete:
-        return
-    for index, along in enumerate(prismatic[:n]):
-        for key, speeds in lists.items():
-            wanted = along == (key == "standstill_mm_s")
-            if speeds and (speeds[index] is not None) != wanted:
-                kind = JointKind.PRISMATIC if along else JointKind.REVOLUTE
-                found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
-                yield Fault(
-                    ("conditioning", key, index), found, "a speed" if wanted else "null, it is in the other list"
-                )
-
-
-def _urdf_limits(urdf: str) -> list[tuple[float, float] | None]:
-    """Limits of the moving joints as the URDF writes them [rad or m], in document order; [] when it cannot be read."""
-    try:
-        joints = ElementTree.fromstring(urdf).iter("joint")
-        limits: list[tuple[float, float] | None] = []
-        for joint in joints:
-            if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
-                continue
-            limit = joint.find("limit")
-            if limit is None or joint.get("type") == "continuous":
-                limits.append(None)
-            else:
-                limits.append((float(limit.get("lower", "0")), float(limit.get("upper", "0"))))
-    except (ElementTree.ParseError, ValueError):
-        return []
-    return limits
-
-
-# What is wrong with the buses of a cell: their wiring, their sampling, and how much they have to carry.
-
-
-SIMULATED_INTERFACES = ("virtual", "socketcand")
-"""Buses on which a simulated cell can be; every other one may have a machine on it."""
-
-
-def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    """Everything that is wrong with buses and sampling.
-
-    Args:
-        model: the cell.
-        profiles: of its drives, by name.
-    """
-    yield from _wiring_faults(model)
-    if not model.buses:
-        return
-    if model.sync is None:
-        yield Fault(("sync",), "nothing", "a sampling period, because the cell has a bus")
-        return
-    if len(model.buses) > 1 and model.sync.producer != RECORDER:
-        expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
-        yield Fault(("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected)
-    yield from _refresh_faults(model, model.sync.period_us, profiles)
-    for index, bus in enumerate(model.buses):
-        if model.sync.pacing is Pacing.TIMED:
-            yield from _load_faults(model, model.sync.period_us, bus, profiles)
-        elif bus.interface not in SIMULATED_INTERFACES:
-            yield Fault(
-                ("sync", "pacing"),
-                f"lockstep on a bus of interface {bus.interface}",
-                f"timed: lockstep makes the time of the samples up, which is true of a simulated cell "
-                f"({' or '.join(SIMULATED_INTERFACES)}) alone",
-            )
-        for other in model.buses[:index]:
-            if _where(bus) == _where(other):
-                yield Fault(
-                    _path(model, index),
-                    f"{bus.interface} {bus.channel}, which bus {other.name} is too",
-                    "another channel: two buses are two wires and two interfaces",
-                )
-
-
-def _wiring_faults(model: CellModel) -> Iterator[Fault]:
-    names = [bus.name for bus in model.buses]
-    for index, name in enumerate(names):
-        if names.count(name) > 1:
-            yield Fault(("bus", index, "name"), f"{name}, used {names.count(name)} times", "each name once")
-        if names.index(name) == index and not any(model.bus_of(axis) == name for axis in model.axes):
-            yield Fault(_path(model, index), f"bus {name} without an axis", "an axis with this `bus`, or no such bus")
-    used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
-    for index, axis in enumerate(model.axes):
-        if model.buses:
-            for key in ("node_id", "drive", "identity", "counts_per_revolution"):
-                if getattr(axis, key) is None:
-                    yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
-        where, known = ("axes", index, "bus"), ", ".join(names)
-        if model.bus_of(axis) is None and len(names) > 1:
-            yield Fault(where, "nothing", f"the bus of its amplifier, because the cell has several: {known}")
-        elif axis.bus is not None and axis.bus not in names:
-            yield Fault(where, f"{axis.bus}, which is no bus of this cell", f"one of {known}" if names else "no `bus`")
-        if axis.node_id is None:
-            continue
-        if not 1 <= axis.node_id <= 127:
-            yield Fault(("axes", index, "node_id"), str(axis.node_id), "1 to 127 (CiA 301)")
-        if used[axis.node_id] > 1:
-            several = ", on all buses together: a frame is known by its node id alone" if len(names) > 1 else ""
-            found = f"{axis.node_id}, used {used[axis.node_id]} times"
-            yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
-
-
-def _refresh_faults(model: CellModel, period_us: int, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    for drive in model.drives:
-        refresh_us = profiles[drive].update_period_us
-        if refresh_us > period_us:
-            yield Fault(
-                ("sync", "period_us"),
-                f"{period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
-                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
-            )
-
-
-def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    """In lockstep the next SYNC waits for the answers, however long they take; a timed one does not."""
-    used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None and model.bus_of(axis) == bus.name]
-    load = bus_load(used, bus.bitrate_bit_s, period_us)
-    if load.allowed:
-        return
-    shortest = shortest_period_us(used, bus.bitrate_bit_s)
-    ways = ["a faster bus" if shortest is None else f"{shortest} or more"]
-    if len(used) > 1:
-        ways.append("the axes on more buses (`bus` as a list)")
-    wide = sorted({profile.name for profile in used if split_answers(profile)})
-    if wide:
-        ways.append(f"position, current and statusword in one frame (drive {', '.join(wide)} needs two)")
-    yield Fault(
-        ("sync", "period_us"),
-        f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load bus {bus.name} "
-        f"by {load} at {bus.bitrate_bit_s} bit/s",
-        f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs at worst: "
-        + ", or ".join(ways),
-    )
-
-
-def _where(bus: Bus) -> tuple[str | int, ...]:
-    hub = (bus.host, bus.port) if bus.interface == "socketcand" else ()
-    return (bus.interface, bus.channel, *hub)
-
-
-def _path(model: CellModel, index: int) -> Location:
-    return ("bus", index) if isinstance(model.bus, tuple) else ("bus",)
-
-
-# What is wrong with who shall send SYNC.
-
-
-KERNEL_INTERFACE = "socketcan"
-
-
-def producer_faults(model: CellModel) -> Iterator[Fault]:
-    """A producer that there is not, or that cannot pace this bus."""
-    if model.sync is None or model.sync.producer == RECORDER:
-        return
-    path, producer = ("sync", "producer"), model.sync.producer
-    interfaces = [bus.interface for bus in model.buses]
-    if len(interfaces) > 1:
-        expected = f"{RECORDER}: nobody else sends SYNC on several buses at once"
-        yield Fault(path, f"{producer} with {len(interfaces)} buses", expected)
-    if model.sync.pacing is Pacing.LOCKSTEP:
-        expected = f"{RECORDER}, or pacing timed: in lockstep the next SYNC waits for the answers"
-        yield Fault(path, f"{producer} with pacing lockstep", expected)
-    if producer == KERNEL:
-        if set(interfaces) != {KERNEL_INTERFACE}:
-            expected = f"a bus of interface {KERNEL_INTERFACE}, whose broadcast manager sends it"
-            yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
-    elif producer not in (names := [axis.name for axis in model.axes]):
-        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(names)})")
-
-
 LARGEST_CONDITION = 1e8
-"""Of R; above it, joint positions cannot be told from motor positions."""
-
+"""Largest condition number of R; above it, joint positions do not follow from motor positions."""
 LARGEST_TOLERANCE = 0.1
-"""Of a payload's mass: a wrong weight scales all gains alike."""
+"""Largest tolerance, as a share of the payload's mass: a wrong weight scales all gains alike."""
 
 
 def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile]) -> None:
@@ -336,29 +34,31 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
 
     Args:
         document: the cell file, for the lines.
-        model: what it says.
+        model: its content.
         urdf: text of its robot.
-        profiles: of its drives, by name.
+        profiles: drive profiles, by name.
 
     Raises:
         ConfigurationInconsistent: with every contradiction and its line.
     """
     joints, faults = _robot(model, urdf)
+    names = [axis.name for axis in model.axes]
     faults += [
         *_ratio_faults(model),
-        *bus_faults(model, profiles),
-        *producer_faults(model),
-        *axis_faults(model, joints, urdf),
+        *_bus_faults(model, profiles),
+        *_producer_faults(model),
+        *_axis_faults(model, joints, urdf),
         *_list_faults(model),
         *_signer_faults(model.policy.apply.signers),
-        *clearance_faults(model.workspace, model.clearance, [axis.name for axis in model.axes]),
+        *clearance_faults(model.workspace, model.clearance, names),
+        *max_change_faults(model.policy.apply, names),
     ]
     if faults:
         raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the cell file")
 
 
 def _robot(model: CellModel, urdf: str) -> tuple[tuple[Joint, ...], list[Fault]]:
-    """The joints of the URDF, none where it cannot be read, and what is wrong with the robot as a whole."""
+    """Return the joints of the URDF, none if it cannot be read, and the faults of the robot as a whole."""
     faults = []
     gravity = hypot(*model.robot.gravity_m_s2)
     if not 9.7 < gravity < 9.9:
@@ -409,13 +109,13 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
             yield Fault(
                 ("payloads", index, "mounting"),
                 f"{payload.mounting}, used {mountings[payload.mounting]} times",
-                "each mounting a name of its own: it stands for one body in one place",
+                "each mounting a name of its own: it denotes one body in one place",
             )
         yield from _inertia_faults(payload, index)
 
 
 def _signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
-    """A key that is none would be found at the first signature only, long after the recording."""
+    """Find malformed public keys now, and not at the first signature, long after the recording."""
     good: dict[str, str] = {}
     for name, line in signers.items():
         try:
@@ -427,7 +127,7 @@ def _signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
-    """No body has an inertia with a moment below zero, or above the sum of the other two."""
+    """Find inertias of no body: a principal moment below zero, or above the sum of the other two."""
     if payload.inertia_kg_m2 is None:
         return
     xx, xy, xz, yy, yz, zz = payload.inertia_kg_m2
@@ -439,3 +139,286 @@ def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
             f"principal moments {least:.4g}, {middle:.4g}, {largest:.4g} kg m²",
             "those of a body about its centre of mass: none below 0, none above the sum of the other two",
         )
+
+
+@dataclass(frozen=True, slots=True)
+class _Plausible:
+    """Positions that a joint can have, in its unit.
+
+    Attributes:
+        farthest, too_far: largest position, and the most likely unit of a larger one.
+        shortest, too_short: smallest range, and the most likely unit of a smaller one.
+    """
+
+    farthest: float
+    too_far: str
+    shortest: float
+    too_short: str
+
+
+_PLAUSIBLE = {
+    DEGREE: _Plausible(720.0, "counts or motor degrees", 0.2, "revolutions"),
+    MILLIMETRE: _Plausible(100_000.0, "counts or µm", 5.0, "m"),
+}
+
+
+def _axis_faults(model: CellModel, joints: Sequence[Joint], urdf: str) -> Iterator[Fault]:
+    """Find axes that contradict themselves or their joint of the URDF."""
+    si_limits = _urdf_limits(urdf)
+    for index, axis in enumerate(model.axes):
+        path: Location = ("axes", index)
+        if index < len(joints):
+            yield from _kind_faults(path, axis, joints[index])
+        in_si = si_limits[index] if index < len(si_limits) else None
+        yield from _limit_faults((*path, "limits", f"position_{axis.limits.unit.name}"), axis, in_si)
+        for unit, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
+            farthest = _PLAUSIBLE[unit].farthest
+            if offset is not None and abs(offset) > farthest:
+                yield Fault((*path, f"zero_offset_{unit.name}"), f"{offset:g}", f"at most ±{farthest:g} {unit.name}")
+    yield from _gain_faults(model, joints)
+    yield from _standstill_faults(model, joints)
+
+
+def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Fault]:
+    """Find degrees for a prismatic joint, and mm for a revolute one."""
+    unit, written = joint_unit(joint.kind), axis.limits.unit
+    what = f"joint {joint.name} of the URDF is {joint.kind.value}"
+    if written is not unit:
+        name = unit.name
+        yield Fault(
+            (*path, "limits"),
+            f"limits in {written.name}, and {what}",
+            f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
+        )
+    offsets = ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm))
+    for other, offset in offsets:
+        if offset is not None and other is not unit:
+            yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
+    if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
+        yield Fault((*path, "lead_mm"), f"a lead, and {what}", "nothing: only a prismatic joint has a lead")
+
+
+def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
+    try:
+        gained = gain_joints(ratio_of(model))
+    except ValueError:
+        gained = ()  # _ratio_faults refuses the drive train
+    for index, axis in enumerate(model.axes):
+        gains = {
+            "nameplate_gain": axis.nameplate_gain,
+            "nameplate_gain_nm_per_a": axis.nameplate_gain_nm_per_a,
+            "nameplate_gain_n_per_a": axis.nameplate_gain_n_per_a,
+        }
+        key, value = next((key, value) for key, value in gains.items() if value is not None)
+        if not value:
+            yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
+        if index >= len(gained) or gained[index] >= len(joints):
+            continue
+        joint = joints[gained[index]]
+        force = joint_unit(joint.kind).force
+        written = {"nameplate_gain_nm_per_a": "Nm", "nameplate_gain_n_per_a": "N"}.get(key)
+        if written is None:
+            key, written = "gain_unit", (axis.gain_unit or "").partition("/")[0].strip()
+        if written in {"Nm", "N"} and written != force:
+            yield Fault(
+                ("axes", index, key),
+                f"a gain in {written}, and it acts on joint {joint.name}, which is {joint.kind.value}",
+                f"{force} per unit of the current reference",
+            )
+
+
+def _limit_faults(path: Location, axis: AxisModel, in_si: tuple[float, float] | None) -> Iterator[Fault]:
+    (lower, upper), unit = axis.limits.position, axis.limits.unit
+    plausible = _PLAUSIBLE[unit]
+    found = f"[{lower:g}, {upper:g}] {unit.name}"
+    if lower >= upper:
+        yield Fault(path, found, "the lower limit first")
+    elif max(abs(lower), abs(upper)) > plausible.farthest:
+        yield Fault(path, found, f"at most ±{plausible.farthest:g} {unit.name}; are these {plausible.too_far}?")
+    elif upper - lower < plausible.shortest:
+        yield Fault(
+            path, found, f"a range of at least {plausible.shortest:g} {unit.name}; are these {plausible.too_short}?"
+        )
+    elif in_si is not None and in_si[0] < in_si[1]:
+        tolerance = 0.1 * (in_si[1] - in_si[0])
+        if abs(lower - in_si[0]) < tolerance and abs(upper - in_si[1]) < tolerance:
+            remedy = f"{unit.name}; multiply by {1.0 / unit.si:.3g}"
+            yield Fault(path, f"{found}, the numbers of the URDF in {unit.si_name}", remedy)
+
+
+def _standstill_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
+    """Check for one speed for each axis, in the list of its unit; without prismatic axes the other list is empty."""
+    n = len(model.axes)
+    lists = {
+        "standstill_rad_s": model.conditioning.standstill_rad_s,
+        "standstill_mm_s": model.conditioning.standstill_mm_s,
+    }
+    prismatic = [joint.kind is JointKind.PRISMATIC for joint in joints] or [
+        axis.limits.unit is MILLIMETRE for axis in model.axes
+    ]
+    needed = {"standstill_rad_s": not all(prismatic), "standstill_mm_s": any(prismatic)}
+    complete = True
+    for key, speeds in lists.items():
+        if len(speeds) != n and (speeds or needed[key]):
+            complete = False
+            yield Fault(
+                ("conditioning", key), f"{len(speeds)} speeds", f"{n}, one for each axis (null in the other list)"
+            )
+    if not complete:
+        return
+    for index, along in enumerate(prismatic[:n]):
+        for key, speeds in lists.items():
+            wanted = along == (key == "standstill_mm_s")
+            if speeds and (speeds[index] is not None) != wanted:
+                kind = JointKind.PRISMATIC if along else JointKind.REVOLUTE
+                found = f"{speeds[index]} for {model.axes[index].name}, which is {kind.value}"
+                yield Fault(
+                    ("conditioning", key, index), found, "a speed" if wanted else "null, it is in the other list"
+                )
+
+
+def _urdf_limits(urdf: str) -> list[tuple[float, float] | None]:
+    """Read the limits of the moving joints from the URDF [rad or m], in document order; [] if it cannot be read."""
+    try:
+        joints = ElementTree.fromstring(urdf).iter("joint")
+        limits: list[tuple[float, float] | None] = []
+        for joint in joints:
+            if joint.get("type") not in {"revolute", "continuous", "prismatic"}:
+                continue
+            limit = joint.find("limit")
+            if limit is None or joint.get("type") == "continuous":
+                limits.append(None)
+            else:
+                limits.append((float(limit.get("lower", "0")), float(limit.get("upper", "0"))))
+    except (ElementTree.ParseError, ValueError):
+        return []
+    return limits
+
+
+SIMULATED_INTERFACES = ("virtual", "socketcand")
+"""Interfaces of simulated cells; any other may have a machine on it."""
+
+
+def _bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
+    """Find faults of the wiring, the sampling and the load of the buses."""
+    yield from _wiring_faults(model)
+    if not model.buses:
+        return
+    if model.sync is None:
+        yield Fault(("sync",), "nothing", "a sampling period, because the cell has a bus")
+        return
+    if len(model.buses) > 1 and model.sync.producer != RECORDER:
+        expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
+        yield Fault(("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected)
+    yield from _refresh_faults(model, model.sync.period_us, profiles)
+    for index, bus in enumerate(model.buses):
+        if model.sync.pacing is Pacing.TIMED:
+            yield from _load_faults(model, model.sync.period_us, bus, profiles)
+        elif bus.interface not in SIMULATED_INTERFACES:
+            yield Fault(
+                ("sync", "pacing"),
+                f"lockstep on a bus of interface {bus.interface}",
+                f"timed: in lockstep the time of the samples is simulated, so only a simulated cell "
+                f"({' or '.join(SIMULATED_INTERFACES)}) may use it",
+            )
+        for other in model.buses[:index]:
+            if _where(bus) == _where(other):
+                yield Fault(
+                    _path(model, index),
+                    f"{bus.interface} {bus.channel}, which bus {other.name} is too",
+                    "another channel: each bus has its own interface",
+                )
+
+
+def _wiring_faults(model: CellModel) -> Iterator[Fault]:
+    names = [bus.name for bus in model.buses]
+    for index, name in enumerate(names):
+        if names.count(name) > 1:
+            yield Fault(("bus", index, "name"), f"{name}, used {names.count(name)} times", "each name once")
+        if names.index(name) == index and not any(model.bus_of(axis) == name for axis in model.axes):
+            yield Fault(_path(model, index), f"bus {name} without an axis", "an axis with this `bus`, or no such bus")
+    used = Counter(axis.node_id for axis in model.axes if axis.node_id is not None)
+    for index, axis in enumerate(model.axes):
+        if model.buses:
+            for key in ("node_id", "drive", "identity", "counts_per_revolution"):
+                if getattr(axis, key) is None:
+                    yield Fault(("axes", index, key), "nothing", "a value, because the cell has a bus")
+        where, known = ("axes", index, "bus"), ", ".join(names)
+        if model.bus_of(axis) is None and len(names) > 1:
+            yield Fault(where, "nothing", f"the bus of its amplifier, because the cell has several: {known}")
+        elif axis.bus is not None and axis.bus not in names:
+            yield Fault(where, f"{axis.bus}, which is no bus of this cell", f"one of {known}" if names else "no `bus`")
+        if axis.node_id is None:
+            continue
+        if not 1 <= axis.node_id <= 127:
+            yield Fault(("axes", index, "node_id"), str(axis.node_id), "1 to 127 (CiA 301)")
+        if used[axis.node_id] > 1:
+            several = ", on all buses together: a frame is known by its node id alone" if len(names) > 1 else ""
+            found = f"{axis.node_id}, used {used[axis.node_id]} times"
+            yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
+
+
+def _refresh_faults(model: CellModel, period_us: int, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
+    for drive in model.drives:
+        refresh_us = profiles[drive].update_period_us
+        if refresh_us > period_us:
+            yield Fault(
+                ("sync", "period_us"),
+                f"{period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
+                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
+            )
+
+
+def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
+    """Find buses that cannot carry a recording. In lockstep any can: the next SYNC waits for the answers."""
+    used = [profiles[axis.drive] for axis in model.axes if axis.drive is not None and model.bus_of(axis) == bus.name]
+    load = bus_load(used, bus.bitrate_bit_s, period_us)
+    if load.allowed:
+        return
+    shortest = shortest_period_us(used, bus.bitrate_bit_s)
+    ways = ["a faster bus" if shortest is None else f"{shortest} or more"]
+    if len(used) > 1:
+        ways.append("the axes on more buses (`bus` as a list)")
+    wide = sorted({profile.name for profile in used if split_answers(profile)})
+    if wide:
+        ways.append(f"position, current and statusword in one frame (drive {', '.join(wide)} needs two)")
+    yield Fault(
+        ("sync", "period_us"),
+        f"{period_us}, with which SYNC, the answers of {len(used)} axes, heartbeats and moves load bus {bus.name} "
+        f"by {load} at {bus.bitrate_bit_s} bit/s",
+        f"at most {100 * LARGEST_MEAN:.0f} % on average and answers that fit between two SYNCs at worst: "
+        + ", or ".join(ways),
+    )
+
+
+def _where(bus: Bus) -> tuple[str | int, ...]:
+    hub = (bus.host, bus.port) if bus.interface == "socketcand" else ()
+    return (bus.interface, bus.channel, *hub)
+
+
+def _path(model: CellModel, index: int) -> Location:
+    return ("bus", index) if isinstance(model.bus, tuple) else ("bus",)
+
+
+KERNEL_INTERFACE = "socketcan"
+"""Only SocketCAN's broadcast manager sends SYNC from the kernel."""
+
+
+def _producer_faults(model: CellModel) -> Iterator[Fault]:
+    """Find a SYNC producer that does not exist, or cannot pace this bus."""
+    if model.sync is None or model.sync.producer == RECORDER:
+        return
+    path, producer = ("sync", "producer"), model.sync.producer
+    interfaces = [bus.interface for bus in model.buses]
+    if len(interfaces) > 1:
+        expected = f"{RECORDER}: no other producer sends SYNC on several buses at once"
+        yield Fault(path, f"{producer} with {len(interfaces)} buses", expected)
+    if model.sync.pacing is Pacing.LOCKSTEP:
+        expected = f"{RECORDER}, or pacing timed: in lockstep the next SYNC waits for the answers"
+        yield Fault(path, f"{producer} with pacing lockstep", expected)
+    if producer == KERNEL:
+        if set(interfaces) != {KERNEL_INTERFACE}:
+            expected = f"a bus of interface {KERNEL_INTERFACE}, whose broadcast manager sends it"
+            yield Fault(path, f"{KERNEL} on {' + '.join(interfaces) or 'no bus'}", expected)
+    elif producer not in (names := [axis.name for axis in model.axes]):
+        yield Fault(path, producer, f"{RECORDER}, {KERNEL}, or an axis ({', '.join(names)})")

@@ -1,4 +1,8 @@
-"""A drive profile file: which objects of an amplifier carry position and current, in which unit, and who says so."""
+"""A drive profile file: the objects of an amplifier with position and current, their units, and the evidence for each.
+
+The classes here differ from those of `drivers.profiles`: an object's type is one word (`i32`), and the keys of a scale
+depend on its form.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_yaml, read_model
+from daq.config.yaml_file import Document, Fault, Positive, StrictModel, describe, parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (
     Amplitude,
@@ -25,7 +29,6 @@ from drivers.profiles.profile import (
 
 Index = Annotated[int, Field(ge=0x1000, le=0xFFFF)]
 Subindex = Annotated[int, Field(ge=0, le=0xFF)]
-Positive = Annotated[float, Field(gt=0)]
 Text = Annotated[str, Field(min_length=1, max_length=400)]
 
 
@@ -37,20 +40,14 @@ class EntryModel(StrictModel):
     type: Literal["i8", "i16", "i32", "i64", "u8", "u16", "u32", "u64"]
 
     def entry(self) -> ObjectEntry:
-        """As drivers takes it."""
+        """Convert to the class of `drivers`."""
         return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
 
 
-class SignalModel(StrictModel):
+class SignalModel(EntryModel):
     """A signal that is mapped into the TPDO: at most 32 bits, because logs hold int32."""
 
-    index: Index
-    subindex: Subindex = 0
     type: Literal["i8", "i16", "i32", "u8", "u16"]
-
-    def entry(self) -> ObjectEntry:
-        """As drivers takes it."""
-        return ObjectEntry(self.index, self.subindex, int(self.type[1:]), signed=self.type[0] == "i")
 
 
 SCALE_KEYS: dict[ScaleForm, frozenset[str]] = {
@@ -61,7 +58,7 @@ SCALE_KEYS: dict[ScaleForm, frozenset[str]] = {
     ScaleForm.DIGITS_OF_REPORTED_PEAK: frozenset({"digits", "peak_current"}),
     ScaleForm.SWITCHED_PER_MILLE: frozenset({"rated_current", "switch"}),
 }
-"""What each form is told by; nothing else, and nothing less."""
+"""Keys of each form, all of them required (but `objects` of a product)."""
 
 
 class ScaleModel(StrictModel):
@@ -89,7 +86,7 @@ class ScaleModel(StrictModel):
         return self
 
     def scale(self) -> CurrentScale | None:
-        """As drivers takes it; None while nobody has entered the peak current."""
+        """Convert to the class of `drivers`; None until the peak current is entered."""
         factor, objects = self.factor, self.objects
         if self.rated_current is not None:
             factor, objects = 1e-6, (self.rated_current,)  # a thousandth of so many mA
@@ -108,7 +105,7 @@ class ScaleModel(StrictModel):
 
 
 class RatedModel(StrictModel):
-    """The motor's name plate in the drive."""
+    """Objects with the motor's rated values."""
 
     current: EntryModel
     ampere_per_unit: Positive = 1e-3
@@ -116,13 +113,13 @@ class RatedModel(StrictModel):
     newton_metre_per_unit: Positive = 1e-3
 
     def rated(self) -> RatedMotor:
-        """As drivers takes it."""
+        """Convert to the class of `drivers`."""
         torque = None if self.torque is None else self.torque.entry()
         return RatedMotor(self.current.entry(), self.ampere_per_unit, torque, self.newton_metre_per_unit)
 
 
 class SaveModel(StrictModel):
-    """How the drive is told to keep its parameters."""
+    """Command with which the drive stores its parameters."""
 
     index: Index = 0x1010
     subindex: Subindex
@@ -130,19 +127,19 @@ class SaveModel(StrictModel):
     mapping: Mapping
 
     def save(self) -> Save:
-        """As drivers takes it."""
+        """Convert to the class of `drivers`."""
         return Save(ObjectEntry(self.index, self.subindex, 32, signed=False), self.signature, self.mapping)
 
 
 class FactModel(StrictModel):
-    """What a fact rests on."""
+    """Evidence for a fact."""
 
     basis: Basis
     where: Text
 
 
 class FactsModel(StrictModel):
-    """One for each line of a profile that somebody could doubt."""
+    """Evidence for each line of a profile."""
 
     position: FactModel
     current: FactModel
@@ -156,7 +153,7 @@ class FactsModel(StrictModel):
     toggle_bit: FactModel | None = None
 
     def facts(self) -> tuple[Fact, ...]:
-        """As drivers takes them."""
+        """Convert to the class of `drivers`."""
         stated: dict[str, FactModel | None] = {name: getattr(self, name) for name in type(self).model_fields}
         return tuple(Fact(name, fact.basis, fact.where) for name, fact in stated.items() if fact is not None)
 
@@ -172,7 +169,7 @@ class DriveModel(StrictModel):
     tap: TapPoint
     saturation_bit: Annotated[int, Field(ge=0, le=15)] | None = None
     toggle_bit: Literal[8, 14, 15] | None = None
-    """Those that CiA 402 leaves to the maker; the others mean something in profile position mode."""
+    """CiA 402 leaves these bits to the maker; the others have a meaning in profile position mode."""
     update_period_us: Annotated[int, Field(gt=0)]
     rated: RatedModel | None = None
     save: SaveModel | None = None
@@ -190,14 +187,14 @@ class DriveModel(StrictModel):
 
 
 def drive_from_text(text: bytes, name: str) -> DriveProfile:
-    """The profile in the text of a drive file.
+    """Read a drive file.
 
     Args:
-        text: of the file.
-        name: what to call it in messages.
+        text: content of the file.
+        name: name of the file in messages.
 
     Raises:
-        ConfigurationError: the text is not a drive profile, or the peak current of the drive is not entered yet.
+        ConfigurationError: it is not a drive profile, or the peak current of the drive is missing.
     """
     document = parse_yaml(text, name)
     model = read_model(document, DriveModel)
@@ -226,7 +223,7 @@ def _peak_missing(document: Document) -> ConfigurationInconsistent:
     fault = Fault(
         ("current_scale", "peak_current_a"),
         "nothing",
-        "the peak current of this size of drive [A]; the drive has no object that tells it",
+        "the peak current of this size of drive [A]; no object of the drive reports it",
     )
     return ConfigurationInconsistent(
         **describe(document, [fault]),

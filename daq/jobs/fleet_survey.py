@@ -17,7 +17,7 @@ from typing import Any
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, DaqError, LogMissing, LogUnreadable
 from daq.files import open_regular
-from daq.log.message import NAME as READBACK
+from daq.log.metadata import READBACK
 from daq.log.reader import LogHead, LogReader
 from ident.calibration import Calibration, Gain
 

@@ -1,8 +1,8 @@
-"""The records of an MCAP file, every byte under a checksum before it is believed.
+"""Read the records of an MCAP file and the messages in its chunks; every byte is covered by a checksum.
 
-The file may be truncated, bit-flipped or made to harm: every length is compared with what the file can hold before
-memory is taken, and a record is parsed from its own bytes alone. (The `mcap` package's readers follow lengths inside
-records and leave attachments unchecked.)
+The file may be truncated, damaged or malicious: every length is compared with the size of the file before memory is
+allocated, and a record is parsed only from its own bytes. The `mcap` package parses single records here; its readers do
+not serve, because they trust lengths inside records and do not check attachments.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from drivers.stream.sample import CellEvent
 
 MAGIC = b"\x89MCAP0\r\n"
 UNFINISHED = ".part"
-"""Ending of a log that is being written, or whose recorder has died."""
+"""Suffix of a log that is being written, or whose recorder has died."""
 LARGEST_RECORD = 64 * 2**20
-"""Bytes; our chunks hold 200 ms."""
+"""[bytes]; our chunks hold 200 ms."""
 LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
-"""Of the unpacked bytes to those of the file; our logs have 2 to 20. It bounds what a small file can take in memory."""
+"""Largest ratio of unpacked bytes to the size of the file, to bound the memory; our logs have 2 to 20."""
 
 Record = TypeVar("Record", bound=McapRecord)
 _PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
@@ -57,9 +57,9 @@ _PARSERS: tuple[tuple[Opcode, Callable[[ReadDataStream], McapRecord]], ...] = (
 
 
 class RecordFile:
-    """Iterates over the records of the data section; afterwards `sha256` is that of the whole file.
+    """Iterate over the records of the data section; afterwards `sha256` is the digest of the whole file.
 
-    While `unfinished` iterates, everything before `whole_bytes` has been found whole.
+    During `unfinished`, everything before `whole_bytes` is undamaged.
 
     Raises (while iterating):
         LogMissing, LogForeign, LogTruncated, LogCorrupt: with the offset in the file.
@@ -74,14 +74,14 @@ class RecordFile:
         self._zstd = zstandard.ZstdDecompressor()
 
     def __iter__(self) -> Iterator[tuple[int, McapRecord]]:
-        """Offset and record; those that only index others are passed over."""
+        """Yield offset and record, without the records that only index others."""
         yield from self._opened(self._records)
 
     def unfinished(self) -> Iterator[tuple[int, McapRecord]]:
-        """The same of a file whose end is missing or damaged, up to there; the error that it ends with says where.
+        """Yield the records before the damage of a file without a valid end, then raise an error with its place.
 
-        What no end vouches for must stand by itself: chunks and attachments have checksums of their own, an unknown
-        kind of record is damage. A whole data section ends the iteration without an error.
+        Without the end, only the checksums of chunks and attachments remain, and an unknown kind of record is damage.
+        A whole data section ends the iteration without an error.
         """
         yield from self._opened(self._unfinished_records)
 
@@ -189,17 +189,17 @@ class RecordFile:
             str(self.path),
             found=f"{size} bytes without the closing mark" + ("" if good is None else f", whole records up to {good}"),
             expected="a finished log",
-            remedy="the recorder was killed or the copy broke off: copy it again, or `drivegain salvage` what is there",
+            remedy="the recorder was killed or the copy is incomplete: copy it again, or use `drivegain salvage`",
         )
 
     def _check_crc(self, offset: int, what: str, stored: int, computed: int) -> None:
-        # 0 means "not computed" in MCAP; our logs always compute, and without it a flipped bit would pass for data.
+        # 0 means "not computed" in MCAP; our logs always have one, and without it a flipped bit would pass for data.
         if stored == 0 or stored != computed:
             found = "no checksum" if stored == 0 else f"checksum {stored:#010x} and contents of {computed:#010x}"
-            raise self.corrupt(offset, f"{what} with {found}", "contents that fit their checksum")
+            raise self.corrupt(offset, f"{what} with {found}", "contents that match their checksum")
 
     def corrupt(self, offset: int, found: str, expected: str) -> LogCorrupt:
-        """The error for a place of this file."""
+        """Make the error for a place in this file."""
         return LogCorrupt(
             f"{self.path}, byte {offset}",
             found=found,
@@ -208,11 +208,11 @@ class RecordFile:
         )
 
     def foreign(self, found: str, expected: str) -> LogForeign:
-        """The error for MCAP that is no log of a cell."""
+        """Make the error for an MCAP file that is not a log of a cell."""
         return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
 
     def definition(self, offset: int, opcode: int, body: bytes) -> McapRecord:
-        """A schema or channel that stands inside the chunk at an offset."""
+        """Parse a schema or channel inside the chunk at an offset."""
         if opcode == Opcode.SCHEMA:
             schema: Schema = _parse(Schema.read, body, self, offset)
             return schema
@@ -220,11 +220,11 @@ class RecordFile:
         return channel
 
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
-        """Contents of a chunk.
+        """Decompress a chunk.
 
         Raises:
             LogForeign: another compression than zstd.
-            LogCorrupt: too large, broken, or not what its checksum says.
+            LogCorrupt: too large, broken, or of another checksum.
         """
         size = chunk.uncompressed_size
         if size > LARGEST_CHUNK:
@@ -244,18 +244,18 @@ class RecordFile:
             try:
                 claimed = zstandard.frame_content_size(data)
                 if claimed > size:
-                    raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as it says itself")
+                    raise self.corrupt(offset, f"a chunk that unfolds to {claimed} bytes", f"{size}, as declared")
                 data = self._zstd.decompress(data, max_output_size=size)
             except zstandard.ZstdError as error:
                 raise self.corrupt(offset, f"a broken chunk ({error})", "zstd") from error
         if len(data) != size:
-            raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as it says itself")
+            raise self.corrupt(offset, f"a chunk of {len(data)} bytes", f"{size}, as declared")
         self._check_crc(offset, "chunk", chunk.uncompressed_crc, zlib.crc32(data))
         return data
 
 
 def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFile, offset: int) -> Record:
-    """A record from its own bytes alone."""
+    """Parse a record from its own bytes only."""
     stream = BytesIO(body)
     try:
         return read(ReadDataStream(stream))
@@ -263,20 +263,14 @@ def _parse(read: Callable[[ReadDataStream], Record], body: bytes, file: RecordFi
         raise file.corrupt(offset, f"a broken record ({type(error).__name__})", "an MCAP record") from error
 
 
-# What stands in the chunks of a log: schemas and channels, samples as one array, events one by one.
-
-
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 
 
 class ChunkContents:
-    """Reads one chunk after the other.
-
-    Args:
-        file: that they are in; it names what is wrong.
+    """Reader of chunks, one after the other: schemas and channels, samples as one array, events one by one.
 
     Attributes:
-        events: of all chunks until now, in the order of the log.
+        events: events of all chunks so far, in the order of the log.
     """
 
     def __init__(self, file: RecordFile) -> None:
@@ -286,15 +280,15 @@ class ChunkContents:
         self._channels: dict[int, Channel] = {}
 
     def samples(self, offset: int, data: bytes) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """Samples of a chunk: at once when it holds nothing else, else picked one by one; its events are kept.
+        """Yield the samples of a chunk, all at once if it holds nothing else; its events go to `events`.
 
         Args:
-            offset: of the chunk in the file, for messages.
-            data: what is in it.
+            offset: offset of the chunk in the file, for messages.
+            data: its content.
 
         Raises:
-            LogCorrupt: a record of it is broken.
-            LogForeign: a topic is not what it is in a log of a cell.
+            LogCorrupt: a record is broken.
+            LogForeign: a topic has another type than in a log of a cell.
         """
         start = self._definitions(offset, data)
         if start == len(data):
@@ -312,7 +306,7 @@ class ChunkContents:
         yield from self._mixed(offset, data, start)
 
     def _mixed(self, offset: int, data: bytes, start: int) -> Iterator[tuple[int, NDArray[np.void]]]:
-        """A chunk of events and viewers' topics, or one that another tool has packed anew."""
+        """Yield the samples of a chunk with events and viewers' topics, or repacked by another tool."""
         samples: list[bytes] = []
         while start < len(data):
             opcode, length, channel, _, _, _ = self._message_head(offset, data, start)
@@ -336,7 +330,7 @@ class ChunkContents:
             yield offset, np.frombuffer(b"".join(samples), dtype=dtype)
 
     def _definitions(self, offset: int, data: bytes) -> int:
-        """Take the schemas and channels at the start of a chunk; position of the first message."""
+        """Read the schemas and channels at the start of a chunk; return the position of the first message."""
         start = 0
         while start < len(data) and data[start] != Opcode.MESSAGE:
             end = start + 9 + int.from_bytes(data[start + 1 : start + 9], "little")
@@ -348,10 +342,10 @@ class ChunkContents:
         return start
 
     def define(self, record: McapRecord) -> None:
-        """Take note of a schema or channel.
+        """Register a schema or channel.
 
         Raises:
-            LogForeign: a topic is not what it is in a log of a cell.
+            LogForeign: a topic has another type than in a log of a cell.
         """
         if isinstance(record, Schema):
             self._schemas[record.id] = record
@@ -378,7 +372,7 @@ class ChunkContents:
         return known.topic if known else ""
 
     def _axes(self, offset: int, length: int) -> int:
-        """Number of axes of samples of this length."""
+        """Return the number of axes of samples of this length."""
         for axes in range(1, LARGEST_AXES + 1):
             if sample_dtype(axes).itemsize == 9 + length:
                 return axes

@@ -1,4 +1,4 @@
-"""From raw counts to SI, as late as possible: a log and the cell that it carries become a `Run`."""
+"""Convert a log with its cell to a `Run` in SI."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
-from daq.log.message import Readback
+from daq.log.metadata import Readback
 from daq.log.reader import Log, LossyLogs, SampleBlock, read_log, reports_only_losses
 from drivers.stream.sample import CellEvent, EventKind
 from ident.data.run import Recording, Run
@@ -22,26 +22,24 @@ from ident.model.bodies import Payload
 _LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
 LIMIT_MARGIN = 0.05
-"""Share of a joint's range by which positions may leave its limits."""
+"""Largest excursion beyond the limits, as a share of the joint's range."""
 LARGEST_SATURATED = 0.1
-"""Share of the samples of an axis in which a limit may act; they are masked."""
+"""Largest share of an axis's samples with an active limit; these samples are masked."""
 STEP_TOLERANCE = 0.5
-"""Share of a period by which one time stamp may be nearer to, or further from, the one before.
-
-Half a period is the least that cannot be told from another cycle."""
+"""Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
 RATE_TOLERANCE = 0.01
-"""Relative difference between the rate asked for and the one that the time stamps show."""
+"""Largest relative difference between the requested rate and that of the time stamps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scaling:
-    """From raw numbers to SI.
+    """Factors from raw numbers to SI.
 
     Attributes:
         rad_per_count: motor angle of a count [rad], shape (n,).
         to_joint: R⁻¹, shape (n, n).
         offset_rad: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,).
-        current_per_unit: unit of the current reference (A) for each raw unit, shape (n,).
+        current_per_unit: unit of the current reference (A) per raw unit, shape (n,).
     """
 
     rad_per_count: FloatArray
@@ -50,20 +48,20 @@ class Scaling:
     current_per_unit: FloatArray
 
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
-        """Joint positions [rad, or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)."""
+        """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""
         motor_rad = counts * self.rad_per_count
         return np.asarray(motor_rad @ self.to_joint.T + self.offset_rad, dtype=np.float64)
 
     def joint_position_of(self, counts: tuple[int, ...]) -> list[float]:
-        """The same for one sample, for /joint_states."""
+        """Convert one sample, for /joint_states."""
         return [float(value) for value in self.joint_position(np.array(counts, dtype=np.int64))]
 
 
 def scaling(cell: Cell, readback: Readback) -> Scaling:
-    """The scaling of a cell whose amplifiers answered so.
+    """Return the scaling of a cell with the answers of its amplifiers.
 
     Raises:
-        LogIncomplete: cell and readback differ in their axes, or neither tells what a count is.
+        LogIncomplete: cell and readback have different axes, or neither defines a count.
     """
     names = tuple(axis.name for axis in readback.axes)
     if names != cell.axis_names:
@@ -95,10 +93,9 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
 
 
 def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
-    """Read a log as a run, with the cell that it carries, or with another description of it.
+    """Read a log as a run, with the cell in the log or another description of it.
 
-    Warns of what was saved of an unfinished recording, of losses that were accepted, and of a first run at less than
-    the plan's speed.
+    Warns of a partial log, of accepted losses, and of a first run below the plan's speed.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.
@@ -107,11 +104,11 @@ def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.
     log = read_log(path)
     if log.partial:
         _LOG.warning(
-            "%s is PARTIAL: saved from a recording that was never finished; nothing of it is written back", path
+            "%s is PARTIAL: salvaged from a recording that was never finished; nothing of it is written back", path
         )
     if (speed := log.head.run.speed) < 1.0:
         _LOG.warning(
-            "%s was recorded at %g %% of the plan's speed: a first run tells less of gains and inertias than planned",
+            "%s was recorded at %g %% of the plan's speed: it identifies gains and inertias less well than planned",
             path,
             100.0 * speed,
         )
@@ -123,7 +120,7 @@ def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.
 
 
 def _weighed_again(payload: Payload, cell: Cell) -> Payload:
-    """A payload as another description of the cell has it: who names another cell corrects what the log carries."""
+    """Correct the mass of a payload by another description of the cell."""
     for weighed in cell.payloads:
         if (weighed.name, weighed.mounting) == (payload.name, payload.mounting) and "m" in payload.known:
             return replace(payload, known={**payload.known, "m": weighed.mass_kg})
@@ -136,8 +133,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
     Raises:
         RunInvalid: its recorder marked it invalid.
         CyclesLost: SYNC cycles are missing.
-        ClockImplausible: the time stamps show another rate, or one of them comes early or late.
-        CurrentSaturated: a limit acted in more than a tenth of an axis's samples.
+        ClockImplausible: the time stamps show another rate, or one of them is early or late.
+        CurrentSaturated: a limit was active in more than a tenth of an axis's samples.
         PositionImplausible: positions far outside the joint limits.
         LogIncomplete: cell and log do not belong together.
     """
@@ -155,7 +152,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
             str(log.path),
             found=f"a run that its recorder marked invalid ({log.statistics.reason or 'no reason given'})",
             expected="a valid run",
-            remedy="record it again" + ("; or, to look at it all the same, --accept-losses" if only_losses else ""),
+            remedy="record it again" + ("; or use it anyway with --accept-losses" if only_losses else ""),
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)
@@ -181,7 +178,7 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
 def _recording(log: Log, cell: Cell) -> Recording:
     run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
     return Recording(
-        # An import is told no time and writes that of 1970.
+        # An import knows no time and writes 0.
         recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
         entered_kg=run.entered_kg,
         serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
@@ -193,10 +190,10 @@ def _recording(log: Log, cell: Cell) -> Recording:
 
 
 def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Number of the move that each sample belongs to, shape (k,); None where no move was written down.
+    """Return the number of the move of each sample, shape (k,); None in a log without moves.
 
-    A move lasts until the next one starts, so the standstill between two belongs to the first of them; what comes
-    before the first start belongs to the first move.
+    A move lasts until the next one starts, so the standstill between two moves belongs to the first. Samples before
+    the first start belong to the first move.
     """
     starts = sorted((event.time_ns, event.code) for event in events if event.kind is EventKind.MOVE_START)
     if not starts:
@@ -210,10 +207,10 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
     """Refuse positions that no joint of this cell can have.
 
     Args:
-        name: of the recording, for the message.
+        name: name of the recording in the message.
         position_rad: joint positions [rad; m of a prismatic joint], shape (k, n).
-        cell: with the limits.
-        valid: samples that count, shape (k, n).
+        cell: cell with the limits.
+        valid: samples to check, shape (k, n).
 
     Raises:
         PositionImplausible: a joint is outside its limits by more than 5 % of its range.
@@ -235,10 +232,9 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
 
 
 def unwrapped(counts: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Positions of an encoder counter of 32 bits that may have run over, shape (k, n).
+    """Unwrap the positions of a 32 bit encoder counter, shape (k, n).
 
-    From sample to sample a jump of more than half the range is a wrap: no motor makes 2³¹ counts in one period. The
-    first sample is taken as it is.
+    A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in one period.
     """
     # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
     steps = np.diff(counts.astype(np.int32).view(np.uint32), axis=0).view(np.int32)
@@ -246,20 +242,20 @@ def unwrapped(counts: NDArray[np.int32]) -> NDArray[np.int64]:
 
 
 def _positions(log: Log) -> NDArray[np.int64]:
-    """Motor counts, unwrapped where they are an encoder's and not numbers that an import has scaled, shape (k, n)."""
+    """Return motor counts, unwrapped if they are an encoder's and not scaled by an import, shape (k, n)."""
     counts = log.samples.position_counts
     counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
     return np.where(counter, unwrapped(counts), counts)
 
 
 def _answered(samples: SampleBlock) -> NDArray[np.bool_]:
-    """Whether the axis answered the SYNC, shape (k, n)."""
+    """Return whether each axis answered the SYNC, shape (k, n)."""
     bits = np.arange(samples.position_counts.shape[1], dtype=np.uint32)
     return np.asarray((samples.missing[:, None] >> bits & 1) == 0, dtype=np.bool_)
 
 
 def _saturated(samples: SampleBlock, cell: Cell) -> NDArray[np.bool_]:
-    """Whether the amplifier says that a limit acts (6041h, bit of its profile), shape (k, n)."""
+    """Return whether the amplifier reports an active limit (6041h, bit of its profile), shape (k, n)."""
     bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
     masks = np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16)
     return np.asarray((samples.statusword & masks) != 0, dtype=np.bool_)
@@ -271,7 +267,7 @@ def _check_saturation(name: str, samples: SampleBlock, cell: Cell) -> None:
     if share[worst] > LARGEST_SATURATED:
         raise CurrentSaturated(
             f"{name}, axis {cell.axes[worst].name}",
-            found=f"a limit acting in {100.0 * share[worst]:.1f} % of the samples",
+            found=f"a limit active in {100.0 * share[worst]:.1f} % of the samples",
             expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
             remedy="plan slower moves, or a smaller payload",
         )
@@ -297,13 +293,13 @@ def _check_cycles(log: Log, rate_hz: float) -> None:
         raise ClockImplausible(
             str(log.path),
             found=f"time stamps at {stamped_hz:.6g} Hz",
-            expected=f"{rate_hz:.6g} Hz, as asked for",
+            expected=f"{rate_hz:.6g} Hz, as requested",
             remedy="was the computer's clock set during the run? record it again",
         )
 
 
 def _check_steps(log: Log, rate_hz: float) -> None:
-    """Every SYNC in its time: central differences take the samples as evenly spaced."""
+    """Refuse uneven time steps: central differences assume evenly spaced samples."""
     cycle, period_ns = log.samples.cycle, 1e9 / rate_hz
     step_ns = np.diff(log.samples.time_ns)
     off = np.abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns

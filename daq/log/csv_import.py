@@ -24,8 +24,7 @@ from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import ImportDescription, PositionUnit, Side, Table, load_import
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
 from daq.log.conversion import check_limits, scaling
-from daq.log.message import AxisReadback, Readback
-from daq.log.metadata import RunInfo, RunStatistics
+from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics
 from daq.log.writer import LogContent, LogWriter
 from drivers.stream.sample import Sample
 from ident.model.bodies import Payload

@@ -1,4 +1,4 @@
-"""A log as a table for other programs: a row a SYNC, columns in SI beside the raw numbers; in bounded memory."""
+"""Export a log as a table for other programs: one row for each SYNC, with SI and raw columns, in bounded memory."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 import os
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from importlib.util import find_spec
@@ -24,12 +24,12 @@ from daq.log.reader import LogReader, SampleBlock
 from drivers.stream.sample import CellEvent
 
 Columns = dict[str, NDArray[Any]]
-"""Columns of the same length by name, in their order."""
+"""Columns of equal length by name, in order."""
 Write = Callable[[Columns], None]
 
 
 class TableFormat(Enum):
-    """Kind of file; the value is what people call it."""
+    """Format of the table."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -37,13 +37,13 @@ class TableFormat(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written.
+    """Result of an export.
 
     Attributes:
-        columns: their names.
-        rows: how many.
+        columns: names of the columns.
+        rows: number of rows.
         partial: the log was never finished.
-        valid: its recorder found no loss; what it found else is in `reason`.
+        valid: whether the recorder marked the run valid.
         reason: why not.
     """
 
@@ -55,10 +55,10 @@ class Exported:
 
 
 def require_format(kind: TableFormat) -> None:
-    """Say at once that the package for a format is missing.
+    """Check that the package for a format is installed.
 
     Raises:
-        ConfigurationMissing: with the extra to install.
+        ConfigurationMissing: it is not; the message names the extra to install.
     """
     if kind is TableFormat.PARQUET and find_spec("pyarrow") is None:
         raise ConfigurationMissing(
@@ -70,18 +70,18 @@ def require_format(kind: TableFormat) -> None:
 
 
 def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
-    """Write all samples of a log into a table; the file appears when it is whole.
+    """Write all samples of a log to a table; the file appears when it is whole.
 
     Args:
-        log: to read.
-        out: to write; must not exist.
-        kind: of file.
+        log: log to read.
+        out: file to write; must not exist.
+        kind: format of the file.
 
     Raises:
-        UsageError: there is a file of that name.
+        UsageError: a file of that name exists.
         OutputFailed: the file system refuses.
         ConfigurationMissing: the package for the format is missing.
-        LogUnreadable: the log is damaged or lacks what makes it one; nothing is written then.
+        LogUnreadable: the log is damaged or incomplete; nothing is written.
     """
     require_format(kind)
     if out.exists():
@@ -115,12 +115,12 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
 
 
 def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iterator[Columns]:
-    """The samples as columns, a block at a time.
+    """Convert the samples to columns, a block at a time.
 
     Args:
-        reader: of the log, not yet iterated over.
-        cell: of the log.
-        events: of the whole log, for the numbers of the moves.
+        reader: reader of the log, not yet iterated over.
+        cell: cell of the log.
+        events: events of the whole log, for the numbers of the moves.
 
     Raises:
         LogUnreadable: the log is damaged, or cell and log do not belong together.
@@ -141,7 +141,7 @@ def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iter
 
 
 def _continued(last: tuple[NDArray[np.int32], NDArray[np.int64]], counts: NDArray[np.int32]) -> NDArray[np.int64]:
-    """As daq.conversion.unwrapped, from where the block before ended: counter and unwrapped count, shape (n,)."""
+    """Continue `daq.log.conversion.unwrapped` from the last counter and unwrapped count, shape (n,) each."""
     all_counts = np.concatenate((last[0][None, :], counts)).astype(np.int32)
     steps = np.diff(all_counts.view(np.uint32), axis=0).view(np.int32)
     return np.asarray(last[1] + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
@@ -176,15 +176,10 @@ def _columns(
     return columns
 
 
-class _Csv(AbstractContextManager[Write]):
-    """Comma, point, a header, lines that end with LF (RFC 4180 but for the end of line)."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Write:
-        stream = self._stack.enter_context(self._path.open("w", encoding="utf-8", newline="\n"))
+@contextmanager
+def _csv(path: Path) -> Iterator[Write]:
+    """Write a header and rows with comma, decimal point and LF (RFC 4180 except for the end of line)."""
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
         begun = False
 
         def write(columns: Columns) -> None:
@@ -196,39 +191,29 @@ class _Csv(AbstractContextManager[Write]):
             texts = [map(repr, column.tolist()) for column in columns.values()]
             stream.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
 
-        return write
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+        yield write
 
 
-class _Parquet(AbstractContextManager[Write]):
-    """A row group a block, compressed by zstandard."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Write:
-        arrow: Any = importlib.import_module("pyarrow")
-        parquet: Any = importlib.import_module("pyarrow.parquet")
-        stream = self._stack.enter_context(self._path.open("wb"))
+@contextmanager
+def _parquet(path: Path) -> Iterator[Write]:
+    """Write a row group for each block, compressed by zstandard."""
+    arrow: Any = importlib.import_module("pyarrow")
+    parquet: Any = importlib.import_module("pyarrow.parquet")
+    with ExitStack() as stack:
+        stream = stack.enter_context(path.open("wb"))
         writer: Any = None
 
         def write(columns: Columns) -> None:
             nonlocal writer
             table = arrow.table({name: np.ascontiguousarray(column) for name, column in columns.items()})
             if writer is None:
-                writer = self._stack.enter_context(parquet.ParquetWriter(stream, table.schema, compression="zstd"))
+                writer = stack.enter_context(parquet.ParquetWriter(stream, table.schema, compression="zstd"))
             writer.write_table(table)
 
-        return write
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
+        yield write
 
 
 _WRITERS: dict[TableFormat, Callable[[Path], AbstractContextManager[Write]]] = {
-    TableFormat.CSV: _Csv,
-    TableFormat.PARQUET: _Parquet,
+    TableFormat.CSV: _csv,
+    TableFormat.PARQUET: _parquet,
 }

@@ -1,19 +1,15 @@
-"""The messages of a log: their definitions, and their CDR bytes.
+"""The messages of a log: their ROS 2 definitions and their CDR bytes.
 
 CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to its own size, counted
-from behind the encapsulation. A sequence is its length and its elements, a string ends with NUL and counts it. With the
-number of axes fixed, an AxisSamples message has a constant size, so numpy reads a chunk of them at once.
+from behind the encapsulation. A sequence is its length and its elements; a string ends with NUL, which counts. With a
+given number of axes an AxisSamples message has a constant size, so numpy reads a chunk of them at once.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import struct
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,7 +19,7 @@ SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/j
 SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
 JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
 LARGEST_AXES = 32
-"""As many as bits in `missing`."""
+"""Number of bits in `missing`."""
 
 _SEPARATOR = "=" * 80 + "\n"
 _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -66,13 +62,17 @@ WHOLE_CELL = -1
 
 
 def sample_struct(axes: int) -> struct.Struct:
-    """Layout of an AxisSamples message of so many axes, encapsulation first."""
+    """Return the layout of an AxisSamples message, encapsulation first."""
     padding = "2x" if axes % 2 else ""  # uint16[] of odd length leaves `missing` unaligned
     return struct.Struct(f"<4sQiII{axes}iI{axes}iI{axes}H{padding}I")
 
 
 def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
-    """CDR of one sample; struct.error when a value does not fit its type, or the axes not the layout."""
+    """Encode one sample.
+
+    Raises:
+        struct.error: a value does not fit its type, or the number of axes the layout.
+    """
     axes = len(sample.position_counts)
     seconds, nanoseconds = divmod(sample.time_ns, 1_000_000_000)
     return layout.pack(
@@ -92,7 +92,7 @@ def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
 
 @functools.cache
 def sample_dtype(axes: int) -> np.dtype[np.void]:
-    """A whole MCAP message record (opcode, length, 22 bytes of message header) of an AxisSamples message, for numpy."""
+    """Return the numpy type of an MCAP record (opcode, length, 22 bytes of header) with an AxisSamples message."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
         ("opcode", "u1"),
         ("length", "<u8"),
@@ -121,7 +121,7 @@ ENCAPSULATION_WORD = int.from_bytes(_ENCAPSULATION, "little")
 
 
 def event_bytes(event: CellEvent) -> bytes:
-    """CDR of one event."""
+    """Encode one event."""
     seconds, nanoseconds = divmod(event.time_ns, 1_000_000_000)
     axis = WHOLE_CELL if event.axis is None else event.axis
     head = _EVENT.pack(_ENCAPSULATION, seconds, nanoseconds, axis)
@@ -130,10 +130,10 @@ def event_bytes(event: CellEvent) -> bytes:
 
 
 def event_from_bytes(data: bytes) -> CellEvent:
-    """The event in some CDR.
+    """Decode one event.
 
     Raises:
-        ValueError, struct.error: the bytes are no CellEvent of this software.
+        ValueError, struct.error: the bytes are not a CellEvent of this software.
     """
     head, seconds, nanoseconds, axis = _EVENT.unpack_from(data)
     if head != _ENCAPSULATION:
@@ -154,7 +154,7 @@ def _string(text: str) -> bytes:
 
 
 def _string_from(data: bytes, start: int) -> tuple[str, int]:
-    """A string and the position behind it."""
+    """Decode a string; return it with the position behind it."""
     (length,) = struct.unpack_from("<I", data, start)
     end = start + 4 + length
     text = data[start + 4 : end]
@@ -164,7 +164,7 @@ def _string_from(data: bytes, start: int) -> tuple[str, int]:
 
 
 def joint_state_prefix(names: Sequence[str]) -> bytes:
-    """What every JointState of these joints has between its stamp and its positions."""
+    """Encode the fields of a JointState between its stamp and its positions: they are the same for every message."""
     data = bytearray(struct.pack("<I", 1) + b"\0")  # empty frame_id
     for word in (None, *(name.encode() + b"\0" for name in names)):
         data += b"\0" * (-len(data) % 4)  # the stamp before it is 8 bytes long, so alignment counts from here too
@@ -173,95 +173,9 @@ def joint_state_prefix(names: Sequence[str]) -> bytes:
 
 
 def joint_state_bytes(prefix: bytes, time_ns: int, position: Sequence[float]) -> bytes:
-    """CDR of a JointState with positions [rad] alone."""
+    """Encode a JointState with positions [rad] only."""
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     data = bytearray(struct.pack("<iI", seconds, nanoseconds) + prefix)
     data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(position))
     data += b"\0" * (-len(data) % 8) + struct.pack(f"<{len(position)}d", *position)
     return _ENCAPSULATION + bytes(data) + struct.pack("<II", 0, 0)
-
-
-# What the amplifiers themselves said when a recording started; without it raw numbers have no unit.
-
-
-NAME = "readback.json"
-
-
-@dataclass(frozen=True, slots=True)
-class AxisReadback:
-    """Of one axis.
-
-    Attributes:
-        name: of the axis.
-        current_per_unit: unit of the reference (A) for each raw unit, from the profile's formula and objects.
-        position_rad_per_count: motor angle of a count [rad]; None for 2π over the cell's counts a revolution.
-        drive: all that the amplifier said about itself: identity, serial number, rated current, PDO mapping.
-    """
-
-    name: str
-    current_per_unit: float
-    position_rad_per_count: float | None = None
-    drive: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Readback:
-    """Of all axes, in their order."""
-
-    axes: tuple[AxisReadback, ...]
-
-
-def readback_of_drives(names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]) -> Readback:
-    """The readback of a network that has been prepared.
-
-    Args:
-        names: of the axes, in their order.
-        ampere_per_unit: as drivers.network.CanopenNetwork.ampere_per_unit() gives it.
-        answers: as its readback() gives it, by axis name.
-    """
-    return Readback(
-        tuple(
-            AxisReadback(name, scale, drive=dict(answers[name]))
-            for name, scale in zip(names, ampere_per_unit, strict=True)
-        )
-    )
-
-
-def readback_bytes(readback: Readback) -> bytes:
-    """The attachment."""
-    return json.dumps(asdict(readback), indent=1).encode()
-
-
-def readback_from_bytes(data: bytes) -> Readback:
-    """What `readback_bytes` wrote.
-
-    Raises:
-        ValueError: it is something else.
-    """
-    try:
-        tree = json.loads(data)
-    except RecursionError as error:
-        raise ValueError("nested too deep") from error
-    axes = tree.get("axes") if isinstance(tree, dict) else None
-    if not isinstance(axes, list) or not axes:
-        raise ValueError("no list of axes")
-    return Readback(tuple(_axis(axis) for axis in axes))
-
-
-def _axis(tree: Any) -> AxisReadback:
-    tree = tree if isinstance(tree, dict) else {}
-    name, drive, angle = tree.get("name"), tree.get("drive", {}), tree.get("position_rad_per_count")
-    if not (isinstance(name, str) and isinstance(drive, dict)):
-        raise ValueError(f"axis {name!r}: name or drive")  # noqa: TRY004 - one kind of error for a foreign attachment
-    return AxisReadback(
-        name=name,
-        current_per_unit=_quantum(name, "current_per_unit", tree.get("current_per_unit")),
-        position_rad_per_count=None if angle is None else _quantum(name, "position_rad_per_count", angle),
-        drive=drive,
-    )
-
-
-def _quantum(name: str, key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= sys.float_info.max:
-        raise ValueError(f"axis {name!r}: {key} is {value!r:.40}, expected a positive number")
-    return float(value)

@@ -1,27 +1,30 @@
-"""Who recorded what, with which load, and how it went: the metadata of a log."""
+"""Metadata and readback of a log: how it was recorded, the answers of the amplifiers, and the outcome."""
 
 from __future__ import annotations
 
 import json
 import math
+import sys
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from enum import Enum
+from typing import Any
 
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
-RUN, STATISTICS = "drivegain.run", "drivegain.statistics"
+RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.json"
+"""Names of two metadata records and an attachment."""
 LARGEST_COUNT = 2**64
-"""Of cycles: their numbers are uint64 in the log."""
+"""Largest number of cycles, which are uint64 in the log."""
 VERSION = "1"
-"""Of the log's contract; a reader refuses a higher one."""
+"""Version of the log contract; a reader refuses any other."""
 SEAL = "crc32"
-"""Entry with the checksum of the others: of what stands outside chunks, a log without its end has no other."""
+"""Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum."""
 
 
 class Role(Enum):
-    """What a run is for."""
+    """Whether a payload was mounted."""
 
     UNLOADED = "unloaded"
     LOADED = "loaded"
@@ -29,20 +32,20 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """What is known when a recording starts.
+    """Facts known when a recording starts.
 
     Attributes:
-        run_id: unique; given by the caller.
-        rate_hz: samples a second, exactly as asked of SYNC.
-        payload: what was mounted, None without load.
-        operator: who stands for it.
+        run_id: unique identifier.
+        rate_hz: sampling rate as requested of SYNC, exactly [Hz].
+        payload: mounted payload, None without load.
+        operator: person responsible for the recording.
         software: name and version of the recorder.
         started_wall_ns: Unix time of the start [ns].
-        started_monotonic_ns: the monotonic clock at the same moment [ns]; a clock jump shows in the difference.
-        origin: where the samples came from: "recorded", or the import's sources.
-        speed: share of the plan's speed that the moves were made with; 1 but for a first run.
-        entered_kg: mass of the payload as somebody read it off the scale for this recording; None where nobody did.
-        controller_sha256: digest of the controller's file at the start; None where the cell names none.
+        started_monotonic_ns: the monotonic clock at the same moment [ns]; the difference reveals a clock jump.
+        origin: "recorded", or the sources of an import.
+        speed: speed of the moves as a share of the plan's; 1 except for a first run.
+        entered_kg: mass of the payload as weighed for this recording [kg]; None if it was not entered.
+        controller_sha256: digest of the controller's file at the start; None without one.
     """
 
     run_id: str
@@ -64,23 +67,23 @@ class RunInfo:
 
     @property
     def wall_minus_monotonic_ns(self) -> int:
-        """What turns the stamps of the samples into the monotonic clock of the recording computer [ns]."""
+        """Offset between the stamps of the samples and the monotonic clock of the recording computer [ns]."""
         return self.started_wall_ns - self.started_monotonic_ns
 
 
 @dataclass(frozen=True, slots=True)
 class RunStatistics:
-    """What is known when a recording ends.
+    """Facts known when a recording ends.
 
     Attributes:
-        samples: cycles in the log.
-        lost_cycles: cycles that are not.
-        missing: samples in which the axis did not answer, one number an axis.
-        valid: whether the recorder stands for the run.
+        samples: number of cycles in the log.
+        lost_cycles: number of cycles missing from it.
+        missing: number of samples without an answer, for each axis.
+        valid: whether the recorder considers the run usable.
         reason: why not.
-        partial: the log holds what could be saved of a recording that was never finished.
-        wall_minus_monotonic_ns: the two clocks at the end [ns]; against the start it shows whether the wall clock was
-            set meanwhile. None where nobody has looked: in salvaged and imported logs.
+        partial: the log was salvaged from a recording that was never finished.
+        wall_minus_monotonic_ns: difference of the two clocks at the end [ns]; compared with the start it reveals a
+            changed wall clock. None in salvaged and imported logs.
     """
 
     samples: int
@@ -93,7 +96,7 @@ class RunStatistics:
 
 
 def run_record(info: RunInfo) -> dict[str, str]:
-    """The metadata `drivegain.run`."""
+    """Encode the metadata `drivegain.run`."""
     payload = info.payload
     return {
         "version": VERSION,
@@ -116,11 +119,11 @@ def run_record(info: RunInfo) -> dict[str, str]:
 
 
 def run_from_record(record: Mapping[str, str]) -> RunInfo:
-    """What `run_record` wrote; logs of earlier versions say nothing of speed, second weighing and controller.
+    """Decode `run_record`; logs of earlier versions lack speed, second weighing and controller.
 
     Raises:
         KeyError: an entry is missing.
-        ValueError: an entry is not what it must be.
+        ValueError: an entry is invalid.
     """
     if record["version"] != VERSION:
         raise ValueError(f"version {record['version']!r} of the log contract; this software reads {VERSION}")
@@ -175,11 +178,11 @@ def statistics_record(statistics: RunStatistics) -> dict[str, str]:
 
 
 def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
-    """What `statistics_record` wrote; logs of earlier versions are never partial.
+    """Decode `statistics_record`; logs of earlier versions are never partial.
 
     Raises:
         KeyError: an entry is missing.
-        ValueError: an entry is not what it must be.
+        ValueError: an entry is invalid.
     """
     missing, valid = json.loads(record["missing"]), json.loads(record["valid"])
     partial = json.loads(record.get("partial", "false"))
@@ -205,15 +208,15 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
 
 
 def sealed(record: Mapping[str, str]) -> dict[str, str]:
-    """A record with the checksum of its entries."""
+    """Add the checksum of its entries to a record."""
     return {**record, SEAL: _checksum(record)}
 
 
 def unsealed(record: Mapping[str, str]) -> dict[str, str]:
-    """The entries of a sealed record; one of an earlier version has no seal and is taken as it is.
+    """Return the entries of a sealed record; records of earlier versions have no seal and are returned unchecked.
 
     Raises:
-        ValueError: they are not those that were sealed.
+        ValueError: the checksum does not match.
     """
     entries = {key: value for key, value in record.items() if key != SEAL}
     if record.get(SEAL, _checksum(entries)) != _checksum(entries):
@@ -226,10 +229,90 @@ def _checksum(record: Mapping[str, str]) -> str:
 
 
 def _number(value: object) -> float:
-    """A number of a foreign JSON document; NaN for anything else, also for an integer that no float can hold."""
+    """Convert a number of a foreign JSON document; NaN for anything else, also for an integer beyond any float."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return math.nan
     try:
         return float(value)
     except OverflowError:
         return math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class AxisReadback:
+    """Answers of the amplifier of one axis.
+
+    Attributes:
+        name: name of the axis.
+        current_per_unit: unit of the reference (A) per raw unit, from the profile's formula and objects.
+        position_rad_per_count: motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
+        drive: identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
+    """
+
+    name: str
+    current_per_unit: float
+    position_rad_per_count: float | None = None
+    drive: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Readback:
+    """Answers of all amplifiers when a recording started. Without them raw numbers have no unit."""
+
+    axes: tuple[AxisReadback, ...]
+
+
+def readback_of_drives(names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]) -> Readback:
+    """Make the readback of a prepared network.
+
+    Args:
+        names: names of the axes, in their order.
+        ampere_per_unit: result of CanopenNetwork.ampere_per_unit().
+        answers: result of CanopenNetwork.readback(), by axis name.
+    """
+    return Readback(
+        tuple(
+            AxisReadback(name, scale, drive=dict(answers[name]))
+            for name, scale in zip(names, ampere_per_unit, strict=True)
+        )
+    )
+
+
+def readback_bytes(readback: Readback) -> bytes:
+    """Encode the attachment."""
+    return json.dumps(asdict(readback), indent=1).encode()
+
+
+def readback_from_bytes(data: bytes) -> Readback:
+    """Decode the attachment.
+
+    Raises:
+        ValueError: it is not a readback.
+    """
+    try:
+        tree = json.loads(data)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+    axes = tree.get("axes") if isinstance(tree, dict) else None
+    if not isinstance(axes, list) or not axes:
+        raise ValueError("no list of axes")
+    return Readback(tuple(_axis(axis) for axis in axes))
+
+
+def _axis(tree: Any) -> AxisReadback:
+    tree = tree if isinstance(tree, dict) else {}
+    name, drive, angle = tree.get("name"), tree.get("drive", {}), tree.get("position_rad_per_count")
+    if not (isinstance(name, str) and isinstance(drive, dict)):
+        raise ValueError(f"axis {name!r}: name or drive")  # noqa: TRY004 - one kind of error for a foreign attachment
+    return AxisReadback(
+        name=name,
+        current_per_unit=_quantum(name, "current_per_unit", tree.get("current_per_unit")),
+        position_rad_per_count=None if angle is None else _quantum(name, "position_rad_per_count", angle),
+        drive=drive,
+    )
+
+
+def _quantum(name: str, key: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= sys.float_info.max:
+        raise ValueError(f"axis {name!r}: {key} is {value!r:.40}, expected a positive number")
+    return float(value)

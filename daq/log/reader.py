@@ -1,4 +1,4 @@
-"""A log into arrays: every chunk of samples is one `frombuffer`, no Python loop over messages."""
+"""Read a log into arrays: every chunk of samples is one `frombuffer`, without a Python loop over messages."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from numpy.typing import NDArray
 
 from daq.errors import LogIncomplete, LogMissing, LogUnreadable
 from daq.log.container import UNFINISHED, ChunkContents, RecordFile
-from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC, Readback, readback_from_bytes
-from daq.log.message import NAME as READBACK
+from daq.log.message import ENCAPSULATION_WORD, SAMPLES_TOPIC
 from daq.log.metadata import (
+    READBACK,
     RUN,
     SEAL,
     STATISTICS,
+    Readback,
     RunInfo,
     RunStatistics,
+    readback_from_bytes,
     run_from_record,
     statistics_from_record,
     unsealed,
@@ -29,7 +31,7 @@ from daq.log.metadata import (
 from drivers.stream.sample import CellEvent
 
 BLOCK_SAMPLES = 4096
-"""That a block has before it is handed out; so many and one chunk are in memory at most."""
+"""Samples of a block; at most these and one chunk are in memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +40,7 @@ class SampleBlock:
 
     Attributes:
         cycle: number of the SYNC, shape (k,), uint64.
-        time_ns: of the SYNC [ns], shape (k,), int64.
+        time_ns: time of the SYNC [ns], shape (k,), int64.
         position_counts, current_raw: shape (k, n), int32.
         statusword: shape (k, n), uint16.
         missing: bit i for axis i, shape (k,), uint32.
@@ -54,12 +56,12 @@ class SampleBlock:
 
 @dataclass(frozen=True, slots=True)
 class LogHead:
-    """What stands before the samples.
+    """Everything before the samples.
 
     Attributes:
-        run: who, what and when.
-        readback: what the amplifiers said.
-        files: all attachments by name; the cell's bundle is among them.
+        run: facts about the recording.
+        readback: answers of the amplifiers.
+        files: all attachments by name, with the cell's bundle.
     """
 
     run: RunInfo
@@ -72,11 +74,11 @@ class Log:
     """A whole log.
 
     Attributes:
-        path, digest: of the file; sha256, hex.
-        head: what stands before the samples.
-        samples: all of them.
+        path, digest: path and sha256 (hex) of the file.
+        head: everything before the samples.
+        samples: all samples.
         events: in the order of the log.
-        statistics: what the recorder said at the end.
+        statistics: the recorder's summary at the end.
     """
 
     path: Path
@@ -88,7 +90,7 @@ class Log:
 
     @property
     def partial(self) -> bool:
-        """It is not known how the recording would have ended: salvaged, or never given its final name."""
+        """Whether the end of the recording is unknown: it was salvaged, or never got its final name."""
         return _partial(self.path, self.statistics)
 
 
@@ -97,7 +99,7 @@ def _partial(path: Path, statistics: RunStatistics) -> bool:
 
 
 class LogReader:
-    """One pass over a log in bounded memory: iterate over blocks, then ask for the rest.
+    """Read a log once in bounded memory: iterate over blocks, then use the other properties.
 
     Raises (while iterating):
         LogUnreadable: one of its kinds, with the place in the file.
@@ -113,14 +115,14 @@ class LogReader:
         self._metadata: dict[str, dict[str, str]] = {}
 
     def __iter__(self) -> Iterator[SampleBlock]:
-        """Blocks of samples; events are collected on the way."""
+        """Yield blocks of samples; events are collected meanwhile."""
         yield from self._blocks(self._file)
 
     def until_damage(self) -> Iterator[SampleBlock]:
-        """The same of a log whose end is missing or damaged, up to there; `damage` then says what ended it.
+        """Yield the blocks before the damage of a log without a valid end; `damage` is then its description.
 
         Raises:
-            LogMissing: there is no such file.
+            LogMissing: the file does not exist.
         """
         try:
             yield from self._blocks(self._checked(self._file.unfinished()))
@@ -131,28 +133,28 @@ class LogReader:
 
     @property
     def events(self) -> list[CellEvent]:
-        """Those that have been read."""
+        """Events read so far."""
         return self._chunks.events
 
     @property
     def whole_bytes(self) -> int:
-        """Of the file, up to the damage that ended `until_damage`."""
+        """Size of the undamaged part of the file, after `until_damage`."""
         return self._file.whole_bytes
 
     @property
     def concluded(self) -> bool:
-        """The recorder's own last word has been read."""
+        """Whether the recorder's summary has been read."""
         return STATISTICS in self._metadata
 
     def _checked(self, records: Iterator[tuple[int, McapRecord]]) -> Iterator[tuple[int, McapRecord]]:
-        """Metadata without a seal would be vouched for by the file's end alone."""
+        """Refuse metadata without a seal: only the end of the file would cover them."""
         for offset, record in records:
             if isinstance(record, Metadata) and SEAL not in record.metadata:
                 raise self._file.corrupt(offset, f"metadata {record.name!r} without a seal", f"an entry {SEAL!r}")
             yield offset, record
 
     def _blocks(self, records: Iterable[tuple[int, McapRecord]]) -> Iterator[SampleBlock]:
-        """Several chunks make a block: numpy's calls cost more than the 150 samples of one chunk."""
+        """Join several chunks to a block: numpy's calls cost more than the 150 samples of one chunk."""
         waiting: list[NDArray[np.void]] = []
         start = 0
         try:
@@ -163,7 +165,7 @@ class LogReader:
                 start = start if waiting else offset
                 waiting.append(chunk)
         except LogUnreadable:
-            if waiting:  # what was whole before the damage
+            if waiting:  # undamaged samples before the damage
                 yield self._block(start, waiting)
             raise
         if waiting:
@@ -184,15 +186,15 @@ class LogReader:
 
     @property
     def digest(self) -> str:
-        """sha256 of the file, once the iteration has ended."""
+        """sha256 of the file, after the iteration."""
         return self._file.sha256
 
     @property
     def head(self) -> LogHead:
-        """What stands before the samples; whole once the first block has come.
+        """Everything before the samples, complete from the first block on.
 
         Raises:
-            LogIncomplete: the log lacks it, or it is unreadable.
+            LogIncomplete: it is missing or unreadable.
         """
         try:
             run = run_from_record(self._metadata[RUN])
@@ -203,10 +205,10 @@ class LogReader:
 
     @property
     def statistics(self) -> RunStatistics:
-        """What the recorder said at the end, once the iteration has ended.
+        """The recorder's summary, after the iteration.
 
         Raises:
-            LogIncomplete: the log lacks it, or it is unreadable.
+            LogIncomplete: it is missing or unreadable.
         """
         try:
             return statistics_from_record(self._metadata[STATISTICS])
@@ -223,11 +225,11 @@ class LogReader:
 
     @property
     def partial(self) -> bool:
-        """See `Log.partial`; once the iteration has ended."""
+        """See `Log.partial`; after the iteration."""
         return _partial(self.path, self.statistics)
 
     def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
-        # As bytes: numpy would promote the fields of one type to those of the same type, chunk by chunk.
+        # Joined as bytes: numpy would convert the fields chunk by chunk.
         records = np.frombuffer(b"".join(chunk.tobytes() for chunk in chunks), dtype=chunks[0].dtype)
         axes = records["position_counts"].shape[1]
         fixed = [records[name] for name in ("positions", "currents", "statuswords", "encapsulation")]
@@ -286,13 +288,10 @@ def read_log(path: Path) -> Log:
 
 
 def _joined(blocks: list[SampleBlock]) -> SampleBlock:
-    """All samples; the blocks are used up, so that a long log is not in memory twice."""
+    """Join all samples; the blocks are freed, so that a long log is not in memory twice."""
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
     blocks.clear()
     return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
-
-
-# Losses that a log tells of, and whether somebody wants to use it all the same.
 
 
 MASKED = (
@@ -303,21 +302,20 @@ MASKED = (
     "frames dropped by the interface",
     "frames dropped by the capture process",
 )
-"""What the recorder counts and every reader masks: the samples that it concerns carry the axis in `missing`."""
+"""Losses that the recorder counts and every reader masks: the samples carry the axis in `missing`."""
 
 
 class LossyLogs(Enum):
-    """What happens with a log that its recorder marked invalid because of MASKED losses."""
+    """Whether to use a log that its recorder marked invalid because of MASKED losses."""
 
     REFUSED = "refused"
     ACCEPTED = "accepted"
 
 
 def reports_only_losses(reason: str) -> bool:
-    """Whether the reason of an invalid run speaks of MASKED losses and of nothing else.
+    """Return whether the reason of an invalid run consists only of MASKED losses.
 
-    Doubles, frames that nobody asked for and periods without SYNC are not among them: they say that the recorder did
-    not understand what it saw.
+    Duplicate and unexpected frames and periods without SYNC are not among them: the recorder could not interpret them.
     """
     kinds = "|".join(map(re.escape, MASKED))
     return all(re.fullmatch(rf"\d+ (?:{kinds})", part) for part in reason.split(", "))

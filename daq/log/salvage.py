@@ -1,4 +1,4 @@
-"""What can be saved of a recording that was never finished: a log of its own, labelled partial."""
+"""Salvage a recording that was never finished: its samples become a new log, marked partial."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ _HARMLESS = (
     EventKind.CAPTURE,
     EventKind.STOP,
 )
-"""Events of sound runs; after any other a recorder might not have called the run valid."""
+"""Events of sound runs; after any other a recorder might have marked the run invalid."""
 
 
 @dataclass(frozen=True, slots=True)
 class Salvaged:
-    """What came of it.
+    """Result of a salvage.
 
     Attributes:
         log: the new file.
-        statistics: of the new file; partial, and valid as far as the samples and events tell.
-        duration_s: of the samples [s].
-        left_out_bytes: of the damaged file, from the first byte that could not be trusted.
-        damage: what was found there; empty where the samples are whole and only the end of the file is missing.
+        statistics: of the new file; partial, and valid as far as samples and events show.
+        duration_s: duration of the samples [s].
+        left_out_bytes: size of the damaged file from the first damaged byte.
+        damage: description of the damage; empty if only the end of the file is missing.
     """
 
     log: Path
@@ -51,15 +51,15 @@ class Salvaged:
 
 
 def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _samples: None) -> Salvaged:
-    """Write what stands before the damage of a log into a new one. The damaged file is only read.
+    """Write everything before the damage of a log to a new log. The damaged file is only read.
 
     Args:
         damaged: a `.part` whose recorder died, or a log that was cut off or damaged later.
         out: the log to write; must not exist.
-        progress: told the samples so far.
+        progress: called with the number of samples so far.
 
     Raises:
-        UsageError: the recorder still writes the file, or nothing is wrong with it.
+        UsageError: the recorder still writes the file, or the file is whole.
         UsageError, OutputFailed: the log cannot be written.
         LogUnreadable: not even one sample, or not the start of the log, can be saved.
         ConfigurationError: the cell configuration in it is inconsistent.
@@ -80,7 +80,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     scale = scaling(cell, head.readback)
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent(run, head.files, head.readback, cell.axis_names)
-    # Nothing but this file is lost by a crash here, so no clock is needed to flush in time.
+    # A crash loses only this new file, so no clock is needed to flush in time.
     log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0)
     with log:
         try:
@@ -118,7 +118,7 @@ def _samples(block: SampleBlock) -> Iterator[Sample]:
 
 
 def _verdict(reader: LogReader, counted: RunStatistics) -> tuple[bool, str]:
-    """The recorder's own, where it came to say it; else what samples and events tell of losses and faults."""
+    """Return the recorder's own verdict if it was written; else that of the losses and faults in samples and events."""
     if reader.concluded:
         return reader.statistics.valid, reader.statistics.reason
     found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
@@ -138,7 +138,7 @@ def _check_width(damaged: Path, block: SampleBlock, axes: int) -> None:
             str(damaged),
             found=f"samples of {width} axes",
             expected=f"{axes}, as in its cell configuration",
-            remedy="it is no recording of this software",
+            remedy="it is not a recording of this software",
         )
 
 
@@ -146,8 +146,8 @@ def _refuse_name_of_the_whole(damaged: Path, out: Path) -> None:
     if damaged == out.with_name(out.name + UNFINISHED):
         raise UsageError(
             str(out),
-            found="the name that the whole recording would have had",
-            expected="one that says what it is",
+            found="the name of the whole recording",
+            expected="a name that shows that it is partial",
             remedy=f"choose another --out, such as {out.stem}-partial{out.suffix}",
         )
 

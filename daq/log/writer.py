@@ -1,4 +1,4 @@
-"""Samples into a log that survives a crash: at most 200 ms are ever in memory alone."""
+"""Write a log that survives a crash: at most the last 200 ms are only in memory."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BufferedWriter
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +15,7 @@ from types import TracebackType
 from mcap.writer import CompressionType, Writer
 
 from daq.errors import OutputFailed, UsageError
+from daq.files import fsync_folder
 from daq.log.container import UNFINISHED
 from daq.log.message import (
     DEFINITIONS,
@@ -24,21 +25,29 @@ from daq.log.message import (
     JOINTS_TOPIC,
     SAMPLES_SCHEMA,
     SAMPLES_TOPIC,
-    Readback,
     event_bytes,
     joint_state_bytes,
     joint_state_prefix,
-    readback_bytes,
     sample_bytes,
     sample_struct,
 )
-from daq.log.message import NAME as READBACK
-from daq.log.metadata import RUN, STATISTICS, RunInfo, RunStatistics, run_record, sealed, statistics_record
+from daq.log.metadata import (
+    READBACK,
+    RUN,
+    STATISTICS,
+    Readback,
+    RunInfo,
+    RunStatistics,
+    readback_bytes,
+    run_record,
+    sealed,
+    statistics_record,
+)
 from drivers.stream.sample import CellEvent, Sample
 
 FLUSH_NS = 150_000_000
-"""Of recorded or of wall time, whichever comes first. What a kill may cost is 200 ms: the rest is for the cycle on the
-bus and for the chunk that is being packed."""
+"""Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
+for the cycle on the bus and the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000
 CHUNK_BYTES = 4 * 2**20
 """Never reached between two flushes; a chunk ends with one."""
@@ -46,12 +55,12 @@ CHUNK_BYTES = 4 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class LogContent:
-    """What stands at the start of a log.
+    """Start of a log.
 
     Attributes:
-        run: who, what and when.
+        run: facts about the recording.
         files: the cell's bundle: configuration, drive profiles, URDF.
-        readback: what the amplifiers said.
+        readback: answers of the amplifiers.
         joint_names: for viewers, one for each axis.
     """
 
@@ -61,25 +70,15 @@ class LogContent:
     joint_names: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Verdict:
-    """What the recorder says at the end, see `LogWriter.conclude`."""
-
-    valid: bool = False
-    reason: str = "not concluded"
-    partial: bool = False
-    wall_minus_monotonic_ns: int | None = None
-
-
 class LogWriter:
-    """Writes one log; a context manager.
+    """Context manager that writes one log.
 
     The log is `PATH.part` until the block ends without an error; then it is finished, synced and renamed. After an
     error the `.part` keeps everything up to that moment.
 
     Raises (on entry and later):
-        UsageError: the log, or a `.part` of the same name, is there already; or at the end, when somebody has put a
-            file there meanwhile: then the `.part` is the whole log.
+        UsageError: the log, or a `.part` of the same name, already exists; or at the end, if a file of that name has
+            appeared: then the `.part` is the whole log.
         OutputFailed: the file system refuses.
     """
 
@@ -93,9 +92,9 @@ class LogWriter:
         """Store the arguments.
 
         Args:
-            path: of the finished log.
-            content: what stands at its start.
-            joint_position: joint positions [rad] of some motor counts, for /joint_states.
+            path: path of the finished log.
+            content: start of the log.
+            joint_position: converts motor counts to joint positions [rad], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
         """
         self.path = path
@@ -113,10 +112,10 @@ class LogWriter:
         self._highest_cycle: int | None = None
         self._flushed_recorded_ns = self._flushed_wall_ns = 0
         self._joint_state_due_ns = 0
-        self._verdict = _Verdict()
+        self._conclusion = RunStatistics(0, 0, (), valid=False, reason="not concluded")
 
     def __enter__(self) -> LogWriter:
-        """Open the file and write all that stands before the first sample."""
+        """Open the file and write everything before the first sample."""
         if self.path.exists():
             raise UsageError(
                 str(self.path),
@@ -131,11 +130,11 @@ class LogWriter:
                 str(self.part),
                 found="an unfinished log of that name",
                 expected="none",
-                remedy="its recorder still runs or was killed; move the file away to keep what it holds",
+                remedy="its recorder still runs or was killed; move the file away to keep its samples",
             ) from error
         except OSError as error:
             raise self._failed(error) from error
-        with suppress(OSError):  # a file system without locks; nothing but `salvage` asks for this one
+        with suppress(OSError):  # a file system without locks; only `salvage` asks for this one
             fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         try:
             self._open()
@@ -187,31 +186,22 @@ class LogWriter:
     def conclude(
         self, valid: bool, reason: str = "", *, partial: bool = False, wall_minus_monotonic_ns: int | None = None
     ) -> None:
-        """Say how the run went; a log of which nobody says so is not valid.
+        """Set the outcome; without it the log is not valid.
 
         Args:
             valid, reason: whether the run may be used, and why not.
-            partial: how it ended is not known.
-            wall_minus_monotonic_ns: the two clocks at the end [ns].
+            partial: the end of the recording is unknown.
+            wall_minus_monotonic_ns: difference of the two clocks at the end [ns].
         """
-        self._verdict = _Verdict(valid, reason, partial, wall_minus_monotonic_ns)
+        self._conclusion = RunStatistics(0, 0, (), valid, reason, partial, wall_minus_monotonic_ns)
 
     @property
     def statistics(self) -> RunStatistics:
-        """So far."""
-        verdict = self._verdict
-        return RunStatistics(
-            samples=self._samples,
-            lost_cycles=self._lost,
-            missing=tuple(self._missing),
-            valid=verdict.valid,
-            reason=verdict.reason,
-            partial=verdict.partial,
-            wall_minus_monotonic_ns=verdict.wall_minus_monotonic_ns,
-        )
+        """Statistics so far."""
+        return replace(self._conclusion, samples=self._samples, lost_cycles=self._lost, missing=tuple(self._missing))
 
     def flush(self) -> None:
-        """Put everything into the file.
+        """Write everything to the file.
 
         Samples get chunks of their own, so that a reader takes a whole chunk at once; the rest follows in another.
         """
@@ -227,7 +217,7 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Finish and take the name after success; keep the `.part` after an error, which goes on as it is."""
+        """Finish and rename after success; keep the `.part` after an error, which propagates."""
         try:
             with self._stream:
                 self.flush()
@@ -238,15 +228,15 @@ class LogWriter:
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
             self._take_name()
-            _sync_folder(self.path.parent)
+            fsync_folder(self.path.parent)
         except (OSError, OutputFailed) as failure:
-            if error is not None:  # it came first, and what a stop could not confirm is noted on it
-                error.add_note(f"kept: less than could be, {failure}")
+            if error is not None:  # it came first, and it may carry notes about the stop
+                error.add_note(f"the log keeps less than it could: {failure}")
                 return
             raise (failure if isinstance(failure, OutputFailed) else self._failed(failure)) from failure
 
     def _take_name(self) -> None:
-        """Give the finished log its name, if nobody has taken it meanwhile: a rename would replace what is there."""
+        """Rename the finished log without replacing a file that has appeared meanwhile."""
         try:
             self.path.hardlink_to(self.part)
         except FileExistsError as error:
@@ -307,12 +297,3 @@ class LogWriter:
             remedy="what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
             "it); free space and record again",
         )
-
-
-def _sync_folder(folder: Path) -> None:
-    """A rename is on the disk only when its folder is."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

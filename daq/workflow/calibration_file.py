@@ -1,4 +1,8 @@
-"""`calibration.yaml`: what a fit leaves behind, written whole, read strictly, hand edits noticed."""
+"""`calibration.yaml`, the result of a fit: written whole, read strictly, and every edit by hand is detected.
+
+The file adds percentages for people and writes NaN as null. Sections without such a difference (`Source`, `Recording`)
+are read as the classes of `ident`.
+"""
 
 from __future__ import annotations
 
@@ -18,17 +22,13 @@ from daq.config.yaml_file import MAX_BYTES, StrictModel, parse_yaml, read_model
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, SchemaMismatch, YamlInvalid
 from daq.files import read_regular, replace_file
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter, Source
-from ident.data.run import Recording
 from ident.estimators.estimate import RelativeError
-
-# Schema of calibration.yaml: its keys and types, for the file border only.
-
 
 _Deviation = Annotated[float, Field(ge=0.0)]
 
 
 class GainEntry(StrictModel):
-    """One drive gain; the percentages are for readers."""
+    """One drive gain; the percentages are for people."""
 
     axis: str
     value: float
@@ -68,32 +68,8 @@ class EffectEntry(StrictModel):
     ambiguity: tuple[str, ...]
 
 
-class RecordingEntry(StrictModel):
-    """How a log came to be."""
-
-    recorded_s: float | None
-    entered_kg: float | None
-    serials: tuple[int | None, ...]
-    saturated_percent: tuple[float, ...]
-    lost_cycles: int
-    missing: tuple[int, ...]
-    controller_sha256: str | None
-
-
-class SourceEntry(StrictModel):
-    """One log; files of earlier versions say nothing of payload and recording, and none of them could be partial."""
-
-    name: str
-    sha256: str
-    role: str
-    partial: bool = False
-    payload: str | None = None
-    mass_kg: float | None = None
-    recording: RecordingEntry | None = None
-
-
 class CalibrationDocument(StrictModel):
-    """The whole file; `digests` are compared by the reader."""
+    """Schema of the whole file; the reader compares the `digests`."""
 
     format: Literal["drivegain-calibration"]
     version: int
@@ -108,14 +84,14 @@ class CalibrationDocument(StrictModel):
     rows: int
     filter: dict[str, int | float | list[float]]
     effects: tuple[EffectEntry, ...]
-    sources: tuple[SourceEntry, ...]
+    sources: tuple[Source, ...]
     configuration_sha256: str
     created: str
     software: str
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
     recording_configuration_sha256: str | None = None
-    """Files of earlier versions do not have these three."""
+    """Files of earlier versions lack these three."""
 
 
 def _parameter(entry: ParameterEntry) -> Parameter:
@@ -130,14 +106,8 @@ def _perhaps(entry: RelativeErrorEntry | None) -> RelativeError | None:
     return None if entry is None else _error(entry)
 
 
-def _source(entry: SourceEntry) -> Source:
-    entry_recording = entry.recording
-    recording = None if entry_recording is None else Recording(**entry_recording.model_dump())
-    return Source(entry.name, entry.sha256, entry.role, entry.partial, entry.payload, entry.mass_kg, recording)
-
-
 def calibration_of(entries: CalibrationDocument) -> Calibration:
-    """The calibration that a checked document says."""
+    """Convert a checked document."""
     return Calibration(
         cell=entries.cell,
         method=entries.method,
@@ -160,7 +130,7 @@ def calibration_of(entries: CalibrationDocument) -> Calibration:
         condition=entries.condition,
         rows=entries.rows,
         filter=dict(entries.filter),
-        sources=tuple(_source(s) for s in entries.sources),
+        sources=entries.sources,
         configuration_sha256=entries.configuration_sha256,
         created=entries.created,
         software=entries.software,
@@ -179,10 +149,10 @@ _HEADER = """\
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what YAML 1.2 reads as a number: PyYAML writes for YAML 1.1, where 1e6 is a word."""
+    """Quote words that YAML 1.2 reads as numbers: PyYAML writes YAML 1.1, where 1e6 is a word."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Equal sections are written out twice: the reader takes no aliases."""
+        """Write equal sections twice: the reader refuses aliases."""
         return True
 
 
@@ -200,9 +170,9 @@ _Dumper.add_implicit_resolver(
 
 
 def as_document(calibration: Calibration) -> dict[str, object]:
-    """The calibration as plain lists, mappings and numbers: the object of `fit --json` and the body of the file.
+    """Return the calibration as lists, mappings and numbers: the object of `fit --json` and the body of the file.
 
-    Percentages that a zero makes meaningless are None.
+    Percentages of zero are None.
     """
     return {
         "cell": calibration.cell,
@@ -239,15 +209,15 @@ def as_document(calibration: Calibration) -> dict[str, object]:
 
 
 def save(calibration: Calibration, path: Path) -> None:
-    """Write `calibration` to `path`, atomically, after the disk has given back an equal one.
+    """Write `calibration` to `path` atomically, and read it back before it replaces an older file.
 
     Raises:
-        CalibrationUnreadable: it has a number that is not finite; nothing is written.
+        CalibrationUnreadable: a number is not finite; nothing is written.
         OSError: from the file system; an old file stays as it was.
     """
 
     def check(content: bytes) -> None:
-        # As documents: NaN, of an axis that did not move, is not equal to itself.
+        # Compared as documents: NaN, for an axis that did not move, is not equal to itself.
         if as_document(decode(content, str(path))) != as_document(calibration):
             raise CalibrationUnreadable(
                 str(path),
@@ -260,7 +230,7 @@ def save(calibration: Calibration, path: Path) -> None:
 
 
 def encode(calibration: Calibration) -> bytes:
-    """The file's content."""
+    """Return the content of the file."""
     body = as_document(calibration)
     document = {"format": "drivegain-calibration", "version": VERSION, **body, "digests": _digests(body)}
     # One entry a line: leaf collections in flow style, lines never folded.
@@ -274,15 +244,15 @@ def load(path: Path) -> Calibration:
     """Read a calibration.
 
     Raises:
-        CalibrationMissing: there is no such file, it is none but a folder or a pipe, or it cannot be read.
-        CalibrationUnreadable: no calibration of this version, or a key, type or number does not belong, with its line.
-        CalibrationRefused: the content is not what `save` wrote, with the sections that were changed.
+        CalibrationMissing: the file does not exist, is a folder or a pipe, or cannot be read.
+        CalibrationUnreadable: not a calibration of this version, or with a wrong key, type or number, with its line.
+        CalibrationRefused: the content was edited, with the names of the edited sections.
     """
     return decode(read(path), str(path))
 
 
 def read(path: Path) -> bytes:
-    """The content of a calibration's file, for whoever needs its digest beside what it says.
+    """Read the content of a calibration's file, for callers that also need its digest.
 
     Raises:
         CalibrationMissing: see `load`.
@@ -299,7 +269,7 @@ def read(path: Path) -> bytes:
 
 
 def decode(content: bytes, name: str) -> Calibration:
-    """The calibration that a file's content says; `name` is what messages call it. Raises as `load`."""
+    """Decode a file's content; `name` is its name in messages. Raises as `load`."""
     try:
         document = parse_yaml(content, name)
         _check_version(document.tree, name)
@@ -323,7 +293,7 @@ def decode(content: bytes, name: str) -> Calibration:
 
 
 def _check_version(tree: object, name: str) -> None:
-    # Before the schema: of a later version every key may be unknown, and only the version says why.
+    # Before the schema: in a later version every key may be unknown, and only the version explains it.
     version = tree.get("version") if isinstance(tree, dict) else None
     if version != VERSION:
         raise CalibrationUnreadable(
@@ -341,7 +311,7 @@ def _edited_sections(tree: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _digests(body: Mapping[str, object]) -> dict[str, str]:
-    """SHA-256 of each section in canonical JSON, so that an edit can be named and not only noticed."""
+    """Compute the SHA-256 of each section in canonical JSON, so that an edit can be located."""
     return {
         key: hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
         for key, value in body.items()
@@ -377,7 +347,7 @@ def _parameter_document(parameter: Parameter) -> dict[str, object]:
 
 def _source_document(source: Source) -> dict[str, object]:
     document = asdict(source)
-    # As YAML gives them back: the schema takes lists.
+    # Lists, as YAML returns them.
     return {**document, "recording": None if source.recording is None else _listed(document["recording"])}
 
 
@@ -388,5 +358,5 @@ def _listed(document: dict[str, object]) -> dict[str, object]:
 def _error_document(error: RelativeError | None) -> dict[str, object] | None:
     if error is None:
         return None
-    # An axis that did not move has no figure; whatever else is not finite is an error, and the reader refuses it.
+    # NaN marks an axis that did not move; the reader refuses any other number that is not finite.
     return {"axes": [None if math.isnan(value) else value for value in error.axes], "total": error.total}

@@ -19,8 +19,7 @@ from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
 from daq.log.conversion import Scaling, scaling
-from daq.log.message import readback_of_drives
-from daq.log.metadata import RunInfo, RunStatistics
+from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
 from daq.workflow.plan import Plan

@@ -19,8 +19,7 @@ import numpy as np
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.log.conversion import scaling
-from daq.log.message import AxisReadback, Readback
-from daq.log.metadata import RunInfo
+from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.plan import Plan, plan
 from drivers.simulation.spec import Body

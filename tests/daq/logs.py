@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from daq.config.cell_file import bundle
-from daq.log.message import AxisReadback, Readback
-from daq.log.metadata import RunInfo
+from daq.log.metadata import AxisReadback, Readback, RunInfo
 from daq.log.writer import LogContent, LogWriter
 from drivers.stream.sample import CellEvent, Sample
 from ident.model.bodies import Payload

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from daq.config.bus import drive_axes
 from daq.config.cell import Cell
 from daq.log.conversion import Scaling, moves, scaling
-from daq.log.message import AxisReadback, Readback
+from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
 from drivers.canopen.network import CanopenNetwork

@@ -11,8 +11,14 @@ from rich.console import Console
 from daq.cli.app import main, show_error
 from daq.config.yaml_file import MAX_EXPLAINED, StrictModel, parse_yaml, read_model
 from daq.errors import ExitCode, OutputFailed, SchemaMismatch
-from daq.log.message import readback_from_bytes
-from daq.log.metadata import RunStatistics, run_from_record, run_record, statistics_from_record, statistics_record
+from daq.log.metadata import (
+    RunStatistics,
+    readback_from_bytes,
+    run_from_record,
+    run_record,
+    statistics_from_record,
+    statistics_record,
+)
 from daq.log.writer import LogWriter
 from drivers.errors import DriveFault
 from tests.daq.logs import DISC, content, demo_content, joints, samples, write

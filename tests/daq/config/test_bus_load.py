@@ -183,7 +183,7 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
     text = files["cell.yaml"].decode()
     timed = text.replace("pacing: lockstep", "pacing: timed")
     (warning,) = load_warnings(cell_from_bundle({**files, "cell.yaml": timed.encode()}))
-    assert warning.startswith("demo: when all its axes are told to start, set-points and answers take 137 %")
+    assert warning.startswith("demo: when all its axes start, set-points and answers take 137 %")
     two = cell_from_bundle({**files, "cell.yaml": on_two_buses(timed, "socketcand", "a", "b").encode()})
     assert load_warnings(two) == ()
     assert [line.partition(": ")[2] for line in load_lines(two)] == ["loaded by 41 % on average, 46 % at worst"] * 2

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from canopen.objectdictionary import ObjectDictionary
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -19,9 +20,8 @@ from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.drive import SCALE_KEYS, drive_from_text
-from daq.config.eds import Eds, disagreements, eds_from_text
 from daq.environment import shipped_configurations
-from daq.errors import ConfigurationError, ConfigurationInconsistent, ExitCode, SchemaMismatch
+from daq.errors import ConfigurationInconsistent, ExitCode, SchemaMismatch
 from daq.log.conversion import load_run
 from daq.log.reader import read_log
 from daq.report.fit import actual_current_note, current_signals
@@ -29,7 +29,8 @@ from daq.simulation.simulation_file import load_simulation
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import record
 from drivers.canopen.bus import open_bus
-from drivers.profiles.profile import Basis, DriveProfile, ScaleForm, TapPoint
+from drivers.profiles.data_sheet import data_sheet, disagreements
+from drivers.profiles.profile import Basis, DriveProfile, ObjectEntry, ScaleForm, TapPoint
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Dialect
@@ -56,11 +57,11 @@ def profile_of(name: str) -> DriveProfile:
     return drive_from_text(text_of(name).encode(), f"{name}.yaml")
 
 
-def sheet(shared_data: Path, name: str) -> Eds:
+def sheet(shared_data: Path, name: str) -> ObjectDictionary:
     path = shared_data / "eds" / name
     if not path.is_file():
         pytest.skip(f"no data sheet at {path}: set DRIVEGAIN_DATA to the folder that holds eds/")
-    return eds_from_text(path.read_bytes(), name)
+    return data_sheet(path.read_bytes(), name)
 
 
 # -- the files ---------------------------------------------------------------------------------------------------------
@@ -234,13 +235,18 @@ def test_the_standard_profile_does_not_fit_these_drives(file: str, missing: str,
 def test_a_wrong_width_or_an_object_that_cannot_be_mapped_is_reported(name: str, file: str, shared_data: Path) -> None:
     reported, profile = sheet(shared_data, file), profile_of(name)
     wide = replace(profile, current=replace(profile.current, bits=32))
-    assert disagreements(wide, reported) == (f"6074h:00 (torque_demand): i16 in {file}, i32 in the profile",)
+    assert disagreements(wide, reported) == ("6074h:00 (torque_demand): i16 in the data sheet, i32 in the profile",)
     rated = replace(profile, current=profile.current_scale.objects[0])
-    assert disagreements(rated, reported) == (f"6075h:00 (motor_rated_current): cannot be mapped by {file}",)
+    assert disagreements(rated, reported) == (
+        "6075h:00 (motor_rated_current): not mappable according to the data sheet",
+    )
 
 
 SHEET = """[FileInfo]
 Description=a drive
+[DeviceInfo]
+VendorName=a maker
+ProductName=
 [6064]
 ParameterName=position
 ObjectType=0x7
@@ -265,28 +271,33 @@ PDOMapping=
 
 
 def test_a_data_sheet_is_read_with_its_empty_fields() -> None:
-    reported = eds_from_text(SHEET.encode(), "x")
-    assert reported.description == "a drive"
-    assert set(reported.objects) == {(0x6064, 0), (0x1008, 0), (0x1018, 1)}
-    position, name, vendor = reported.objects[0x6064, 0], reported.objects[0x1008, 0], reported.objects[0x1018, 1]
-    assert (position.bits, position.signed, position.readable, position.mappable) == (32, True, True, True)
-    assert (name.bits, vendor.readable, vendor.mappable) == (0, False, False)
+    read = data_sheet(SHEET.encode(), "x")
+    assert set(read) == {0x6064, 0x1008, 0x1018}
+    agreed = profile_of("elmo-gold")
+    profile = replace(agreed, current=agreed.position, current_scale=replace(agreed.current_scale, objects=()))
+    profile = replace(profile, rated=None, save=None)
+    assert disagreements(profile, read) == ()
+    name, vendor = ObjectEntry(0x1008, 0, 32, signed=False), ObjectEntry(0x1018, 1, 32, signed=False)
+    assert disagreements(replace(profile, position=name, current=vendor), read) == (
+        "1008h:00 (name): no integer in the data sheet, u32 in the profile",
+        "1008h:00 (name): not mappable according to the data sheet",
+        "1018h:01 (vendor): not readable according to the data sheet",
+        "1018h:01 (vendor): not mappable according to the data sheet",
+    )
 
 
-@pytest.mark.parametrize(
-    "text", [b"", b"hello", b"[6064]\nDataType=seven\n", b"[6064]\nDataType=0x99999\n", b"\xff\xfe"]
-)
+@pytest.mark.parametrize("text", [b"", b"hello", b"[6064]\nDataType=seven\n", b"\xff\xfe"])
 def test_what_is_no_data_sheet_is_named(text: bytes) -> None:
-    with pytest.raises(ConfigurationInconsistent, match=r"x: found .*data sheet"):
-        eds_from_text(text, "x")
+    with pytest.raises(ValueError, match=r"x: found .*data sheet"):
+        data_sheet(text, "x")
 
 
 @given(st.integers(0, len(SHEET) - 1), st.binary(max_size=12))
 @settings(deadline=None)
 def test_a_damaged_data_sheet_is_read_or_named(where: int, damage: bytes) -> None:
     text = SHEET.encode()
-    with contextlib.suppress(ConfigurationError):
-        assert eds_from_text(text[:where] + damage + text[where + len(damage) :], "x").objects
+    with contextlib.suppress(ValueError):
+        assert data_sheet(text[:where] + damage + text[where + len(damage) :], "x")
 
 
 # -- to the ampere -----------------------------------------------------------------------------------------------------

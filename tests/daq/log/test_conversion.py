@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from daq.config.cell_file import load_cell
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.conversion import load_run, scaling, unwrapped
-from daq.log.message import AxisReadback, Readback, readback_of_drives
+from daq.log.metadata import AxisReadback, Readback, readback_of_drives
 from drivers.stream.sample import CellEvent, EventKind, Sample
 from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
@@ -100,7 +100,7 @@ def test_missing_and_saturated_samples_are_masked(record: Recorder) -> None:
 
 def test_a_run_at_the_limit_is_refused(record: Recorder) -> None:
     rows = samples([[0] * 6] * 17) + samples([[0] * 6] * 20, status=0x1A37)[17:]
-    with pytest.raises(CurrentSaturated, match=r"axis J1: found a limit acting in 15\.0 %"):
+    with pytest.raises(CurrentSaturated, match=r"axis J1: found a limit active in 15\.0 %"):
         load_run(record(rows))
 
 

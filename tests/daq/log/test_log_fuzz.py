@@ -20,8 +20,7 @@ from mcap.opcode import Opcode
 from daq.errors import LogUnreadable
 from daq.log.container import MAGIC
 from daq.log.message import DEFINITIONS, EVENTS_SCHEMA, EVENTS_TOPIC, SAMPLES_SCHEMA, SAMPLES_TOPIC, sample_dtype
-from daq.log.message import NAME as READBACK
-from daq.log.metadata import RUN, STATISTICS, run_record, sealed, statistics_record
+from daq.log.metadata import READBACK, RUN, STATISTICS, run_record, sealed, statistics_record
 from daq.log.reader import Log, LogReader, SampleBlock, read_log
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.logs import START_NS, content, samples, write

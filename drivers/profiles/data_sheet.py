@@ -1,0 +1,85 @@
+"""Compare a drive profile with the maker's electronic data sheet (EDS or DCF, CiA 306).
+
+No verb needs data sheets. They are for whoever writes a profile, and for the tests of the shipped ones.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from io import StringIO
+
+from canopen.objectdictionary import ObjectDictionary, ODVariable
+from canopen.objectdictionary.datatypes import INTEGER_TYPES, SIGNED_TYPES
+from canopen.objectdictionary.eds import import_eds
+
+from drivers.profiles.profile import DriveProfile, ObjectEntry
+
+LARGEST_BYTES = 4 * 2**20
+_READABLE = {"ro", "rw", "rwr", "rww", "const"}
+_EMPTY_FIELD = re.compile(r"^(?:PDOMapping|ObjectType|SubNumber)=[ \t\r]*$", re.MULTILINE | re.IGNORECASE)
+"""Fields of an object that real data sheets leave empty and canopen cannot read."""
+
+
+def data_sheet(text: bytes, name: str) -> ObjectDictionary:
+    """Read a data sheet.
+
+    Args:
+        text: content of the file.
+        name: name of the file in messages.
+
+    Raises:
+        ValueError: it is not a data sheet.
+    """
+    if len(text) > LARGEST_BYTES:
+        raise ValueError(_message(name, f"{len(text)} bytes"))
+    stream = StringIO(_EMPTY_FIELD.sub("", text.decode("latin-1")))
+    try:
+        sheet: ObjectDictionary = import_eds(stream, None)
+    except Exception as error:  # canopen raises errors of many kinds for a file that is not a data sheet
+        raise ValueError(_message(name, f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}")) from error
+    if not any(index >= 0x1000 for index in sheet):
+        raise ValueError(_message(name, "no objects"))
+    return sheet
+
+
+def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, ...]:
+    """List the statements of a profile that the drive's data sheet contradicts; empty if the two agree."""
+    scale, rated = profile.current_scale, profile.rated
+    read = [*scale.objects, *(() if scale.switch is None else (scale.switch,))]
+    if rated is not None:
+        read += [rated.current, *(() if rated.torque is None else (rated.torque,))]
+    if profile.save is not None:
+        read.append(profile.save.command)
+    mapped = (profile.position, profile.current)
+    return tuple(
+        fault for entry in dict.fromkeys((*mapped, *read)) for fault in _faults(entry, sheet, mapped=entry in mapped)
+    )
+
+
+def _faults(entry: ObjectEntry, sheet: ObjectDictionary, *, mapped: bool) -> Iterator[str]:
+    found = sheet.get_variable(entry.index, entry.subindex)
+    if found is None:
+        yield f"{entry}: no such object"
+        return
+    wanted = _type_name(entry.bits, entry.signed)
+    if (declared := _declared(found)) != wanted:
+        yield f"{entry} ({found.name}): {declared} in the data sheet, {wanted} in the profile"
+    if found.access_type.lower() not in _READABLE:
+        yield f"{entry} ({found.name}): not readable according to the data sheet"
+    if mapped and not found.pdo_mappable:
+        yield f"{entry} ({found.name}): not mappable according to the data sheet"
+
+
+def _declared(variable: ODVariable) -> str:
+    if variable.data_type not in INTEGER_TYPES:
+        return "no integer"
+    return _type_name(len(variable), variable.data_type in SIGNED_TYPES)
+
+
+def _type_name(bits: int, signed: bool) -> str:
+    return f"{'i' if signed else 'u'}{bits}"
+
+
+def _message(name: str, found: str) -> str:
+    return f"{name}: found {found}; expected an electronic data sheet (EDS or DCF, CiA 306); is this the right file?"
