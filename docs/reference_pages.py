@@ -25,6 +25,7 @@ from daq.config.import_description import ImportModel
 from daq.errors import DaqError, exit_code
 from daq.simulation.simulation_file import SimulationModel
 from daq.workflow.calibration_file import CalibrationDocument
+from daq.writeback.gates.table import GATES
 from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
@@ -261,11 +262,11 @@ def api() -> str:
     return "\n\n".join(parts)
 
 
-def glossary() -> str:
-    """The glossary's place in the navigation, once there is one."""
-    if not (Path(__file__).parent / "glossary.md").exists():
-        return ""
-    return "```{toctree}\n:hidden:\n\nglossary\n```"
+def gates() -> str:
+    """Return the table of all gates, in the order in which they are checked."""
+    head = "| gate | refuses if | default limit | do |\n|---|---|---|---|\n"
+    rows = [f"| {row.gate.value} | {row.closed_when} | {row.limit} | {row.remedy} |" for row in GATES]
+    return head + "\n".join(rows)
 
 
 PARTS: dict[str, Callable[[], str]] = {
@@ -274,6 +275,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "schemas": schema_list,
     "errors": errors,
     "api": api,
-    "glossary": glossary,
+    "gates": gates,
 }
 """What a page can ask for."""
