@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -18,182 +17,27 @@ from daq.cli.writing import applier
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
-from daq.errors import (
-    ConfigurationInconsistent,
-    DataError,
-    HistoryUnreadable,
-    OutputFailed,
-    UsageError,
-)
+from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, OutputFailed, UsageError
 from daq.files import replace_file
 from daq.jobs.session import sessions
-from daq.ledger.audit import AuditAction, AuditVerdict, append, verify
-from daq.ledger.entry import Acknowledgement, iso, utc
-from daq.ledger.store import HistoryStore
-from daq.ledger.verify import AuditedWrite, acknowledgement_flaws, catch_up, event_flaws, unknown_writes, writes_to
+from daq.ledger.entry import utc
+from daq.ledger.ledger import Ledger, Verification, audit_error, rebuild
 from daq.ledger.watch import Series, watch
 from daq.report.history import COLUMNS, csv_text, plot_history
-from daq.report.history_view import describe, describe_actions, in_force, show, show_axis
+from daq.report.history_view import (
+    describe,
+    describe_actions,
+    describe_verification,
+    in_force,
+    say_verification,
+    show,
+    show_axis,
+)
 from daq.workflow.calibration_file import decode, read
 from daq.writeback.file_access import resolve_links
 
-# `drivegain history --verify`: whether audit and history are what was written, and what became of killed writes.
-
-
-_ADDING = (
-    "`drivegain history CELL --add CALIBRATION` for each calibration that was written, oldest first, which enters what "
-    "the audit tells of them. Where one is no more to be had, keep both files and begin audit and history anew "
-    "(`history.audit`, `history.store`)"
-)
 _SHOWN = 5
 """Sentences of a kind in an error; --json has all."""
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """What was found.
-
-    Attributes:
-        audit, store: the two files.
-        verdict: of the audit.
-        broken: what is broken in the history, and where its rows are not what the audit tells.
-        unknown: writes of which the history does not know.
-        late: whether the history knows of a later write than one of these: it cannot be entered behind that.
-    """
-
-    audit: Path
-    store: Path
-    verdict: AuditVerdict
-    broken: tuple[str, ...]
-    unknown: tuple[AuditedWrite, ...] = ()
-    late: bool = False
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """For --json."""
-        return {
-            "file": str(self.audit),
-            "entries": len(self.verdict.entries),
-            "holds": self.verdict.holds,
-            "broken_line": self.verdict.broken,
-            "flaws": [{"line": f.line, "flaw": f.flaw.value, "says": f.says} for f in self.verdict.flaws],
-            "torn_lines": list(self.verdict.torn),
-            "open_writes": [
-                {
-                    "number": one.begun.number,
-                    "at": one.begun.at,
-                    "who": one.begun.who,
-                    "file": one.begun.subject,
-                    "content": one.content.value,
-                }
-                for one in self.verdict.open_writes
-            ],
-            "history_broken": list(self.broken),
-            "unknown_writes": [
-                {
-                    "number": one.ended.number,
-                    "at": one.ended.at,
-                    "who": one.ended.who,
-                    "file": one.ended.subject,
-                    "action": one.ended.action.value,
-                    "calibration_sha256": one.calibration,
-                }
-                for one in self.unknown
-            ],
-        }
-
-    def say(self, console: Console) -> None:
-        """For a person; flaws are the error's to tell."""
-        state = "unbroken" if self.verdict.holds else "BROKEN"
-        console.print(f"{self.audit}: {len(self.verdict.entries)} entries, chain {state}.")
-        if self.verdict.torn:
-            lines = ", ".join(map(str, self.verdict.torn))
-            console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
-        for one in self.verdict.open_writes:
-            begun = one.begun
-            console.print(
-                f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
-                f"ended; {printable(begun.subject)} was found {one.content.value}."
-            )
-        console.print(f"{self.store}: {'BROKEN' if self.broken else 'NOT COMPLETE' if self.unknown else 'sound'}.")
-
-    def require(self) -> None:
-        """Raise what is wrong.
-
-        Raises:
-            DataError: the audit is not what was written, with the first line that is not and all flaws.
-            HistoryUnreadable: the history's file is broken, its rows are not what the audit tells, or it does not know
-                of a write.
-        """
-        if not self.verdict.holds:
-            first = self.verdict.flaws[0]
-            more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in self.verdict.flaws)
-            raise DataError(
-                f"{self.audit}, line {first.line}",
-                found=f"{len(self.verdict.flaws)} places that are not what was written{more}\n ",
-                expected="entries that were never changed, moved or taken away",
-                remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is "
-                "known trust the controller's file by its backups only, and begin audit and history anew, both "
-                "(`history.audit`, `history.store`): the old history would look for what is missing for ever",
-            )
-        unknown = [printable(f"no event of {one}") for one in self.unknown]
-        if self.broken:
-            raise HistoryUnreadable(
-                str(self.store),
-                found=_first([*self.broken, *unknown]),
-                expected="a sound SQLite file with the rows that drivegain wrote",
-                remedy="keep a copy, ask who can write to it, and restore the last good one from a backup",
-            )
-        if self.unknown:
-            raise HistoryUnreadable(
-                str(self.store),
-                found=_first(unknown),
-                expected="an event of every write to this cell's controller that the audit tells of",
-                remedy="it knows of a later write: restore the last good one from a backup, or build it anew in "
-                f"another file (`history.store`) with {_ADDING}"
-                if self.late
-                else f"{_ADDING}; of a rollback with any one",
-            )
-
-
-def verify_history(cell: Cell, place: HistoryPlace, store: HistoryStore) -> Checked:
-    """Check both files, each by itself and against the other.
-
-    What must be in the audit, the history knows, and the sessions of scheduled recalibrations; what must be in the
-    history, the audit. Raises as `daq.ledger.audit.verify` and the store.
-    """
-    verdict, broken = _verdict(cell, place, store), store.integrity()
-    if not verdict.holds:  # its entries prove nothing
-        return Checked(place.audit, place.store, verdict, broken)
-    entries = verdict.entries
-    by_digest = {one.sha256: one for one in entries}
-    events = [(number, event, by_digest.get(event.audit or "")) for number, event in enumerate(store.events(), start=1)]
-    broken += tuple(
-        printable(f"event {number}: {says}")
-        for number, event, entry in events
-        if entry is not None
-        for says in event_flaws(event, entry, entries)
-    )
-    broken += tuple(
-        printable(f"acknowledgement of {noted.axis} at {iso(noted.at)}: {says}")
-        for noted in store.acknowledgements()
-        if (entry := by_digest.get(noted.audit)) is not None
-        for says in acknowledgement_flaws(noted, entry)
-    )
-    unknown, late = unknown_writes(writes_to(cell, entries), store.audited())
-    return Checked(place.audit, place.store, verdict, broken, tuple(unknown), late != unknown)
-
-
-def _verdict(cell: Cell, place: HistoryPlace, store: HistoryStore) -> AuditVerdict:
-    past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
-    ends = [session.state.audit_sha256 for session in past]
-    return verify(place.audit, store.audited().union(end for end in ends if end is not None))
-
-
-def _first(sentences: Sequence[str]) -> str:
-    more = len(sentences) - _SHOWN
-    return "; ".join(sentences[:_SHOWN]) + (f"; and {more} more (--json tells all)" if more > 0 else "")
-
 
 _PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}
 """Suffixes of pictures, and how such a file begins."""
@@ -220,6 +64,10 @@ def history_verb(
         bool,
         typer.Option("--verify", help="Check audit and history, by themselves and together; exit code 4 if broken."),
     ] = False,
+    rebuild: Annotated[
+        bool,
+        typer.Option("--rebuild", help="Make the history anew from the audit; the old file is kept beside it."),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Show the calibrations of a cell, which were applied, the change of each gain with its σ, and alarms.
@@ -239,40 +87,97 @@ def history_verb(
             expected="them with --acknowledge AXIS",
             remedy="name the axis whose change is explained",
         )
-    now = datetime.now(UTC)
-    with HistoryStore(place.store) as store:
+    now, who = datetime.now(UTC), str(applier(by if acknowledge is not None else None))
+    if rebuild:
+        _rebuild(declared, place, who, now)
+    with Ledger(declared, place, who) as ledger:
         if add is not None:
-            _add(store, declared, place, add, now)
-        all_series = watch(store.entries(), store.acknowledgements())
+            _add(ledger, add, now)
+        all_series = watch(ledger.entries(), ledger.acknowledgements())
         if acknowledge is not None:
-            _acknowledge(store, place, _named(all_series, acknowledge, declared), by, why, since, now)
-            all_series = watch(store.entries(), store.acknowledgements())
+            _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)
+            all_series = watch(ledger.entries(), ledger.acknowledgements())
         chosen = all_series if axis is None else (_named(all_series, axis, declared),)
-        if picture is not None:
-            _plot(picture, chosen, declared)
-        if csv is not None:
-            _write_csv(csv, chosen)
-        entries = store.entries()
-        current = in_force(declared, store)
-        actions = describe_actions(entries, store.events(), current)
+        _write_files(chosen, declared, picture, csv)
+        entries = ledger.entries()
+        current = in_force(declared, ledger)
+        actions = describe_actions(entries, ledger.events(), current)
         if verify and declared.controller_path is not None:
             # Where its links lead decides which writes are this cell's: another user's link could hide some.
             resolve_links(declared.controller_path)
-        checked = verify_history(declared, place, store) if verify else None
+        checked = ledger.verify(_session_heads(declared)) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:
             document = describe(declared.name, entries, chosen, all_series, current)
-            print_json(document if checked is None else {**document, "audit": checked.document})
+            print_json(document if checked is None else {**document, "audit": describe_verification(checked)})
         else:
             if checked is not None:
-                checked.say(console)
+                say_verification(checked, console)
             elif axis is not None:
                 show_axis(chosen[0], all_series, actions, console)
             else:
                 show(entries, all_series, actions, console)
             say_written(console, picture, csv)
         if checked is not None:
-            checked.require()
+            _require(checked)
+
+
+def _session_heads(cell: Cell) -> list[str]:
+    """SHA-256 of the entries that end the sessions of scheduled recalibrations."""
+    past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
+    return [session.state.audit_sha256 for session in past if session.state.audit_sha256 is not None]
+
+
+def _require(checked: Verification) -> None:
+    """Raise what is wrong.
+
+    Raises:
+        DataError: the audit log is not what was written, with the first line that is not and all flaws.
+        HistoryUnreadable: the history is broken, contradicts the audit log, or lacks a write.
+    """
+    if not checked.verdict.holds:
+        raise audit_error(checked.place, checked.verdict)
+    store, unknown = str(checked.place.store), [f"no event of {one}" for one in checked.unknown]
+    if checked.broken:
+        raise HistoryUnreadable(
+            store,
+            found=_first([*checked.broken, *unknown]),
+            expected="a sound SQLite file with the rows that drivegain wrote",
+            remedy="keep a copy, ask who can write to it, and restore the last good one from a backup, or make it anew "
+            "from the audit with `drivegain history CELL --rebuild`",
+        )
+    if checked.unknown:
+        adding = (
+            "`drivegain history CELL --add CALIBRATION` for each calibration that was written, which also enters its "
+            "writes from the audit"
+        )
+        raise HistoryUnreadable(
+            store,
+            found=_first(unknown),
+            expected="an event of every write to this cell's controller that the audit has",
+            remedy=f"it knows of a later write: {adding}, then `drivegain history CELL --rebuild`, which puts them in "
+            "their order"
+            if checked.late
+            else f"{adding}; of a rollback with any one. Where a calibration is lost, keep both files and begin audit "
+            "and history anew (`history.audit`, `history.store`)",
+        )
+
+
+def _first(sentences: Sequence[str]) -> str:
+    more = len(sentences) - _SHOWN
+    shown = "; ".join(map(printable, sentences[:_SHOWN]))
+    return shown + (f"; and {more} more (--json has all)" if more > 0 else "")
+
+
+def _rebuild(cell: Cell, place: HistoryPlace, who: str, now: datetime) -> None:
+    done = rebuild(cell, place, who=who, at=now, heads=_session_heads(cell))
+    console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
+    console.print(
+        f"Rebuilt from {place.audit}: {done.calibrations} calibrations, {done.writes} writes, {done.acknowledgements} "
+        f"acknowledgements. {'There was no history before.' if done.kept is None else f'The old one is {done.kept}.'}"
+    )
+    if done.kept is not None and not done.trusted:
+        console.print("The old history was broken: what only it had was not taken over.")
 
 
 def _place(cell: Cell, file: Path) -> HistoryPlace:
@@ -283,59 +188,37 @@ def _place(cell: Cell, file: Path) -> HistoryPlace:
     return cell.history
 
 
-def _add(store: HistoryStore, cell: Cell, place: HistoryPlace, file: Path, now: datetime) -> None:
+def _add(ledger: Ledger, file: Path, now: datetime) -> None:
     content = read(file)
     calibration = decode(content, str(file))
-    if calibration.cell != cell.name:
+    if calibration.cell != ledger.cell.name:
         raise DataError(
             str(file),
             found=f"a calibration of cell {calibration.cell!r}",
-            expected=f"one of {cell.name!r}",
+            expected=f"one of {ledger.cell.name!r}",
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
-    new = store.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
-    outcome_text = "entered" if new else "it was in the history already"
+    new = ledger.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
     console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    console.print(f"{file.name}: {outcome_text}.")
-    # Whoever wrote it may have been killed before the history knew.
-    for write in catch_up(cell, place, store):
+    console.print(f"{file.name}: {'entered' if new else 'it was in the history already'}.")
+    # The process that wrote it may have been killed before it was entered.
+    for write in ledger.catch_up():
         console.print(f"Entered too: {printable(str(write))}.")
-    left = verify_history(cell, place, store)
-    if left.unknown or not left.verdict.holds:
-        console.print("Not all writes that the audit tells of could be entered: see `drivegain history CELL --verify`.")
+    if not ledger.verify(_session_heads(ledger.cell)).complete:
+        console.print("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.")
 
 
-def _acknowledge(
-    store: HistoryStore,
-    place: HistoryPlace,
-    series: Series,
-    by: str | None,
-    why: str | None,
-    since: str | None,
-    now: datetime,
-) -> None:
+def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | None, now: datetime) -> None:
     if not why or not why.strip():
         raise UsageError(
             "--why",
             found="nothing",
-            expected="what happened, for whoever reads this in a year",
+            expected="what happened, for a reader in a year",
             remedy='give it: --why "gearbox changed"',
         )
     # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
     begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
-    who = str(applier(by))
-    try:
-        entry = append(
-            place.audit,
-            AuditAction.ACKNOWLEDGED,
-            at=now,
-            who=who,
-            subject=f"gain of {series.axis}",
-            details={"axis": series.axis, "since": begins.isoformat(), "why": why},
-        )
-    except OSError as error:
-        raise OutputFailed.of(place.audit, error) from error
-    store.acknowledge(Acknowledgement(series.axis, begins, now, who, why, entry.sha256))
+    ledger.acknowledge_change(series.axis, since=begins, at=now, who=ledger.who, why=why)
 
 
 def _day(text: str, now: datetime) -> datetime:
@@ -397,21 +280,21 @@ def _require_replaceable(path: Path, begins: bytes) -> None:
         )
 
 
-def _plot(path: Path, chosen: tuple[Series, ...], cell: Cell) -> None:
+def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
     drawn = [series for series in chosen if series.points]
-    if not drawn:
+    if picture is not None and not drawn:
         raise UsageError(
             "--plot", found="an empty history", expected="at least one calibration", remedy="fit and apply one first"
         )
-    try:
-        plot_history(path, drawn, title=f"Drive gains of {cell.name}")
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
+    if picture is not None:
+        _write(picture, lambda path: plot_history(path, drawn, title=f"Drive gains of {cell.name}"))
+    if csv is not None:
+        _write(csv, lambda path: replace_file(path, csv_text(chosen).encode()))
 
 
-def _write_csv(path: Path, chosen: tuple[Series, ...]) -> None:
+def _write(path: Path, write: Callable[[Path], object]) -> None:
     try:
-        replace_file(path, csv_text(chosen).encode())
+        write(path)
     except OSError as error:
         raise OutputFailed.of(path, error) from error
 

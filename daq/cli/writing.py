@@ -19,6 +19,7 @@ from daq.environment import login
 from daq.errors import AuditUnusable, DaqError, ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.judgement import NOTHING, Known, known_of
+from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.workflow.safeguards import bus_lock
 from daq.writeback.drive_target import DriveTarget
@@ -122,7 +123,7 @@ def record_in_history(cell: Cell, record: Callable[[HistoryStore], object]) -> N
     if cell.history is None:
         return
     try:
-        with HistoryStore(cell.history.store) as store:
+        with Ledger(cell, cell.history, login()) as store:
             record(store)
     except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
         _LOG.warning("the history does not know of this: %s", error)

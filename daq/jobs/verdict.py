@@ -23,7 +23,7 @@ from daq.ledger.audit import AuditAction, append, find_write_entry
 from daq.ledger.audit import read as read_audit
 from daq.ledger.entry import Event, WriteAction
 from daq.ledger.judgement import Known, judge, known_of
-from daq.ledger.store import HistoryStore
+from daq.ledger.ledger import Ledger
 from daq.ledger.verify import enter_applied
 from daq.ledger.watch import alarm_text, watch
 from daq.workflow.calibration_file import read
@@ -55,7 +55,7 @@ class GainHistory:
         self._target = str(resolve_links(controller))
         self._now = now
         self._who = who
-        self._store = HistoryStore(place.store)
+        self._store = Ledger(cell, place, who)
         self._cell = cell
         self._digest = ""
 

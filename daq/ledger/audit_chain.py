@@ -35,6 +35,10 @@ class AuditAction(Enum):
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
     ACKNOWLEDGED = "acknowledged"
+    CALIBRATION_ENTERED = "calibration entered"
+    """The history has this calibration; details: SHA-256 of its file, cell, time, and the whole document."""
+    WRITE_FOUND = "write found"
+    """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
     TORN_LINE = "torn line"
     """The line before is what a writer left that was killed or had no room; details: its length and SHA-256."""
 

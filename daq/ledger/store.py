@@ -15,7 +15,7 @@ from datetime import datetime
 from enum import Enum
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 from urllib.parse import quote
 
 from daq.errors import DataError, HistoryUnreadable, OutputFailed
@@ -149,7 +149,7 @@ class HistoryStore:
         self.path = path
         self._connection: sqlite3.Connection | None = None
 
-    def __enter__(self) -> HistoryStore:
+    def __enter__(self) -> Self:
         """Open it.
 
         Raises:

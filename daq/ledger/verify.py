@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,9 +10,11 @@ from datetime import UTC, datetime
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
+from daq.errors import DataError
 from daq.ledger.audit import AuditAction, AuditEntry, verify
 from daq.ledger.entry import Acknowledgement, Event, WriteAction, iso, utc
 from daq.ledger.store import HistoryStore
+from daq.workflow.calibration_file import decode
 from daq.writeback.drive_record import drives_of
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
@@ -21,10 +24,11 @@ _NEVER = datetime.min.replace(tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class AuditedWrite:
-    """A write that went well, as the audit tells of it.
+    """A successful write, as the audit log reports it.
 
     Attributes:
-        begun: the entry before it, None where the audit has none.
+        begun: the entry before the write, with its details; None where the audit log has none. Of a write that was
+            found later, the entry of the finding.
         ended: the entry after it.
     """
 
@@ -33,29 +37,29 @@ class AuditedWrite:
 
     @property
     def action(self) -> WriteAction:
-        """What was done."""
-        return _ENDS[self.ended.action]
+        """Applied or rolled back."""
+        return _ENDS.get(self.ended.action) or WriteAction(_text(self.ended, "action"))
 
     @property
     def calibration(self) -> str | None:
-        """SHA-256 of the calibration that was written, None where the audit does not tell."""
-        return None if self.begun is None else _calibration(self.begun)
+        """SHA-256 of the calibration, None where the audit log has none."""
+        return None if self.begun is None else calibration_of(self.begun)
 
     @property
     def cell(self) -> str | None:
-        """Name of the cell whose calibration was written, None where the audit does not tell."""
+        """Name of the calibration's cell, None where the audit log has none."""
         recorded = None if self.begun is None else self.begun.details.get("calibration")
         found = recorded.get("cell") if isinstance(recorded, dict) else None
         return found if isinstance(found, str) else None
 
     @property
     def sha256_after(self) -> str | None:
-        """Of what the target held afterwards, None where the audit does not tell."""
+        """SHA-256 of the target's content after the write, None where the audit log has none."""
         return None if self.begun is None else _text(self.begun, "sha256_after")
 
     @property
     def digests(self) -> frozenset[str]:
-        """Of its entries; an event of the history names one of them."""
+        """SHA-256 of its entries; an event of the history names one of them."""
         return frozenset(one.sha256 for one in (self.begun, self.ended) if one is not None)
 
     @property
@@ -69,26 +73,47 @@ class AuditedWrite:
         return f"entry {one.number} of the audit, {one.action.value} by {one.who} at {one.at} to {one.subject}{written}"
 
 
-def writes_to(cell: Cell, entries: Sequence[AuditEntry]) -> list[AuditedWrite]:
-    """To this cell's controller.
+def is_end(entry: AuditEntry) -> bool:
+    """Whether an entry says that a controller has other gains now."""
+    return entry.action in _ENDS or (
+        entry.action is AuditAction.WRITE_FOUND and _text(entry, "action") in {one.value for one in WriteAction}
+    )
 
-    Another cell may have the same audit, and even the same file: what was written with its calibrations, and the way
-    back from there, is told to its own history.
+
+def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = False) -> list[AuditedWrite]:
+    """Return the writes of this cell's calibrations, and the rollbacks of them.
+
+    Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
+    and rolled back from there, is in its own history.
+
+    Args:
+        cell: whose calibrations.
+        entries: of the audit log.
+        everywhere: also to files that are not the cell's controller (`apply --to`).
     """
     file = cell.controller_path
-    # Not `followed`: a link that it refuses today was followed on the day of the write.
+    # Not `resolve_links`: a link that it refuses today was followed on the day of the write.
     targets = {drives_of(cell.name), *(() if file is None else (os.path.realpath(file),))}
     begun = {one.number: one for one in entries if one.action in _BEGINS}
-    found, owners = [], dict[str, str]()
+    found: list[AuditedWrite] = []
+    owners = dict.fromkeys(targets, cell.name)
     for one in entries:
-        if one.action not in _ENDS or one.subject not in targets:
+        if not is_end(one) or not (everywhere or one.subject in targets):
             continue
-        write = AuditedWrite(begun.get(_number(one)), one)
+        write = AuditedWrite(one if one.action is AuditAction.WRITE_FOUND else begun.get(_number(one)), one)
         if write.action is WriteAction.APPLIED:
-            owners[one.subject] = write.cell or cell.name
-        if owners.get(one.subject, cell.name) == cell.name:
-            found.append(write)
+            owners[one.subject] = write.cell or (cell.name if one.subject in targets else "")
+        if owners.get(one.subject) == cell.name:
+            later = len(found)
+            if one.details.get("migrated") is True:  # its entry is younger than the write
+                later = next((i for i, other in enumerate(found) if _is_later(other.ended, one)), later)
+            found.insert(later, write)
     return found
+
+
+def _is_later(entry: AuditEntry, than: AuditEntry) -> bool:
+    at, other = at_of(entry), at_of(than)
+    return at is not None and other is not None and at > other
 
 
 def unknown_writes(
@@ -115,29 +140,47 @@ def unknown_writes(
     return unknown[::-1], new[::-1]
 
 
-def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[AuditedWrite, ...]:
-    """Enter writes of which the audit tells and the history does not know, in their order.
+def catch_up(
+    cell: Cell, place: HistoryPlace, store: HistoryStore, own: Collection[str] = ()
+) -> tuple[AuditedWrite, ...]:
+    """Enter in the history what the audit log reports and the history lacks, in the order of the audit log.
 
-    Only those behind the last one of their target that it knows, and of those with calibrations that it has: an event
-    is never entered behind a later one. Of an audit that is not what was written nothing is entered.
+    Calibrations and acknowledgements, and of each target the writes behind the last one that the history has: an event
+    is never entered behind a later one. A write whose calibration is not known stops its target. Nothing is entered
+    from an audit log that was changed.
+
+    Args:
+        cell: whose history it is.
+        place: of audit log and history.
+        store: the history.
+        own: SHA-256 of acknowledgements without the name of a cell that are this cell's.
 
     Returns:
-        what was entered.
+        the writes that were entered.
 
     Raises:
         AuditUnusable, HistoryUnreadable, OutputFailed: see `daq.ledger.audit.verify` and the store.
     """
-    verdict = verify(place.audit, store.audited())
+    audited = store.audited()
+    verdict = verify(place.audit, audited)
     if not verdict.holds:
         return ()
-    _, new = unknown_writes(writes_to(cell, verdict.entries), store.audited())
-    known, stopped, entered = {entry.digest for entry in store.entries()}, set[str](), []
+    known = {entry.digest for entry in store.entries()}
+    for one in verdict.entries:
+        if one.action is AuditAction.ACKNOWLEDGED and one.sha256 not in audited:
+            noted = acknowledgement_of(one)
+            if noted is not None and (one.sha256 in own or _text(one, "cell") == cell.name):
+                store.acknowledge(noted)
+        found = entered_calibration(one, cell.name)
+        if found is not None and found.digest not in known:
+            with contextlib.suppress(DataError):  # not comparable: of a history that was begun earlier
+                store.add(decode(found.document, f"entry {one.number}"), digest=found.digest, at=found.at)
+                known.add(found.digest)
+    _, new = unknown_writes(writes_to(cell, verdict.entries, everywhere=True), audited)
+    stopped, entered = set[str](), []
     for write in new:
-        one, after = write.ended, write.sha256_after
-        at, can = (
-            at_of(one),
-            after is not None and (write.action is WriteAction.ROLLED_BACK or write.calibration in known),
-        )
+        one, at, after = write.ended, at_of(write.ended), write.sha256_after
+        can = write.action is WriteAction.ROLLED_BACK or write.calibration in known
         if one.subject in stopped or at is None or after is None or not can:
             stopped.add(one.subject)
             continue
@@ -148,6 +191,56 @@ def catch_up(cell: Cell, place: HistoryPlace, store: HistoryStore) -> tuple[Audi
             store.applied(digest, at=at, who=one.who, target=one.subject, audit=one.sha256, sha256_after=after)
         entered.append(write)
     return tuple(entered)
+
+
+@dataclass(frozen=True, slots=True)
+class EnteredCalibration:
+    """A calibration in the audit log.
+
+    Attributes:
+        digest: SHA-256 of its file.
+        at: when it was entered in the history, UTC.
+        document: the file as drivegain spells it.
+    """
+
+    digest: str
+    at: datetime
+    document: bytes
+
+
+def entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | None:
+    """Return the calibration that an entry has, None where it has none of this cell."""
+    digest, document, at = _text(entry, "sha256"), _text(entry, "document"), utc(_text(entry, "entered") or "", _NEVER)
+    if entry.action is not AuditAction.CALIBRATION_ENTERED or _text(entry, "cell") != cell:
+        return None
+    return (
+        None
+        if digest is None or document is None or at == _NEVER
+        else EnteredCalibration(digest, at, document.encode())
+    )
+
+
+def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
+    """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
+    axis, why, at = _text(entry, "axis"), _text(entry, "why"), at_of(entry)
+    since = utc(_text(entry, "since") or "", _NEVER)
+    if axis is None or why is None or at is None or not _NEVER < since <= at:
+        return None
+    return Acknowledgement(axis, since, at, entry.who, why, entry.sha256)
+
+
+def calibration_flaws(entries: Sequence[AuditEntry], cell: str, store: HistoryStore) -> Iterator[str]:
+    """Report calibrations of the audit log that the history lacks or has otherwise, as sentences."""
+    documents = {entry.digest: store.document(entry.digest) for entry in store.entries()}
+    for one in entries:
+        found = entered_calibration(one, cell)
+        if found is None:
+            continue
+        name, said = f"calibration {found.digest[:12]}…", f"as entry {one.number} of the audit says"
+        if found.digest not in documents:
+            yield f"{name}: found no such row, expected one {said}"
+        elif documents[found.digest] != found.document:
+            yield f"document of {name}: found another one, expected it {said}"
 
 
 def enter_applied(cell: Cell, store: HistoryStore, event: Event) -> None:
@@ -180,15 +273,18 @@ def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) 
     """Where an event is not what the entry of the audit says that it names."""
     named = f"as entry {entry.number} of the audit, which it names"
     begun = next((one for one in entries if one.number == _number(entry)), entry) if entry.action in _ENDS else entry
+    action = AuditedWrite(begun, entry).action if is_end(entry) else event.action
     after = _text(begun, "sha256_after")
-    if entry.action in _ENDS and _ENDS[entry.action] is not event.action:
-        yield f"found {event.action.value}, expected {entry.action.value} {named}"
+    if action is not event.action:
+        yield f"found {event.action.value}, expected {action.value} {named}"
     if event.target != entry.subject:
         yield f"found target {event.target}, expected {entry.subject} {named}"
     if after is not None and event.sha256_after is not None and event.sha256_after != after:
         yield f"found sha256_after {event.sha256_after[:12]}…, expected {after[:12]}… {named}"
-    if entry.action is AuditAction.APPLIED and event.digest != (_calibration(begun) or event.digest):
-        yield f"found calibration {event.digest}, expected {_calibration(begun)} {named}"
+    if entry.action in (AuditAction.APPLIED, AuditAction.WRITE_FOUND) and event.digest != (
+        calibration_of(begun) or event.digest
+    ):
+        yield f"found calibration {event.digest}, expected {calibration_of(begun)} {named}"
     if (event.who, event.at) != (entry.who, at_of(entry)) and not _finished(event, entry, entries):
         if event.who != entry.who:
             yield f"found who {event.who!r}, expected {entry.who!r} {named}"
@@ -202,7 +298,7 @@ def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) ->
     Such an event names the entry of the begin, and another entry of the audit tells of whoever entered it: `nothing to
     do` of the same time, or the job around it.
     """
-    if entry.action in _ENDS or event.action is not WriteAction.APPLIED:
+    if is_end(entry) or event.action is not WriteAction.APPLIED:
         return False
     begun_at: datetime | None = None
     for one in entries:
@@ -254,7 +350,7 @@ def _number(entry: AuditEntry) -> int:
     return found if isinstance(found, int) else 0
 
 
-def _calibration(begun: AuditEntry) -> str | None:
+def calibration_of(begun: AuditEntry) -> str | None:
     recorded = begun.details.get("calibration")
     found = recorded.get("sha256") if isinstance(recorded, dict) else None
     return found if isinstance(found, str) else None

@@ -13,7 +13,9 @@ from rich.table import Table
 from daq.cli.verb import printable
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
+from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction
+from daq.ledger.ledger import Verification
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
@@ -187,6 +189,45 @@ def describe(
             for series in chosen
         ],
     }
+
+
+def say_verification(found: Verification, console: Console) -> None:
+    """Print the state of audit log and history; flaws are in the error."""
+    place, verdict = found.place, found.verdict
+    console.print(f"{place.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
+    if verdict.torn:
+        lines = ", ".join(map(str, verdict.torn))
+        console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
+    for one in verdict.open_writes:
+        begun = one.begun
+        console.print(
+            f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
+            f"ended; {printable(begun.subject)} was found {one.content.value}."
+        )
+    console.print(f"{place.store}: {'BROKEN' if found.broken else 'NOT COMPLETE' if found.unknown else 'sound'}.")
+
+
+def describe_verification(found: Verification) -> dict[str, Any]:
+    """Return the same for --json."""
+    verdict = found.verdict
+    return {
+        "file": str(found.place.audit),
+        "entries": len(verdict.entries),
+        "holds": verdict.holds,
+        "broken_line": verdict.broken,
+        "flaws": [{"line": f.line, "flaw": f.flaw.value, "says": f.says} for f in verdict.flaws],
+        "torn_lines": list(verdict.torn),
+        "open_writes": [{**_described(one.begun), "content": one.content.value} for one in verdict.open_writes],
+        "history_broken": [printable(one) for one in found.broken],
+        "unknown_writes": [
+            {**_described(one.ended), "action": one.ended.action.value, "calibration_sha256": one.calibration}
+            for one in found.unknown
+        ],
+    }
+
+
+def _described(entry: AuditEntry) -> dict[str, Any]:
+    return {"number": entry.number, "at": entry.at, "who": entry.who, "file": entry.subject}
 
 
 def _table(*first: str) -> Table:

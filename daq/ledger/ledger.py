@@ -1,0 +1,284 @@
+"""A cell's ledger: the audit log, which is the truth, and the history, which is its index.
+
+What is added goes to the audit log first and then to the index. A process that is killed in between leaves an index
+that lacks an entry; the next one adds it (`catch_up`), and `rebuild` makes the whole index anew.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import sqlite3
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.config.policy import HistoryPlace
+from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
+from daq.files import fsync_folder
+from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
+from daq.ledger.entry import Acknowledgement, Event, iso
+from daq.ledger.store import HistoryStore
+from daq.ledger.verify import (
+    AuditedWrite,
+    acknowledgement_flaws,
+    calibration_flaws,
+    catch_up,
+    entered_calibration,
+    event_flaws,
+    is_end,
+    unknown_writes,
+    writes_to,
+)
+from daq.workflow.calibration_file import decode, encode
+from ident.calibration import Calibration
+
+_LOG = logging.getLogger("drivegain")
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What a check of audit log and history found.
+
+    Attributes:
+        place: of both files.
+        verdict: on the audit log.
+        broken: what is broken in the history, and where its rows are not what the audit log says.
+        unknown: writes that the history lacks.
+        late: whether the history has a later write than one of these.
+    """
+
+    place: HistoryPlace
+    verdict: AuditVerdict
+    broken: tuple[str, ...]
+    unknown: tuple[AuditedWrite, ...] = ()
+    late: bool = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether the audit log holds and the history has every write."""
+        return self.verdict.holds and not self.unknown
+
+
+class Ledger(HistoryStore):
+    """The history of a cell that writes through the audit log; use as a context manager.
+
+    Where the audit log cannot be written, the history has what was added all the same, a warning says so, and `rebuild`
+    enters it in the audit log later: a write that was made must not be called undone.
+
+    Args:
+        cell: whose ledger it is.
+        place: of audit log and history.
+        who: the person or the job.
+    """
+
+    def __init__(self, cell: Cell, place: HistoryPlace, who: str) -> None:
+        super().__init__(place.store)
+        self.cell = cell
+        self.place = place
+        self.who = who
+
+    def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
+        """See `HistoryStore.add`."""
+        if self.document(digest) is None:
+            self._check_like(calibration)
+            self._enter_calibration(calibration, digest, at, at)
+        return super().add(calibration, digest=digest, at=at)
+
+    def acknowledge_change(self, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
+        """Record that a change of a gain is explained.
+
+        Raises:
+            AuditUnusable, HistoryUnreadable, OutputFailed: it could not be recorded.
+        """
+        details = {"axis": axis, "cell": self.cell.name, "since": since.isoformat(), "why": why}
+        try:
+            entry = append(
+                self.place.audit, AuditAction.ACKNOWLEDGED, at=at, who=who, subject=f"gain of {axis}", details=details
+            )
+        except OSError as error:
+            raise OutputFailed.of(self.place.audit, error) from error
+        self.acknowledge(Acknowledgement(axis, since, at, who, why, entry.sha256))
+
+    def catch_up(self) -> tuple[AuditedWrite, ...]:
+        """Add what the audit log has and the index lacks; see `daq.ledger.verify.catch_up`."""
+        return catch_up(self.cell, self.place, self)
+
+    def verify(self, heads: Collection[str] = ()) -> Verification:
+        """Check audit log and history, each by itself and against the other.
+
+        Args:
+            heads: SHA-256 of entries of the audit log that were noted elsewhere, besides the history.
+
+        Raises:
+            AuditUnusable, HistoryUnreadable: see `daq.ledger.audit.verify` and the store.
+        """
+        verdict, broken = verify(self.place.audit, self.audited().union(heads)), self.integrity()
+        if not verdict.holds:  # its entries prove nothing
+            return Verification(self.place, verdict, broken)
+        entries, audited = verdict.entries, self.audited()
+        by_digest = {one.sha256: one for one in entries}
+        for number, event in enumerate(self.events(), start=1):
+            if (entry := by_digest.get(event.audit or "")) is not None:
+                broken += tuple(f"event {number}: {flaw}" for flaw in event_flaws(event, entry, entries))
+        for noted in self.acknowledgements():
+            if (entry := by_digest.get(noted.audit)) is not None:
+                name = f"acknowledgement of {noted.axis} at {iso(noted.at)}"
+                broken += tuple(f"{name}: {flaw}" for flaw in acknowledgement_flaws(noted, entry))
+        broken += tuple(calibration_flaws(entries, self.cell.name, self))
+        unknown, new = unknown_writes(writes_to(self.cell, entries), audited)
+        return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
+
+    def enter_in_audit(self, at: datetime) -> None:
+        """Enter in the audit log what only the history has: calibrations and found writes of an earlier version."""
+        for one in self.entries():
+            document = self.document(one.digest)
+            if document is not None:
+                self._enter_calibration(decode(document, one.digest), one.digest, one.entered, at)
+        found = {
+            (one.subject, one.at, one.who) for one in read(self.place.audit) if one.action is AuditAction.WRITE_FOUND
+        }
+        for event in self.events():
+            if (event.target, event.at.isoformat(), event.who) not in found:
+                self._with_entry(event, event.who, {"migrated": True})
+
+    def _note(self, connection: sqlite3.Connection, event: Event) -> None:
+        """Enter a write; one that no entry of the audit log ends is entered there as found."""
+        super()._note(connection, self._with_entry(event, event.who, {}))
+
+    def _with_entry(self, event: Event, who: str, more: dict[str, object]) -> Event:
+        try:
+            entries = {one.sha256: one for one in read(self.place.audit)}
+            named = entries.get(event.audit or "")
+            if named is not None and is_end(named):
+                return event
+            details: dict[str, object] = {
+                "action": event.action.value,
+                "begun": None if named is None else named.number,
+                "calibration": {"sha256": event.digest, "cell": self.cell.name},
+                "sha256_after": event.sha256_after,
+                **more,
+            }
+            found = append(
+                self.place.audit, AuditAction.WRITE_FOUND, at=event.at, who=who, subject=event.target, details=details
+            )
+            return replace(event, audit=found.sha256)
+        except (AuditUnusable, OSError) as error:
+            _LOG.warning("the audit log does not have this write: %s", error)
+            return event
+
+    def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> None:
+        try:
+            if any(_has(one, digest, self.cell.name) for one in read(self.place.audit)):
+                return
+            append(
+                self.place.audit,
+                AuditAction.CALIBRATION_ENTERED,
+                at=at,
+                who=self.who,
+                subject=f"history of {self.cell.name}",
+                details={
+                    "sha256": digest,
+                    "cell": self.cell.name,
+                    "entered": iso(entered),
+                    "document": encode(calibration).decode(),
+                },
+            )
+        except (AuditUnusable, OSError) as error:
+            _LOG.warning("the audit log does not have this calibration: %s", error)
+
+
+def _has(entry: AuditEntry, digest: str, cell: str) -> bool:
+    found = entered_calibration(entry, cell)
+    return found is not None and found.digest == digest
+
+
+@dataclass(frozen=True, slots=True)
+class Rebuilt:
+    """What a history has after `rebuild`.
+
+    Attributes:
+        calibrations, writes, acknowledgements: how many.
+        kept: the history that was replaced, None where there was none.
+        trusted: whether what only the old history had was entered in the audit log: not where it was broken.
+    """
+
+    calibrations: int
+    writes: int
+    acknowledgements: int
+    kept: Path | None
+    trusted: bool
+
+
+def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: Collection[str] = ()) -> Rebuilt:
+    """Make the history anew from the audit log; the old file is kept under another name.
+
+    Calibrations and writes that only the history has, which an earlier version wrote, are entered in the audit log
+    first, unless the history contradicts itself or the audit log.
+
+    Args:
+        cell: whose history it is.
+        place: of audit log and history.
+        who: the person.
+        at: now, with its zone.
+        heads: SHA-256 of entries of the audit log that were noted elsewhere.
+
+    Raises:
+        DataError: the audit log is not what was written; nothing was changed.
+        AuditUnusable, OutputFailed: a file cannot be written; the history is as it was.
+    """
+    entries = read(place.audit)
+    own = frozenset(one.sha256 for one in entries if "cell" not in one.details)
+    verdict, trusted = verify(place.audit, heads), False
+    try:
+        with Ledger(cell, place, who) as old:
+            found = old.verify(heads)
+            verdict, trusted = found.verdict, not found.broken
+            if trusted and verdict.holds and place.store.exists():
+                own = old.audited()
+                old.enter_in_audit(at)
+    except HistoryUnreadable as error:
+        _LOG.warning("the old history cannot be read: %s", error)
+    if not verdict.holds:
+        raise audit_error(place, verdict)
+    new = place.store.with_name(f"{place.store.name}.part")
+    try:
+        new.unlink(missing_ok=True)
+        with HistoryStore(new) as index:
+            catch_up(cell, place, index, own)
+            counts = len(index.entries()), len(index.events()), len(index.acknowledgements())
+        kept = _keep(place.store, at) if place.store.exists() else None
+        if new.exists():
+            new.replace(place.store)
+        else:
+            place.store.unlink(missing_ok=True)
+        fsync_folder(place.store.resolve().parent)
+    except OSError as error:
+        raise OutputFailed.of(place.store, error) from error
+    return Rebuilt(*counts, kept, trusted)
+
+
+def _keep(store: Path, at: datetime) -> Path:
+    """Copy a history, and move the journal that SQLite would otherwise apply to the new one."""
+    kept = store.with_name(f"{store.name}.{at:%Y%m%dT%H%M%SZ}.bak")
+    shutil.copyfile(store, kept)
+    journal = store.with_name(f"{store.name}-journal")
+    if journal.exists():
+        journal.rename(kept.with_name(f"{kept.name}-journal"))
+    return kept
+
+
+def audit_error(place: HistoryPlace, verdict: AuditVerdict) -> DataError:
+    """Return the error for an audit log that is not what was written."""
+    first = verdict.flaws[0]
+    more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
+    return DataError(
+        f"{place.audit}, line {first.line}",
+        found=f"{len(verdict.flaws)} places that are not what was written{more}\n ",
+        expected="entries that were never changed, moved or removed",
+        remedy="keep this file as it is, compare it with a backup, ask who can write to it; until that is known trust "
+        "the controller's file by its backups only, and begin audit and history anew, both (`history.audit`, "
+        "`history.store`): the old history would report the missing entries for ever",
+    )
