@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +126,39 @@ def _source(run: Run, role: str) -> Source:
     mounted = run.payload
     name, mass_kg = (None, None) if mounted is None else (mounted.name, mounted.known.get("m"))
     return Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
+
+
+BOOTSTRAP_SEED = 0
+
+
+def fit_logs(
+    logs: Sequence[Path],
+    *,
+    holdout: Sequence[Path] = (),
+    cell: Cell | None = None,
+    effects: bool = True,
+    created: datetime | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """Identify the gains from logs, detect and add missing effects, and return the calibration.
+
+    Args:
+        logs: at least one run without load and one with a weighed payload.
+        holdout: held-out logs, on which the errors are reported.
+        cell: description that replaces the one in the logs.
+        effects: detect effects that the declared model lacks, and refit with those that pass.
+        created: time stamp of the calibration, with its time zone; now when None.
+        progress: receives a line for each step.
+
+    Raises:
+        DataError: a log cannot be read, or its samples cannot be used.
+        ConfigurationError: the description of the cell is inconsistent.
+        ident.IdentificationError: the runs do not identify the gains.
+    """
+    fitted = fit(logs, holdout=holdout, cell=cell)
+    if effects:
+        fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
+    return calibration_of(fitted, created or datetime.now(UTC))
 
 
 def fit(
