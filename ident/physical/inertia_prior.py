@@ -1,4 +1,4 @@
-"""What is believed of the links where the data say nothing: the URDF's own inertias, or a ball."""
+"""Expected inertias of the links where the data do not determine them: the URDF's own, or those of a ball."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ident.model.robot import read_urdf
 FloatArray = NDArray[np.float64]
 
 DEFAULT_MASS_KG = 1.0
-"""Of a link of which the URDF says no mass."""
+"""Mass of a link without one in the URDF."""
 DEFAULT_RADIUS_M = 0.1
-"""Of the solid ball that stands for a link whose inertia the URDF does not say, or says wrongly."""
+"""Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist."""
 _THINNEST = 1e-6
-"""Smallest share of a ball's second moment that a link of the URDF may have in any direction: a rod or a plate passes,
+"""Smallest share of a ball's second moment that a link of the URDF may have in any direction: rods and plates pass,
 rounding errors around zero do not."""
 
 
@@ -35,7 +35,7 @@ class InertiaPrior:
 
 
 def urdf_links(urdf: str) -> FloatArray:
-    """Inertial parameters of the moving links of a URDF, bodies behind fixed joints included, shape (n, 10).
+    """Return inertial parameters of the moving links of a URDF with bodies behind fixed joints, shape (n, 10).
 
     Raises:
         ModelError: the text is no URDF.
@@ -44,7 +44,7 @@ def urdf_links(urdf: str) -> FloatArray:
 
 
 def inertia_prior(urdf: str) -> InertiaPrior:
-    """The URDF's inertias where they are those of a body; else a solid ball about the centre of mass.
+    """Take the URDF's inertias where a body can have them, else those of a solid ball about the centre of mass.
 
     The ball has DEFAULT_RADIUS_M, and the URDF's mass and centre of mass; without a mass, DEFAULT_MASS_KG at the
     origin of the link frame.
@@ -55,10 +55,10 @@ def inertia_prior(urdf: str) -> InertiaPrior:
     links = urdf_links(urdf)
     assumed = []
     for index, link in enumerate(links):
-        mass = float(link[9])
-        centre = link[6:9] / mass if mass > 0.0 else np.zeros(3)
-        moment = 0.4 * DEFAULT_RADIUS_M**2 * np.eye(3)
-        ball = Body(mass if mass > 0.0 else DEFAULT_MASS_KG, centre, (mass if mass > 0.0 else DEFAULT_MASS_KG) * moment)
+        has_mass = float(link[9]) > 0.0
+        mass = float(link[9]) if has_mass else DEFAULT_MASS_KG
+        centre = link[6:9] / mass if has_mass else np.zeros(3)
+        ball = Body(mass, centre, mass * (0.4 * DEFAULT_RADIUS_M**2 * np.eye(3)))
         inside = np.linalg.inv(np.linalg.cholesky(pseudo_inertia(ball.parameters)))
         if np.linalg.eigvalsh(inside @ pseudo_inertia(link) @ inside.T)[0] < _THINNEST:
             links[index] = ball.parameters

@@ -1,4 +1,4 @@
-"""From base parameters to the parameters of bodies, rotors and friction that could exist and move alike."""
+"""Physically consistent standard parameters: bodies, rotors and friction that could exist and have the same torque."""
 
 from __future__ import annotations
 
@@ -12,27 +12,26 @@ from ident.model.base import BaseParameters
 from ident.model.bodies import pseudo_inertia
 from ident.model.model import Model
 from ident.physical.inertia_prior import InertiaPrior
-from ident.physical.programme import MARGIN, NotPhysical, Programme, seen_from
+from ident.physical.programme import MARGIN, NotPhysical, Programme, relative_to_prior
 
 FloatArray = NDArray[np.float64]
 
 EXACT = 1e-6
 """Share of the torque below which a consistent set counts as predicting the identified torque."""
-
 SLACK = 0.1
-"""Where the nearest torque is not the identified one, bodies are sought among all that are at most this share farther
-from it: right at the nearest there is no choice left, and the bodies are as odd as the errors of the data make them."""
+"""If the nearest torque is not the identified one, bodies are sought among all that are at most this share farther from
+it: right at the nearest there is no choice left, and the errors of the data decide on the bodies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhysicalParameters:
-    """Standard parameters that a robot could have, with their own certificate.
+    """Physically consistent standard parameters with their certificate.
 
     Attributes:
-        model: whose columns they belong to.
+        model: the declared model.
         standard: χ_st, shape (c,).
-        base: what they are near to, and how it is grouped.
-        identified: values of the base parameters as given, shape (b,).
+        base: grouping of the base parameters.
+        identified: given values of the base parameters, shape (b,).
         realised: base parameters of `standard`, shape (b,); those identified where a consistent set exists.
         torque_change_percent: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
         eigenvalues: smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
@@ -65,26 +64,26 @@ def physical_parameters(
     prior: InertiaPrior,
     other_friction: frozenset[int] = frozenset(),
 ) -> PhysicalParameters:
-    """Physically consistent standard parameters that predict the torque of base parameters.
+    """Find physically consistent standard parameters that predict the torque of base parameters.
 
-    Consistent is: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry friction fs and fsm,
-    and what motors that turn with several joints have of their own (Iam, fvm), are not negative; the kinetic energy of
+    Consistent means: every link's pseudo-inertia is positive definite (`ident.model.bodies`); dry friction fs and fsm,
+    and the own parameters of motors that turn with several joints (Iam, fvm), are not negative; the kinetic energy of
     the rotors and the power lost to viscous friction are not negative in any motion, that is
 
         diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) ⪰ 0, and the same with fv and fvm (paper eq. 25),
 
-    which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free. First the torque nearest to the identified one
-    is sought (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); then, of all sets with this torque, the one nearest
-    to the prior.
+    which without coupled motors is Ia ≥ 0 and fv ≥ 0. Offsets are free. The first programme finds
+    the torque nearest to the identified one (‖Δτ_j‖/‖τ_j‖ over all joints, on the given motion); the second finds, of
+    all sets with this torque, the one nearest to the prior.
 
     Args:
         model: the declared model.
         base: the grouping of its base parameters.
         values: identified values, shape (b,).
-        columns: the model's regressor of a rich motion, shape (n, c, k); its torque is the measure of nearness.
-        prior: what the links are believed to be.
-        other_friction: axes (from 0) whose friction has further terms outside of this model, so that fs and fv alone
-            may have any sign.
+        columns: the model's regressor of a rich motion, shape (n, c, k), whose torque measures the distance.
+        prior: expected links.
+        other_friction: axes (from 0) with friction terms outside of this model, so that fs and fv alone may have any
+            sign.
 
     Raises:
         NotPhysical: no set was found, or it does not pass its own test.
@@ -104,10 +103,10 @@ def physical_parameters(
     nearest = programme.nearest(values)
     apart = float(np.linalg.norm(triangle @ (base.grouping @ nearest - values)))
     exact = apart <= EXACT
-    directions = _invisible(base) if exact else np.eye(len(nearest))
+    directions = _null_space(base) if exact else np.eye(len(nearest))
     standard = programme.closest_to_prior(nearest, directions, values, (1.0 + SLACK) * apart)
     if exact:
-        # The solver is this near to the identified parameters: the leading ones take the rest.
+        # The leading parameters take the rest of the solver's tolerance.
         standard[leading] += values - base.grouping @ standard
     for column in programme.positive:
         standard[column] = max(standard[column], 0.0)
@@ -121,12 +120,13 @@ def physical_parameters(
             identified, np.einsum("jck,c->jk", columns, standard), np.ones(identified.shape, dtype=np.bool_)
         ),
         eigenvalues=np.asarray(
-            np.linalg.eigvalsh(seen_from(programme.factors, standard[_link_columns(model)]))[:, 0], dtype=np.float64
+            np.linalg.eigvalsh(relative_to_prior(programme.factors, standard[_link_columns(model)]))[:, 0],
+            dtype=np.float64,
         ),
     )
     if not np.all(found.eigenvalues >= 0.5 * MARGIN):
         raise NotPhysical(
-            "the solution has a link that cannot be", f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}"
+            "the solution has an impossible link", f"eigenvalues {np.array2string(found.eigenvalues, precision=3)}"
         )
     return found
 
@@ -172,7 +172,7 @@ def _programme(
 
 
 def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
-    """Joints in groups that share motors."""
+    """Group joints that share motors."""
     groups: list[set[int]] = [{joint} for joint in range(model.robot.joint_count)]
     for motor in model.drive_train.coupled:
         turned = set(np.flatnonzero(model.drive_train.direction[motor]).tolist())
@@ -182,7 +182,7 @@ def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
 
 
 def _shares(model: Model, joints: tuple[int, ...], motors: list[int]) -> FloatArray:
-    """What the parameter of each joint, then of each motor, adds to the matrix over these joints, shape (p, k, k)."""
+    """Contribution of each joint's, then each motor's parameter to the matrix over these joints, shape (p, k, k)."""
     shares = [np.diag(unit) for unit in np.eye(len(joints))]
     for motor in motors:
         r = model.drive_train.direction[motor, list(joints)]
@@ -194,8 +194,8 @@ def _link_columns(model: Model) -> NDArray[np.int64]:
     return 14 * np.arange(model.robot.joint_count)[:, None] + np.arange(10)
 
 
-def _invisible(base: BaseParameters) -> FloatArray:
-    """Changes of the standard parameters that leave all base parameters, shape (c, c − b)."""
+def _null_space(base: BaseParameters) -> FloatArray:
+    """Changes of the standard parameters that keep all base parameters, shape (c, c − b)."""
     count = base.grouping.shape[1]
     rest = np.setdiff1d(np.arange(count), base.independent)
     out = np.zeros((count, len(rest)))

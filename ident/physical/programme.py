@@ -1,7 +1,7 @@
 """The two semidefinite programmes behind `ident.physical.physical`; cvxpy and Clarabel are imported when one is solved.
 
-Unknowns are, of each link, its pseudo-inertia seen from its prior, Q = L⁻¹ P L⁻ᵀ with P_prior = L Lᵀ, and the other
-standard parameters, divided so that one unit of each makes the whole torque. Everything is then of the size of one.
+Unknowns are the pseudo-inertia of each link relative to its prior, Q = L⁻¹ P L⁻ᵀ with P_prior = L Lᵀ, and the other
+standard parameters, scaled so that one unit of each makes the whole torque. All unknowns are then of order one.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ FloatArray = NDArray[np.float64]
 MARGIN = 1e-4
 """Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)."""
 _ROOM = 2.0
-"""The first programme keeps this multiple of the margin, so that the second has an inside to search."""
+"""The first programme keeps this multiple of the margin, so that the second has room to search."""
 _SCALAR_ROOM = 2e-7
-"""For drive-chain parameters that may not be negative [share of the whole torque]: more than the solver's tolerance, so
-that none is, and less than what counts as a change; half of it is kept by the second programme."""
+"""Lower bound of drive-chain parameters that may not be negative [share of the whole torque]: above the solver's
+tolerance, and too small to count as a change; the second programme keeps half of it."""
 _TRACE = 1e-8
 """Weight that bounds the links in the first programme where the torque does not; the norm beside it is exact."""
 _RIDGE = 1e-6
-"""Weight of the drive-chain parameters in the second: decides between those that the torque cannot tell apart."""
+"""Weight of the drive-chain parameters in the second: decides between those that the torque cannot distinguish."""
 _INVISIBLE = 1e-9
-"""Effect on the relative torque of a unit step along directions that leave the torque."""
+"""Change of the relative torque below which a unit step leaves the torque unchanged."""
 _ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
-"""Settings of Clarabel, tried in turn: now and then a programme ends in a numerical error with the first."""
+"""Settings of Clarabel, tried in turn: some programmes end in a numerical error with the first."""
 
 
 class NotPhysical(IdentificationError):
@@ -47,17 +47,17 @@ class NotPhysical(IdentificationError):
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """What both programmes are about; c standard parameters, n links, b base parameters.
+    """Data of both programmes for c standard parameters, n links and b base parameters.
 
     Attributes:
         factors: L of each link's prior, shape (n, 4, 4).
         link_columns: indices of each link's ten parameters, shape (n, 10).
         scalars: indices of the other parameters, shape (s,).
-        scales: what makes the whole torque, of each of these, shape (s,).
+        scales: value of each of these that makes the whole torque, shape (s,).
         grouping: base parameters = grouping @ standard parameters, shape (b, c).
         triangle: a torque of relative size ‖triangle @ base‖, shape (b, b).
         positive: parameters that may not be negative.
-        dissipative: for each set of motors that turn with the same joints: parameters, and what each of them adds to
+        dissipative: for each set of motors that turn with the same joints: parameters, and the contribution of each to
             the symmetric matrix that must be positive semidefinite, shape (p, k, k).
     """
 
@@ -71,7 +71,7 @@ class Programme:
     dissipative: tuple[tuple[tuple[int, ...], FloatArray], ...]
 
     def nearest(self, base: FloatArray) -> FloatArray:
-        """The consistent standard parameters whose torque is nearest to that of ``base``, shape (b,) → (c,).
+        """Find the consistent standard parameters whose torque is nearest to that of ``base``, shape (b,) → (c,).
 
         Raises:
             NotPhysical: the solver found none.
@@ -95,16 +95,16 @@ class Programme:
     def closest_to_prior(
         self, start: FloatArray, directions: FloatArray, base: FloatArray, farthest: float
     ) -> FloatArray:
-        """Of the consistent standard parameters with almost the same torque, those nearest to the prior, shape (c,).
+        """Find the standard parameters nearest to the prior with almost the same torque, shape (c,).
 
         The distance of a link is the divergence tr Q − log det Q − 4 (Lee, Wensing, Park: Geometric Robot Dynamic
-        Identification, 2020): it does not depend on frames and units, and grows without limit towards a body that
-        cannot be.
+        Identification, 2020): it does not depend on frames and units, and grows without limit towards an
+        impossible body.
 
         Args:
             start: consistent standard parameters, shape (c,).
-            directions: independent changes of them to choose from, shape (c, d).
-            base: base parameters that the torque is compared with, shape (b,).
+            directions: independent changes of them that are allowed, shape (c, d).
+            base: base parameters with the identified torque, shape (b,).
             farthest: largest ‖triangle @ (base parameters − base)‖.
 
         Raises:
@@ -112,22 +112,15 @@ class Programme:
         """
         import cvxpy as cp  # noqa: PLC0415 - as above
 
-        links, scalars = self._seen(start)
-        link_changes, scalar_changes = zip(*(self._seen(change) for change in directions.T), strict=True)
-        # Orthonormal steps: the solver sees neither kg beside kg m² nor two directions that are almost one.
-        steps = np.column_stack(
-            [
-                np.concatenate((change.ravel(), scalar))
-                for change, scalar in zip(link_changes, scalar_changes, strict=True)
-            ]
-        )
-        steps, upper = np.linalg.qr(steps)
+        # Orthonormal steps: the solver gets neither kg beside kg m² nor two directions that are almost one.
+        steps, upper = np.linalg.qr(np.column_stack([self._scaled(change) for change in directions.T]))
         rotation = np.linalg.inv(upper)
         step = cp.Variable(steps.shape[1])
-        moved = np.concatenate((links.ravel(), scalars)) + steps @ step
-        found = [cp.reshape(moved[16 * i : 16 * i + 16], (4, 4), order="C") for i in range(len(links))]
+        moved = self._scaled(start) + steps @ step
+        count = len(self.factors)
+        found = [cp.reshape(moved[16 * i : 16 * i + 16], (4, 4), order="C") for i in range(count)]
         found = [0.5 * (link + link.T) for link in found]
-        drive = moved[16 * len(links) :]
+        drive = moved[16 * count :]
         divergence = sum(cp.trace(link) - cp.log_det(link) for link in found)
         objective = cp.Minimize(divergence + _RIDGE * cp.sum_squares(drive))
         constraints = self._consistent(cp, found, drive, MARGIN, 0.5 * _SCALAR_ROOM)
@@ -137,17 +130,17 @@ class Programme:
             constraints.append(cp.norm2(apart + effect @ step) <= farthest)
         _solve(cp, objective, constraints, (step,))
         change = steps @ step.value
-        return start + self._standard(change[: 16 * len(links)].reshape(-1, 4, 4), change[16 * len(links) :])
+        return start + self._standard(change[: 16 * count].reshape(-1, 4, 4), change[16 * count :])
 
     def _consistent(self, cp: Any, links: list[Any], scalars: Any, margin: float, room: float) -> list[Any]:
-        """Constraints on the links as their priors see them, and on the scaled other parameters."""
+        """Constraints on the links relative to their priors, and on the scaled other parameters."""
         constraints = [link >> margin * np.eye(4) for link in links]
         where = {int(column): number for number, column in enumerate(self.scalars)}
         if self.positive:
             constraints.append(scalars[[where[column] for column in self.positive]] >= room)
         for columns, parts in self.dissipative:
             size = np.array([self.scales[where[column]] for column in columns])
-            # Seen in the scales of its diagonal, like everything else.
+            # In the scales of its diagonal, like everything else.
             unit = np.sqrt([size[np.argmax(parts[:, k, k])] for k in range(parts.shape[1])])
             matrix = sum(
                 scalars[where[column]] * (part * scale / np.outer(unit, unit))
@@ -156,12 +149,13 @@ class Programme:
             constraints.append(matrix >> room * np.eye(len(unit)))
         return constraints
 
-    def _seen(self, standard: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Q of every link and the scaled other parameters, shapes (n, 4, 4) and (s,)."""
-        return seen_from(self.factors, standard[self.link_columns]), standard[self.scalars] / self.scales
+    def _scaled(self, standard: FloatArray) -> FloatArray:
+        """Q of every link, row by row, and the scaled other parameters, shape (16 n + s,)."""
+        links = relative_to_prior(self.factors, standard[self.link_columns])
+        return np.concatenate((links.ravel(), standard[self.scalars] / self.scales))
 
     def _standard(self, links: FloatArray, scalars: FloatArray) -> FloatArray:
-        """The inverse of `_seen`, shape (c,)."""
+        """Standard parameters of links Q, shape (n, 4, 4), and scaled other parameters, shape (c,)."""
         standard = np.zeros(self.grouping.shape[1])
         standard[self.scalars] = self.scales * scalars
         for link, factor, columns in zip(links, self.factors, self.link_columns, strict=True):
@@ -169,26 +163,26 @@ class Programme:
         return standard
 
 
-def seen_from(factors: FloatArray, links: FloatArray) -> FloatArray:
+def relative_to_prior(factors: FloatArray, links: FloatArray) -> FloatArray:
     """Q = L⁻¹ P L⁻ᵀ of links, shapes (n, 4, 4) and (n, 10) → (n, 4, 4)."""
-    inside = np.linalg.inv(factors)
-    return np.array([inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inside, links, strict=True)])
+    inverse = np.linalg.inv(factors)
+    return np.array([inv @ pseudo_inertia(link) @ inv.T for inv, link in zip(inverse, links, strict=True)])
 
 
 def _solve(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[Any]) -> None:
     problem = cp.Problem(objective, constraints)
-    said = ""
+    message = ""
     for settings in _ATTEMPTS:
         with warnings.catch_warnings():
-            # What a solver says of its own accuracy is checked on its result by ident.physical.
+            # The accuracy that the solver warns about is checked on its result by ident.physical.
             warnings.simplefilter("ignore")
             try:
                 problem.solve(solver=cp.CLARABEL, **settings)
             except cp.SolverError as error:
-                said = str(error)
+                message = str(error)
         if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(one.value is not None for one in unknowns):
             return
-    raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {said}".strip())
+    raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {message}".strip())
 
 
 def _linear_map(factor: FloatArray, columns: NDArray[np.int64], count: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The grouping of a calibration's base parameters, found again from their names and the robot."""
+"""Recover the grouping of a calibration's base parameters from their names and the robot."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from ident.model.model import Model
 FloatArray = NDArray[np.float64]
 
 _SAME = 1e-4
-"""The names carry six decimals of each weight; data that were filtered give them with a few digits less."""
+"""Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less."""
 _TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 
 
 def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
-    """Independent states within limits, for what must hold in every motion.
+    """Draw independent states within limits, to test statements about every motion.
 
     Args:
-        limits: of each joint the middle of its range, half the range, speed and acceleration, in four rows [rad or m,
-            and their derivatives], shape (4, n).
+        limits: middle of the range, half the range, speed and acceleration of each joint, in four rows [rad or m, and
+            their derivatives], shape (4, n).
         samples: k.
         seed: the same seed gives the same states.
     """
@@ -37,7 +37,7 @@ def random_motion(limits: FloatArray, samples: int, seed: int) -> Motion:
 
 
 def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BaseParameters:
-    """Which standard parameters each base parameter gathers, to full precision.
+    """Compute the weights of standard parameters in each base parameter to full precision.
 
     A calibration keeps the weights of the grouping as text of six decimals; its leading names are exact. Every column
     is a combination of the leading ones (paper §2.1), so the weights follow from any motion that is rich enough.
@@ -49,15 +49,15 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
 
     Raises:
         ModelError: the names are not those of this robot: unknown, or with other weights (another geometry, other
-            gravity), or too few (the data of the fit have not shown everything) or too many.
+            gravity), or too few (not everything was identifiable in the fit) or too many.
     """
     index = {column.name: number for number, column in enumerate(model.columns)}
     leading = [name.split(" ", 1)[0] for name in names]
     foreign = [name for name in leading if name not in index]
     if foreign:
         raise ModelError(
-            f"the calibration has parameters that this robot has not: {', '.join(foreign)}; is it the cell of the fit, "
-            "with its drive train?"
+            f"the calibration has parameters that this robot does not have: {', '.join(foreign)}; use the cell of the "
+            "fit, with its drive train"
         )
     order = np.argsort([index[name] for name in leading])
     independent = tuple(index[leading[i]] for i in order)
@@ -76,8 +76,8 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     unseen = [column.name for column, rest in zip(model.columns, left, strict=True) if rest > 1e-6]
     if unseen:
         raise ModelError(
-            f"the calibration says nothing of {', '.join(unseen)}, which this robot's torque depends on: its data have "
-            "not shown them, or it is of another robot"
+            f"the calibration lacks {', '.join(unseen)}, which this robot's torque depends on: its data did not "
+            "determine them, or it is of another robot"
         )
     grouping = weights * scale / scale[list(independent), None]
     grouping[:, list(independent)] = np.eye(len(independent))
@@ -88,10 +88,10 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
 
 def _check_weights(name: str, row: FloatArray, index: dict[str, int]) -> None:
     for sign, size, other in _TERM.findall(name):
-        said = float(sign + size)
+        declared = float(sign + size)
         found = float(row[index[other]]) if other in index else float("nan")
-        if not abs(found - said) <= _SAME * max(1.0, abs(said)):
+        if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):
             raise ModelError(
-                f"the base parameter {name!r} of the calibration gathers {said:g}*{other}; this robot's geometry gives "
-                f"{found:.6g}: it is not the robot, the gravity or the drive train of the fit"
+                f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; this robot's geometry "
+                f"gives {found:.6g}: it is not the robot, the gravity or the drive train of the fit"
             )
