@@ -9,7 +9,7 @@ Everything that a program needs is here; importing `daq` loads no module before 
     for gain in calibration.gains:
         print(f"{gain.axis}: {gain.value:.2f} ± {gain.std:.2f} {gain.unit}")
     daq.save_calibration(calibration, Path("calibration.yaml"))
-    proposal = daq.propose(cell, daq.Request(calibration, now=datetime.now(UTC)))
+    proposal = daq.propose(daq.FileTarget.of(cell), daq.Request(calibration, now=datetime.now(UTC)))
     if not proposal.refusals:
         daq.apply(proposal, datetime.now(UTC), audit=cell.history.audit, who="Ada")
 
@@ -19,7 +19,8 @@ read a log                          `read_log` (raw counts), `load_run` (SI unit
 logs to a `Calibration`              `fit_logs`; in steps: `fit`, `close_loop`, `calibration_of`, `Fit`
 keep a calibration                  `save_calibration`, `load_calibration`
 test it on other logs               `validate`, `Validation`
-write it to the controller          `propose`, `Proposal`, `Request`, `apply`, `Written`
+write it to the controller          `FileTarget`, `DriveTarget`, `propose`, `Request`, `Proposal`, `apply`,
+                                    `Written`, `rollback`
 errors                              `DaqError` and its subclasses (daq/errors.py)
 ==================================  ==============================================================================
 
@@ -54,10 +55,10 @@ if TYPE_CHECKING:
     from daq.workflow.calibration_file import save as save_calibration
     from daq.workflow.fit import Fit, calibration_of, close_loop, fit, fit_logs
     from daq.workflow.validate import Validation, validate
-    from daq.writeback.file_proposal import Proposal, apply
-    from daq.writeback.file_proposal import propose_for as propose
-    from daq.writeback.file_target import Written
+    from daq.writeback.drive_target import DriveTarget
+    from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
+    from daq.writeback.target import Proposal, Written, apply, propose, rollback
     from ident.calibration import Calibration
 
 __all__ = [
@@ -69,7 +70,9 @@ __all__ = [
     "ControllerUnfit",
     "DaqError",
     "DataError",
+    "DriveTarget",
     "ExitCode",
+    "FileTarget",
     "Fit",
     "Log",
     "LogUnreadable",
@@ -90,6 +93,7 @@ __all__ = [
     "load_run",
     "propose",
     "read_log",
+    "rollback",
     "save_calibration",
     "validate",
 ]
@@ -102,13 +106,14 @@ _HOMES = {
     "daq.workflow.calibration_file": ("load_calibration", "save_calibration"),
     "daq.workflow.fit": ("Fit", "calibration_of", "close_loop", "fit", "fit_logs"),
     "daq.workflow.validate": ("Validation", "validate"),
-    "daq.writeback.file_proposal": ("Proposal", "apply", "propose"),
-    "daq.writeback.file_target": ("Written",),
+    "daq.writeback.drive_target": ("DriveTarget",),
+    "daq.writeback.file_target": ("FileTarget",),
     "daq.writeback.request": ("Request",),
+    "daq.writeback.target": ("Proposal", "Written", "apply", "propose", "rollback"),
     "ident.calibration": ("Calibration",),
 }
 _MODULES = {name: home for home, names in _HOMES.items() for name in names}
-_RENAMED = {"load_calibration": "load", "propose": "propose_for", "save_calibration": "save"}
+_RENAMED = {"load_calibration": "load", "save_calibration": "save"}
 
 
 def __getattr__(name: str) -> object:

@@ -21,7 +21,7 @@ from sphinx.application import Sphinx
 from daq.cli.app import build_app
 from daq.config.cell_schema import CellModel
 from daq.config.drive import DriveModel
-from daq.config.import_description import ImportModel
+from daq.config.import_description import ImportDescription
 from daq.errors import DaqError, exit_code
 from daq.simulation.simulation_file import SimulationModel
 from daq.workflow.calibration_file import CalibrationDocument
@@ -33,7 +33,7 @@ SCHEMAS: dict[str, tuple[str, type[BaseModel]]] = {
     "cell": ("Cell file", CellModel),
     "drive-profile": ("Drive profile", DriveModel),
     "calibration": ("Calibration", CalibrationDocument),
-    "import": ("Import description", ImportModel),
+    "import": ("Import description", ImportDescription),
     "simulation": ("Simulation file", SimulationModel),
 }
 """File formats by the name of their schema: title and model."""
