@@ -1,6 +1,6 @@
 """Calibrate the drive gains of a robot cell: from recorded logs to the numbers in the controller.
 
-Everything that a program needs is here; importing `daq` loads no module before a name is used.
+Everything that a program needs is here; importing `daq` loads no module before a name is used::
 
     import daq
 

@@ -253,11 +253,13 @@ def _summary(thing: Any) -> str:
 
 def api() -> str:
     """The front doors: everything that `__all__` of each package exports."""
-    parts = []
+    parts, described = [], set[str]()
     for name in FRONT_DOORS:
-        package = importlib.import_module(name)
-        exported = getattr(package, "__all__", ())
-        members = "\n   :members:\n   :imported-members:" if exported else ""
+        exported = set(importlib.import_module(name).__all__)
+        members = "\n   :members:\n   :imported-members:"
+        if again := sorted(exported & described):  # `daq.Calibration` is `ident.Calibration`
+            members += f"\n   :exclude-members: {', '.join(again)}"
+        described |= exported
         parts.append(f"## `{name}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```")
     return "\n\n".join(parts)
 
