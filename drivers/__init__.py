@@ -115,37 +115,28 @@ __all__ = [
 ]
 
 _HOMES = {
-    "canopen.bus": ("BusAddress",),
-    "canopen.network": ("CanopenNetwork", "open_cell"),
-    "canopen.scan": ("FoundNode", "scan"),
-    "motion.execute": ("execute",),
-    "motion.move": ("AxisLimits", "MotionPermission", "Move", "synchronised_move"),
-    "profiles.cia402": ("State", "decode"),
-    "profiles.profile": (
-        "CIA402",
-        "Amplitude",
-        "Axis",
-        "CurrentScale",
-        "DriveProfile",
-        "Identity",
-        "ObjectEntry",
-        "TapPoint",
-    ),
-    "stream.answers": ("StreamStatistics",),
-    "stream.sample": ("CellEvent", "EventKind", "Sample"),
-    "stream.split_bus": ("BusPart", "SplitAddress"),
-    "stream.stream": ("SyncStream",),
-    "stream.sync": ("FollowedSync", "LockstepSync", "TimedSync"),
+    "canopen.bus": "BusAddress",
+    "canopen.network": "CanopenNetwork open_cell",
+    "canopen.scan": "FoundNode scan_bus",
+    "motion.execute": "execute",
+    "motion.move": "AxisLimits MotionPermission Move synchronised_move",
+    "profiles.cia402": "State decode",
+    "profiles.profile": "CIA402 Amplitude Axis CurrentScale DriveProfile Identity ObjectEntry TapPoint",
+    "stream.answers": "StreamStatistics",
+    "stream.sample": "CellEvent EventKind Sample",
+    "stream.split_bus": "BusPart SplitAddress",
+    "stream.stream": "SyncStream",
+    "stream.sync": "FollowedSync LockstepSync TimedSync",
 }
-_MODULES = {name: home for home, names in _HOMES.items() for name in names}
-_RENAMED = {"scan": "scan_bus"}
+_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f"{__name__}.{_MODULES.get(name, 'errors')}")
-    value = globals()[name] = getattr(module, _RENAMED.get(name, name))
+    name_there = "scan_bus" if name == "scan" else name
+    module = import_module(f"{__name__}.{_MODULES.get(name_there, 'errors')}")
+    value = globals()[name] = getattr(module, name_there)
     return value
 
 

@@ -73,7 +73,7 @@ def command_name(identifier: int) -> str:
 
 
 class Link:
-    """An open bus and the last known state of its nodes.
+    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost.
 
     Attributes:
         nmt: last NMT state of each node that sent a heartbeat.
@@ -117,11 +117,7 @@ class Link:
         self._events: deque[tuple[int, EventKind, int, str]] = deque()
 
     def open(self) -> None:
-        """Open the bus.
-
-        Raises:
-            BusError: it cannot be opened.
-        """
+        """Open the bus."""
         self._bus = self._opener(self.address)
 
     def close(self) -> None:
@@ -132,30 +128,18 @@ class Link:
 
     @property
     def bus(self) -> can.BusABC:
-        """The open bus.
-
-        Raises:
-            BusError: it is not open.
-        """
+        """The open bus."""
         if self._bus is None:
             raise BusError(str(self.address), "is not open; use the network as a context manager")
         return self._bus
 
     def send(self, messages: Sequence[can.Message]) -> None:
-        """Send frames in their order.
-
-        Raises:
-            BusError: the bus is lost.
-        """
+        """Send frames in their order."""
         with bus_errors(self.address):
             send_burst(self.bus, messages)
 
     def pump(self, timeout_s: float) -> None:
-        """Handle one frame, waiting at most ``timeout_s`` for it; with 0, all frames that have already arrived.
-
-        Raises:
-            BusError: the bus is lost, or off.
-        """
+        """Handle one frame, waiting at most ``timeout_s`` for it; with 0, all frames that have already arrived."""
         self.beat()
         with bus_errors(self.address):
             message = self.bus.recv(timeout_s)
@@ -170,11 +154,7 @@ class Link:
         self.wait(0.001)
 
     def wait(self, seconds: float) -> None:
-        """Handle frames for a time.
-
-        Raises:
-            BusError: the bus is lost, or off.
-        """
+        """Handle frames for a time."""
         deadline = self.clock() + round(seconds * 1e9)
         while (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
@@ -197,10 +177,9 @@ class Link:
             self.send((self._beat,))
 
     def dispatch(self, message: can.Message) -> bool:
-        """Process a frame; returns False for a frame (such as a PDO) that is left to the caller.
+        """Process a frame; returns False for a frame, such as a PDO, that is left to the caller.
 
-        Raises:
-            BusError: an error frame reports that the controller went off the bus.
+        An error frame which reports that the controller went off the bus raises BusError.
         """
         if message.is_error_frame:
             self._note_error_frame(message)

@@ -87,6 +87,8 @@ def open_cell(address: CellAddress | str, axes: Sequence[Axis], *, guard_ms: int
 class CanopenNetwork:
     """The axes of a cell. Use as a context manager; leaving it disables all axes and restores all settings.
 
+    Methods that use the bus raise BusError when it is lost, and ObjectAccessError when an axis does not answer.
+
     Args:
         address: of the bus, or of the buses that share the axes.
         axes: the amplifiers, in the order of the samples' columns.
@@ -287,11 +289,7 @@ class CanopenNetwork:
         return tuple(f"{axis.name}: {guard.lack}" for axis, guard in guards if guard is not None and guard.lack)
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
-        """Ask all these axes at once for an answer; those without one are skipped from then on.
-
-        Raises:
-            BusError: the bus is lost.
-        """
+        """Ask all these axes at once for an answer; those without one are skipped from then on."""
         asked = tuple(axis.node_id for axis in axes)
         answered = answering(self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s)
         missing = [axis for axis in axes if axis.node_id not in answered]
@@ -350,11 +348,7 @@ class CanopenNetwork:
         return dict(self._readback)
 
     def statuswords(self) -> tuple[int, ...]:
-        """Read 6041h of every axis by SDO.
-
-        Raises:
-            ObjectAccessError: an axis does not answer.
-        """
+        """Read 6041h of every axis by SDO."""
         return tuple(self.link.objects(node_id).read(STATUSWORD) for node_id in self.node_ids)
 
     def reset_faults(self) -> None:

@@ -160,9 +160,6 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     """Describe settings of a killed recording in a drive; empty where there are none.
 
     They are lost with the drive's power, and a save would keep them.
-
-    Raises:
-        ObjectAccessError: an object cannot be read.
     """
     access = network.link.objects(axis.node_id)
     # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h proves that there

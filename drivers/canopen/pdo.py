@@ -129,11 +129,7 @@ def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectE
 
 
 def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
-    """Read one PDO of a drive; None when the drive has no such PDO.
-
-    Raises:
-        ObjectAccessError: the drive has it and refuses to let it be read.
-    """
+    """Read one PDO of a drive; None when the drive has no such PDO."""
     cob_id, transmission, count = _parameters(direction, number)
     identifier = access.read_optional(cob_id)
     if identifier is None:

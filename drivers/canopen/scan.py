@@ -73,11 +73,7 @@ def scan_bus(
 
 
 def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
-    """Find all nodes that answer an SDO request or send a heartbeat within a time.
-
-    Raises:
-        BusError: the bus is lost.
-    """
+    """Find all nodes that answer an SDO request or send a heartbeat within a time."""
     answered = answering(link, node_ids, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     return tuple(_describe(link, node_id, node_id in answered) for node_id in alive)
@@ -96,20 +92,12 @@ def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Read object 1018h; the serial is None where a node has none.
-
-    Raises:
-        ObjectAccessError: it does not report vendor and product.
-    """
+    """Read object 1018h; the serial is None where a node has none."""
     return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Return the nodes that answer an SDO request; all are asked at once, and share the time.
-
-    Raises:
-        BusError: the bus is lost.
-    """
+    """Return the nodes that answer an SDO request; all are asked at once, and share the time."""
     asked = set(node_ids)
     link.answered.clear()
     _ask(link, node_ids)
@@ -120,11 +108,7 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
 
 
 def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
-    """Return the node ids of which no frame came since the bus was opened, nor an SDO answer within a time.
-
-    Raises:
-        BusError: the bus is lost.
-    """
+    """Return the node ids of which no frame came since the bus was opened, nor an SDO answer within a time."""
     _ask(link, node_ids)
     link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone
     return tuple(node_id for node_id in node_ids if node_id not in link.heard)

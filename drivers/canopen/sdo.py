@@ -62,11 +62,7 @@ class ObjectAccess:
         return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
 
     def read_optional(self, entry: ObjectEntry) -> int | None:
-        """Read an integer object that a drive need not have; None where it has none.
-
-        Raises:
-            ObjectAccessError: any other failure.
-        """
+        """Read an integer object that a drive need not have; None where it has none."""
         try:
             return self.read(entry)
         except ObjectAccessError as error:

@@ -50,11 +50,7 @@ class AxisSetup:
         self._pdos: tuple[PdoRecord, ...] = ()
 
     def send_heartbeats(self, period_ms: int) -> None:
-        """Let the amplifier send heartbeats.
-
-        Raises:
-            ObjectAccessError: refused or not answered.
-        """
+        """Let the amplifier send heartbeats."""
         if self._heartbeat_ms is None:
             self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
         self._access.write(HEARTBEAT_TIME, period_ms)
@@ -62,11 +58,7 @@ class AxisSetup:
     def watch_recorder(
         self, consumers: Consumers | None, is_left_over: Callable[[int], bool], recorder_id: int, silence_ms: int
     ) -> None:
-        """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py).
-
-        Raises:
-            ObjectAccessError: not answered.
-        """
+        """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py)."""
         if self.guard is None:
             self.guard = find_guard(self._access, consumers, is_left_over)
         self.guard = arm(self._access, self.guard, recorder_id, silence_ms)
@@ -120,11 +112,7 @@ class AxisSetup:
             self._link.pass_time()
 
     def stop_watching(self) -> None:
-        """Restore the objects of the guard.
-
-        Raises:
-            ObjectAccessError: refused or not answered.
-        """
+        """Restore the objects of the guard."""
         if self.guard is not None:
             disarm(self._access, self.guard)
 

@@ -6,7 +6,8 @@ quick stop.
 
 A heartbeat does not identify its sender. Another device with the recorder's node id would keep the axes running after
 the recorder was killed. The recorder therefore takes an id that no device uses, and a foreign heartbeat with it is a
-fault.
+fault. All functions raise ObjectAccessError only when the amplifier does not answer; a refusal is no reason not to
+record.
 """
 
 from __future__ import annotations
@@ -73,11 +74,7 @@ def is_left_over(value: int, recorder_id: int, silence_ms: int, heard: Collectio
 
 
 def read_consumers(access: ObjectAccess) -> Consumers | None:
-    """Read 1016h up to the first entry that cannot be read; None where the amplifier has no such object.
-
-    Raises:
-        ObjectAccessError: the node does not answer.
-    """
+    """Read 1016h up to the first entry that cannot be read; None where the amplifier has no such object."""
     found: list[tuple[ObjectEntry, int]] = []
     try:
         for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
@@ -98,8 +95,8 @@ def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Cal
         consumers: its 1016h.
         left_over: `is_left_over` for the value of an entry.
 
-    Raises:
-        ObjectAccessError: the node does not answer; a missing object is reported in `Guard.lack`.
+    Returns:
+        The guard; a missing object is reported in `Guard.lack`.
     """
     if consumers is None:
         return Guard(None, 0, None, "no 1016h: it does NOT stop by itself when the recorder is killed")
@@ -123,9 +120,6 @@ def arm(access: ObjectAccess, guard: Guard, recorder_id: int, silence_ms: int) -
 
     Returns:
         The guard in force. A refused write is reported in `Guard.lack`; the recording goes on.
-
-    Raises:
-        ObjectAccessError: the node does not answer.
     """
     consumer = guard.consumer
     if consumer is None:
@@ -155,11 +149,7 @@ def _refused(access: ObjectAccess, entry: ObjectEntry, value: int) -> str:
 
 
 def disarm(access: ObjectAccess, guard: Guard) -> None:
-    """Restore the original values.
-
-    Raises:
-        ObjectAccessError: a write was refused or not answered.
-    """
+    """Restore the original values."""
     if guard.consumer is None:
         return
     access.write(guard.consumer, guard.consumer_before)

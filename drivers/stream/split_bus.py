@@ -157,21 +157,14 @@ class SplitBus(can.BusABC):
         return tuple(f"{name}: {remark}" for name, remarks in named for remark in remarks)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame to its bus, or to all.
-
-        Raises:
-            BusError: one of the buses has just failed, the others got it; or all have failed.
-        """
+        """As `send_burst`, with one frame."""
         self.send_burst((msg,))
 
     def send_burst(self, messages: Sequence[can.Message]) -> None:
         """Send several frames in their order; consecutive frames of one bus go there in one call.
 
         A frame for all buses goes to one right after the other, when everything before it has been sent: this keeps the
-        SYNCs close together.
-
-        Raises:
-            BusError: as `send`.
+        SYNCs close together. A bus that fails raises BusError after the others got their frames.
         """
         failures: list[BusError] = []
         for route, run in groupby(messages, self.address.route):
@@ -286,11 +279,7 @@ class SplitBus(can.BusABC):
             raise BusError(self.channel_info, "all of them have failed")
 
     def shutdown(self) -> None:
-        """Close all ends, also after a failure.
-
-        Raises:
-            BusError: the first that could not be closed.
-        """
+        """Close all ends, also after a failure."""
         if self._is_shutdown:
             return
         super().shutdown()

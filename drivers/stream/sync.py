@@ -168,11 +168,7 @@ class KernelProducer:
         self.stop()
 
     def start(self) -> None:
-        """Send SYNC from now on.
-
-        Raises:
-            BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
-        """
+        """Send SYNC from now on; BusError where the kernel has no broadcast manager, or the bus is not SocketCAN."""
         address = self._link.address
         if not isinstance(address, BusAddress) or address.interface != "socketcan":
             raise BusError(str(address), "SYNC by the kernel needs one bus of interface socketcan")
@@ -251,11 +247,7 @@ class DriveProducer:
         """A drive keeps its period by itself."""
 
     def start(self) -> None:
-        """Let the drive send SYNC.
-
-        Raises:
-            ObjectAccessError: it cannot, or does not answer.
-        """
+        """Let the drive send SYNC."""
         access = self._network.link.objects(self._node_id)
         self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
         self._network.link.sync_producer = self.name
@@ -265,11 +257,7 @@ class DriveProducer:
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID | PRODUCES)
 
     def stop(self) -> None:
-        """Restore both objects, if started and if the drive still answers.
-
-        Raises:
-            ObjectAccessError: the drive refuses.
-        """
+        """Restore both objects, if started and if the drive still answers."""
         before, self._before = self._before, None
         try:
             if before is not None and self._node_id not in self._network.link.silent:

@@ -1,4 +1,4 @@
-"""What every bus of ours must do, whatever its interface; subclass it with a fixture ``ends`` of three open ends."""
+"""Requirements on every bus, whatever its interface; subclass it with a fixture ``ends`` of three open ends."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A bus with tiny CANopen nodes on it that live in the caller's thread and in a time of their own: no waiting, no luck.
 
 The nodes keep to what CiA 301 and 402 demand of a drive (mapping may change only while the PDO is not valid,
-transitions one at a time, set-points on the rising edge of bit 4) and are told by a test where to deviate.
+transitions one at a time, set-points on the rising edge of bit 4) and deviate where a test sets it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Tamper = Callable[[can.Message], Iterable[can.Message]]
 
 
 class FakeClock:
-    """Monotonic time that passes only when somebody waits."""
+    """Monotonic time that passes only while code waits."""
 
     def __init__(self) -> None:
         self.now_ns = 1_000_000_000

@@ -25,12 +25,12 @@ CUT_OFF: dict[str, tuple[FaultSpec, EventKind, Callable[[str, FaultSpec], Outcom
         lambda name, fault: run(name, fault, guard_ms=GUARD_MS, afterwards=2 * GUARD_MS),
     ),
 }
-"""Faults that leave axes which nobody can ask."""
+"""Faults that leave axes which do not answer."""
 COUNTED = {
     "error passive": FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
     **{f"one {kind.value} frame": at(kind, cycles=1) for kind in (FaultKind.LOST, FaultKind.LATE, FaultKind.DUPLICATE)},
     "one short frame": at(FaultKind.SHORT_PDO, cycles=1),
-    "somebody asks by SDO": at(FaultKind.SDO_MASTER, cycles=5),
+    "another device sends SDO requests": at(FaultKind.SDO_MASTER, cycles=5),
 }
 """Faults with which the run goes on."""
 

@@ -1,4 +1,4 @@
-"""The demo cell with one fault in it, driven over a virtual bus in lockstep: what was told, when, and how it ended."""
+"""The demo cell with one fault in it, driven over a virtual bus in lockstep: the reports, their time, and the end."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Settings = tuple[tuple[tuple[bytes, ...], ...], ...]
 
 @dataclass
 class Outcome:
-    """What became of a run.
+    """Outcome of a run.
 
     Attributes:
         error: that it raised, None when it ended well.
@@ -89,7 +89,7 @@ class Outcome:
 
 
 def settings_of(cell: SimulatedCell) -> Settings:
-    """What a recording changes and must give back, of each node."""
+    """Settings of each node that a recording changes and must restore."""
     return tuple(
         (
             *(_pdo(node, base, number) for base in (0x1400, 0x1800) for number in range(4)),
@@ -124,7 +124,7 @@ def run(
         name: of the virtual bus.
         faults: of the cell.
         guard_ms: silence of the recorder that the amplifiers bear.
-        afterwards: SYNCs of somebody else when the recorder has gone, to let the plant's time pass.
+        afterwards: SYNCs of another device when the recorder is gone, to let the plant's time pass.
         toggle_bit: of the amplifiers and of their profile.
     """
     address, outcome = BusAddress("virtual", f"faults {name}"), Outcome()

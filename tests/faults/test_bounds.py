@@ -1,4 +1,4 @@
-"""How soon a refused NMT command is told, in a time that passes only when somebody waits."""
+"""Time to report a refused NMT command, by a clock that passes only while code waits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The speed override of a first run: slower profiles for the amplifiers, told by the log and by whoever fits it."""
+"""The speed override of a first run: slower profiles for the amplifiers, in the log and in the report of a fit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROFILE_VELOCITY, PROFILE_ACCELERATION, PROFILE_DECELERATION = 0x6081, 0x6083, 0
 
 
 def profiles(cell: SimulatedCell, index: int) -> list[int]:
-    """What the amplifiers were told last; not the sixth, which rests where J5 and J6 turn against each other."""
+    """Last profile of the amplifiers; not the sixth, which rests where J5 and J6 turn against each other."""
     return [int.from_bytes(node.read(index, 0), "little") for node in cell.nodes[:5]]
 
 

@@ -1,4 +1,4 @@
-"""Every fault that comes in the middle of a move: its name, how soon it is told, that all axes end without power."""
+"""Faults in the middle of a move: the name, the time to report it, and all axes without power at the end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ J3 = r"J3 \(node 3\): "
 
 @dataclass(frozen=True)
 class Promise:
-    """What is promised for one fault.
+    """Promise for one fault.
 
     Attributes:
         fault: that comes.
@@ -106,9 +106,9 @@ def test_a_fault_is_named_logged_in_time_and_stops_all_axes(name: str) -> None:
     assert outcome.cycles_of(EventKind.STOP)[0] >= STRIKE
     assert EventKind.STOP_UNCONFIRMED not in {event.kind for event in outcome.events}
     assert outcome.powerless
-    if name != "reboots":  # which forgets by itself what it was told
+    if name != "reboots":  # which forgets its settings by itself
         assert outcome.restored
-    assert len(outcome.cycles_of(EventKind.MOVE_END)) < 2  # of two: nobody went on
+    assert len(outcome.cycles_of(EventKind.MOVE_END)) < 2  # of two: the second was not made
 
 
 def assert_matches(text: str, error: DriverError) -> None:

@@ -58,7 +58,7 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
         samples = execute(network, stream, (far,), MotionPermission("the test", ROOM))
         moving = list(islice(samples, 300))[-1]
         assert all(word & 0x6F == 0x27 for word in moving.statusword)
-        network.link.close()  # the process has gone: nobody says another word
+        network.link.close()  # the process is gone, without another frame
         let_pass(cell, address, GUARD_MS + 500)
         states = {node.drive.state for node in cell.nodes}
         turned = abs(cell.plant.motor_rad - start_rad) * 65536 / (2 * 3.141592653589793)

@@ -1,4 +1,4 @@
-"""The same run without any fault: nothing is told, nothing is left behind."""
+"""The same run without any fault: nothing is reported, nothing is left behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The toggle bit of an amplifier: what its standing proves, and how soon."""
+"""The toggle bit of an amplifier: what a constant bit proves, and how soon."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BIT = 14
 
 
 def alarm_cycles(values: Sequence[int], update_period_us: int = 1000, missing: Sequence[int] = ()) -> list[int]:
-    """Cycles in which the first of two axes is told; the second has no such bit."""
+    """Cycles in which the first of two axes is reported; the second has no such bit."""
     profile = replace(PROFILE, toggle_bit=BIT, update_period_us=update_period_us)
     bits = ToggleBits((Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None)))
     found = []

@@ -25,7 +25,7 @@ ATTEMPTS = 10
 ended or marked invalid as at a real cell. One records again."""
 MAX_SUBSTEPS = 100
 POSITION_CUTOFF, DECIMATION_CUTOFF = 0.2, 0.1
-"""Of the sampling rate."""
+"""Fraction of the sampling rate."""
 
 
 def write_cell(folder: Path, period_us: int, pacing: str) -> Path:
@@ -80,7 +80,7 @@ def simulated(
 
 
 def say(*arguments: str) -> dict[str, Any]:
-    """What a verb of drivegain says with --json; it must end well."""
+    """Run a verb of drivegain with --json and return its document; it must succeed."""
     with redirect_stdout(io.StringIO()) as out:
         code = main([*arguments, "--json"])
     assert code == ExitCode.OK, f"drivegain {' '.join(arguments)} ended with {code}"
@@ -89,7 +89,7 @@ def say(*arguments: str) -> dict[str, Any]:
 
 
 def record_once(cell: Path, plan: Path, log: Path, *mounted: str) -> dict[str, Any]:
-    """What `record` said; a run that supervision ended is as invalid as one that is marked so."""
+    """Document of `record`; a run that supervision ended is as invalid as one that is marked so."""
     moving = ("--enable-motion", "--operator", "test", "--json")
     with redirect_stdout(io.StringIO()) as out:
         code = main(["record", str(cell), str(plan), "--out", str(log), *moving, *mounted])

@@ -1,4 +1,4 @@
-"""What all tests on the kernel's CAN share: they are marked `vcan`, and skipped where there is no vcan0."""
+"""Fixtures of all tests on the kernel's CAN: they are marked `vcan`, and skipped where there is no vcan0."""
 
 from __future__ import annotations
 

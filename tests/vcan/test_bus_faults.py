@@ -104,7 +104,7 @@ class Wire:
 
 @dataclass(frozen=True)
 class Ended:
-    """What became of a recording.
+    """Outcome of a recording.
 
     Attributes:
         code, output: exit code and what it said on stderr.
@@ -146,7 +146,7 @@ def record(folder: Path, strike: Callable[[Wire], None]) -> Ended:
 
 
 def at_rest(end: socket.socket) -> list[State]:
-    """States of the axes when none has power any more; SYNC lets their time pass, and nobody tells them anything."""
+    """States of the axes when none has power any more; SYNC lets their time pass, and no command reaches them."""
     deadline = time.monotonic() + PATIENCE_S / 4
     while True:
         states = states_after(end, 10)
@@ -189,7 +189,7 @@ def error_passive(_wire: Wire) -> None:
 
 
 def goes_down(wire: Wire) -> None:
-    """Somebody takes the recorder's interface down."""
+    """Take the recorder's interface down."""
     set_link(up=False)
     wire.cut = True
 
@@ -219,13 +219,13 @@ def test_the_recorder_says_so_and_the_axes_stop_by_themselves(
     ended = record(tmp_path, strike)
     assert ended.code == ExitCode.DEVICE_FAULT, ended.output
     assert words in ended.output
-    assert "NOT ALL OF THEM ARE KNOWN TO STAND" in ended.output  # nobody could ask them
+    assert "NOT ALL OF THEM ARE KNOWN TO STAND" in ended.output  # they could not be reached
     assert [event.text for event in ended.log.events if event.kind is EventKind.BUS_LOST and words in event.text]
     kinds = [event.kind for event in ended.log.events]
     assert EventKind.STOP_UNCONFIRMED in kinds
     assert EventKind.MOVE_END not in kinds
     assert ended.states == ([State.SWITCH_ON_DISABLED] * len(NODES),) * 2
-    figure(f"{words}: told {ended.after_cycles} cycles after it happened; the axes stopped by their own 1016h")
+    figure(f"{words}: reported {ended.after_cycles} cycles after it happened; the axes stopped by their own 1016h")
 
 
 def test_error_passive_is_reported_and_the_run_goes_on(tmp_path: Path, figure: Callable[[str], None]) -> None:

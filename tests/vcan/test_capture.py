@@ -91,7 +91,7 @@ def test_stamps_are_the_kernels_own_in_whole_nanoseconds(bus: SocketcanBus, wire
     ):
         assert all(type(stamp) is int for stamp in stamps)
         assert stamps == sorted(stamps)
-        # When the kernel got them, not when anybody read them; the clocks are compared to a fraction of a millisecond.
+        # When the kernel got them, not when they were read; the clocks are compared to a fraction of a millisecond.
         assert begin - 1_000_000 <= stamps[0]
         assert stamps[-1] <= sent + 1_000_000
     assert all(message.local and message.is_rx for message in messages)
@@ -152,7 +152,7 @@ def test_an_interface_that_goes_down_is_named(spare: str, figure: Callable[[str]
         begun = time.monotonic()
         with pytest.raises(can.CanOperationError, match=r"the interface is down \(ENETDOWN\)"):
             bus.recv(WAIT_S)
-        figure(f"interface down: told {1e3 * (time.monotonic() - begun):.0f} ms later")
+        figure(f"interface down: reported {1e3 * (time.monotonic() - begun):.0f} ms later")
     finally:
         bus.shutdown()
     with pytest.raises(BusError, match="the interface is down"):

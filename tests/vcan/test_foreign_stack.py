@@ -1,6 +1,6 @@
 """Our driver against drives on a CANopen stack that is not ours (npm `canopen`), over the kernel's CAN.
 
-Driver and simulated cell could agree on a mistake; these drives were taught CANopen by somebody else.
+Driver and simulated cell could agree on a mistake; these drives have another project's CANopen stack.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class Job:
-    """What the verbs said.
+    """Output of the verbs.
 
     Attributes:
         folder: with cell.yaml, controller.yaml, calibration.yaml.

@@ -26,7 +26,7 @@ def give_guard(node: ScriptedNode, entry: int = 0, option: int | None = 1) -> No
 
 
 @pytest.mark.parametrize(
-    "before", [0, 0x00050000, RECORDER << 16 | 500], ids=["free", "unused", "left by a killed one"]
+    "before", [0, 0x00050000, RECORDER << 16 | 500], ids=["free", "no time", "left by a killed one"]
 )
 def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: int) -> None:
     network, bus = cell(2)
@@ -44,7 +44,7 @@ def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: in
 def test_what_an_amplifier_lacks_is_said() -> None:
     network, bus = cell(3)
     give_guard(bus.nodes[1], option=None)
-    give_guard(bus.nodes[2], entry=0x0005_01F4)  # it watches somebody else, and that is not ours to change
+    give_guard(bus.nodes[2], entry=0x0005_01F4)  # it watches another device, and must not be changed
     with network:
         network.prepare()
         assert network.unguarded() == (
@@ -107,7 +107,7 @@ def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other
         count = len(beats_ns)
         assert count > 5
         assert max(b - a for a, b in pairwise(beats_ns)) <= 1.5 * network.heartbeat_ms * 1e6
-        assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]  # nobody watches while the log is finished
+        assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]  # no watch while the log is finished
     assert len(beats_ns) == count
     assert all(powered)
 

@@ -344,7 +344,7 @@ def test_moves_that_were_made_end_for_no_reason(moving: Moving) -> None:
 
 
 def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:
-    """What would interrupt it is asked to wait from its first frame to its last."""
+    """Interrupts are deferred from its first frame to its last."""
     network, _, bus, events = moving
     inside: list[bool] = []
 
@@ -440,7 +440,7 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
 def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_stopped(
     moving: Moving, error: DriverError
 ) -> None:
-    """Of several buses one that fails is told of once."""
+    """A failure of one of several buses is reported once."""
     _, _, bus, events = moving
 
     def fail(_cycle: int) -> None:

@@ -81,7 +81,7 @@ def test_whole_numbers_keep_limits_and_end_times(start: tuple[int, ...], target:
         for seconds, a, b in zip(move.duration_s(start), start, target, strict=True)
         if abs(b - a) > 2000
     ]
-    # Of a few counts no whole speed is near enough: what they take is nobody's end time.
+    # For a few counts no whole speed is near enough, so their time is left out.
     longest = max((seconds for seconds, _ in going), default=0.0)
     for seconds, _ in going:
         assert abs(seconds - longest) < 2e-3  # two periods of a 1 kHz SYNC

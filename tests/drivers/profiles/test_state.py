@@ -12,7 +12,7 @@ STATES = tuple(state for state in State if state is not State.UNKNOWN)
 
 
 def transition(state: State, command: int) -> State:
-    """What the standard's drive does with a controlword (transitions 2 to 16; 605Ah = 5, so a stop is held)."""
+    """Reaction of the standard's drive to a controlword (transitions 2 to 16; 605Ah = 5, so a stop is held)."""
     powered = state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE)
     after: State
     if state in (State.FAULT, State.FAULT_REACTION_ACTIVE, State.NOT_READY_TO_SWITCH_ON):

@@ -56,7 +56,7 @@ def cell(address: BusAddress) -> Iterator[SimulatedCell]:
 
 
 def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
-    """What ``prepare`` changes: heartbeat, mode, and the communication and mapping of the first PDOs."""
+    """Objects that ``prepare`` changes: heartbeat, mode, and the communication and mapping of the first PDOs."""
     objects = ((0x1017, 0), (0x6060, 0), (0x1800, 1), (0x1800, 2), (0x1A00, 0), (0x1A00, 1), (0x1400, 2), (0x1600, 0))
     return [
         tuple(network.link.objects(node_id).read_bytes(index, sub) for index, sub in objects)

@@ -1,4 +1,4 @@
-"""Who sends SYNC for us, and that they are told to stop."""
+"""SYNC producers other than this process: started, and stopped again."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def test_the_drop_counter_goes_on_beyond_its_32_bits(steps: list[int]) -> None:
     st.integers(-(10**15), 10**15),
 )
 def test_no_setting_of_the_wall_clock_moves_a_stamp(frames: list[tuple[int, int]], when: int, jump_ns: int) -> None:
-    """Each frame comes some time after the last and waits to be read; once somebody sets the clock while one waits."""
+    """Each frame comes some time after the last and waits to be read; once the clock is set while one waits."""
     now_ns = offset_ns = last_ns = 10**18
     time = MonotonicTime(now_ns + offset_ns, now_ns)
     for number, (gap_ns, wait_ns) in enumerate(frames):
@@ -96,7 +96,7 @@ def test_no_setting_of_the_wall_clock_moves_a_stamp(frames: list[tuple[int, int]
         offset_ns += jump_ns if number == when else 0
         found_ns = time.of(stamp_ns, now_ns + offset_ns, now_ns)
         assert last_ns <= found_ns <= now_ns
-        # A step that could as well be time that has passed since the last frame cannot be told from that.
+        # A step that could as well be time that has passed since the last frame cannot be distinguished from it.
         doubt_ns = abs(jump_ns) if number == when and abs(jump_ns) <= gap_ns + wait_ns + 10**6 else 0
         assert abs(found_ns - true_ns) <= doubt_ns
         last_ns = found_ns
@@ -146,7 +146,7 @@ def test_stamps_are_whole_nanoseconds_that_never_go_back(pair: Pair) -> None:
 
 
 def test_a_full_backlog_is_counted_to_the_frame() -> None:
-    """Nobody reads: what neither the backlog nor the pair holds is lost, and the count comes with what follows."""
+    """Without a reader, frames beyond the backlog and the pair are lost, and the next record carries their count."""
     wire, bus = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     out, parent = socket.socketpair()
     sent = 0

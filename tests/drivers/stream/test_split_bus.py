@@ -89,7 +89,7 @@ def frame(identifier: int, at_s: float = 0.0, data: bytes = b"", **more: bool) -
 
 
 class FarEnd(SplitBus):
-    """What stands at the other ends of the wires: what came on all of them counts once."""
+    """The other ends of the wires; a frame that arrives on all of them counts once."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         while (message := super().recv(timeout)) is not None:
@@ -137,7 +137,7 @@ def test_what_concerns_everybody_goes_to_all(pair: Pair) -> None:
         frame(0x080),
         frame(0x000, data=bytes((NmtCommand.STOP, 0))),
         frame(0x77F, data=b"\5"),  # the recorder's heartbeat: its id is no node's
-        frame(0x67D),  # whoever has this id may be on either
+        frame(0x67D),  # a node with this id may be on either
         frame(0x12345, is_extended_id=True),
     ):
         pair.log.clear()
@@ -227,7 +227,7 @@ def test_our_own_sync_comes_back_once(pair: Pair) -> None:
 
 
 class Hoarder(Wire):
-    """An end that has read a burst from its socket, which nobody then tells of: a file descriptor that stays silent."""
+    """An end that has read a burst from its socket, while its file descriptor stays silent."""
 
     def __init__(self, name: str, silent: socket.socket) -> None:
         super().__init__(name, [], FakeClock())
@@ -335,7 +335,7 @@ def test_losses_of_all_buses_count_and_remarks_have_their_bus(pair: Pair) -> Non
 
 @pytest.mark.parametrize("step_s", [0.0, -3600.0, 3600.0])
 def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(pair: Pair, step_s: float) -> None:
-    """Whatever the wall clock is set to between them; and seconds of it as a float cannot tell 100 ns apart."""
+    """Also when the wall clock is set between them; its seconds as a float cannot resolve 100 ns."""
     for number, wire in enumerate((pair.left, pair.right, pair.left, pair.right)):
         at_ns = 5_000_000_000 + 100 * number
         message = CapturedMessage(

@@ -52,7 +52,7 @@ def timed() -> Iterator[Prepared]:
 
 
 def faults_of(stream: SyncStream) -> Iterator[str]:
-    """What waits to be raised, taken out."""
+    """Remove and return the faults that wait to be raised."""
     while True:
         try:
             stream.check()
@@ -202,7 +202,7 @@ def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None
 
 @pytest.mark.parametrize("following_error", [False, True])
 def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(lockstep: Prepared, following_error: bool) -> None:
-    """Its statusword before its first answer is nobody's: what it says then is no change."""
+    """Its statusword before its first answer is undefined: the first one is no change."""
     stream, bus, events = lockstep
     bus.nodes[1].fault(following_error)
     drop(bus, 0x182, range(2))
@@ -321,7 +321,7 @@ def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -
 
 
 class Producer:
-    """Somebody who sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
+    """Sends SYNC on the scripted bus, whether the stream reads or not; each axis' position is its number.
 
     Attributes:
         pulses: SYNCs sent.
@@ -389,7 +389,7 @@ def test_a_followed_sync_opens_a_cycle_with_its_own_time(followed: Followed) -> 
     samples = [next(stream)]
     for _ in range(4):
         producer.pulse()
-        bus.clock.now_ns += 7 * PERIOD_NS  # when it is read is nobody's concern
+        bus.clock.now_ns += 7 * PERIOD_NS  # the time of reading does not matter
         samples.append(next(stream))
     assert [sample.cycle for sample in samples] == list(range(5))
     assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
@@ -400,7 +400,7 @@ def test_a_followed_sync_opens_a_cycle_with_its_own_time(followed: Followed) -> 
 
 
 def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
-    """A thousand cycles wait; they are told apart by their order, not by the clock."""
+    """A thousand cycles wait; they are distinguished by their order, not by the clock."""
     stream, bus, producer, _ = followed
     next(stream)
     for _ in range(1000):
@@ -534,7 +534,7 @@ def test_a_schedule_that_slips_by_more_than_a_second_is_a_fault(timed: Prepared)
     for late_ns in (900_000_000, 1_100_000_000):
         bus.clock.now_ns += late_ns
         stream.advance()
-        reported.append("; ".join(faults_of(stream)))  # nobody read the heartbeats either
+        reported.append("; ".join(faults_of(stream)))  # the heartbeats were not read either
     assert ["read 1.1 s late" in each for each in reported] == [False, True]
 
 
@@ -644,7 +644,7 @@ def test_the_kernel_is_steered_to_its_period(period_us: int, late: float, noise:
 
 def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
-    bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: nobody misses those
+    bus.losses = Losses(kernel=5)  # type: ignore[attr-defined]  # before the first SYNC: they do not count
     next(stream)
     bus.losses = Losses(kernel=7, backlog=1, interface=4)  # type: ignore[attr-defined]
     sample = next(stream)

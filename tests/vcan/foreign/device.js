@@ -1,6 +1,6 @@
 // A CiA 402 drive on the CANopen stack of the npm package `canopen`: node device.js INTERFACE NODE_ID
 // Object dictionary, SDO, NMT, heartbeat and PDO on SYNC are that stack's; this file adds the objects of a drive and what
-// they do. The shaft turns by itself: each SYNC adds STEP counts, so that whoever listens can tell a lost sample.
+// they do. The shaft turns by itself: each SYNC adds STEP counts, so that a listener recognises a lost sample.
 'use strict';
 
 const { Device, DataType, ObjectType, AccessType } = require('canopen');
