@@ -42,8 +42,9 @@ if TYPE_CHECKING:
         RankDeficient,
         TooFewMoves,
     )
-    from ident.estimators.estimate import Estimate, Method, RelativeError
+    from ident.estimators.estimate import Estimate, RelativeError
     from ident.estimators.identify import Identification, identify
+    from ident.estimators.method import Method
     from ident.model.bodies import Payload
     from ident.model.kinematics import Motion
     from ident.model.model import DriveTrain, Model
@@ -103,8 +104,9 @@ _MODULES = {
         "RankDeficient",
         "TooFewMoves",
     ),
-    "ident.estimators.estimate": ("Estimate", "Method", "RelativeError"),
+    "ident.estimators.estimate": ("Estimate", "RelativeError"),
     "ident.estimators.identify": ("Identification", "identify"),
+    "ident.estimators.method": ("Method",),
     "ident.model.bodies": ("Payload",),
     "ident.model.kinematics": ("Motion",),
     "ident.model.model": ("DriveTrain", "Model"),

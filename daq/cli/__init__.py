@@ -2,8 +2,8 @@
 
 import os
 
-# Several threads make linear algebra of this size slower and take several times the processor time; the libraries read
-# this when they are loaded. Who wants another number says so in the environment.
+# More threads make linear algebra of this size slower and take several times the processor time. The libraries read the
+# variable when they are loaded; a value from the environment is kept.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from daq.cli.app import main

@@ -1,47 +1,24 @@
-"""`drivegain export`: what a calibration or a log holds, in the files of other programs."""
+"""`drivegain export`: a calibration or a log, in the files of other programs."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-from daq.cli.terminal import check_output, say_written, status
-from daq.cli.verb import JsonOption, Verb, VerbGroup, print_json, printable
-from daq.config.cell import model_of
-from daq.config.cell_file import URDF, bundle, load_cell
-from daq.config.yaml_file import read_bytes
-from daq.environment import software
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, VerbGroup, print_json
 from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFailed, UsageError
-from daq.files import replace_file
-from daq.log.export import TableFormat, export_log
-from daq.workflow.calibration_file import load
-from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.urdf_export import (
-    FORMAT,
-    JointUpdate,
-    PhysicalRobot,
-    Updated,
-    cell_limits,
-    parse_markup,
-    physical_robot,
-    require_solver,
-    update_urdf,
-)
-from ident.calibration import Calibration
-from ident.model.bodies import body_of
-from ident.model.model import DriveTrain, Model
-from ident.model.robot import robot_from_urdf
-from ident.physical.inertia_prior import urdf_links
-from ident.physical.programme import MARGIN
 
-# `drivegain export log`: a log as a table for other programs.
+if TYPE_CHECKING:
+    from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+    from ident.calibration import Calibration
+    from ident.data.run import FloatArray
+    from ident.model.model import Model
+
+
+def export_verb() -> None:
+    """Write a calibration or a log as a file of another program."""
 
 
 def export_log_verb(
@@ -53,52 +30,30 @@ def export_log_verb(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Write the samples of a log into a table: a row a SYNC, joint positions and currents in SI beside raw numbers.
+    """Write the samples of a log into a table: a row per SYNC, joint positions and currents in SI beside raw numbers.
 
-    The log itself opens in Foxglove and PlotJuggler as it is (configs/viewers).
+    The log itself opens in Foxglove and PlotJuggler (configs/viewers).
     """
-    kind = _format(csv, parquet)
+    from daq.cli.terminal import one_of, print_view, status
+    from daq.log.export import TableFormat, export_log
+
+    one_of("choose the kind of table to write", csv=csv, parquet=parquet)
+    kind = TableFormat.CSV if csv else TableFormat.PARQUET
     with status(f"writing {kind.value}"):
         done = export_log(log, out, kind)
     if done.partial:
-        typer.echo(f"{log} is PARTIAL: saved from a recording that was never finished", err=True)
+        typer.echo(f"{log} is PARTIAL: saved from an unfinished recording", err=True)
     if not done.valid:
         typer.echo(f"{log} is INVALID: {done.reason or 'no reason given'}; a fit refuses it", err=True)
     if json:
         print_json({"log": str(log), "table": str(out), "format": kind.value, "rows": done.rows,
                     "columns": list(done.columns), "partial": done.partial, "valid": done.valid})  # fmt: skip
     else:
-        console = Console(soft_wrap=True, highlight=False)
-        console.print(f"{done.rows} rows of {len(done.columns)} columns", markup=False)
-        say_written(console, out)
-
-
-def _format(csv: bool, parquet: bool) -> TableFormat:
-    wanted = [kind for kind, asked in ((TableFormat.CSV, csv), (TableFormat.PARQUET, parquet)) if asked]
-    if len(wanted) != 1:
-        raise UsageError(
-            "--csv, --parquet",
-            found="both" if wanted else "neither",
-            expected="one of them",
-            remedy="say which kind of table to write",
-        )
-    return wanted[0]
-
-
-EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
-
-
-FloatArray = NDArray[np.float64]
-
-_SHOWN_SHIFTS = 5
-
-
-def export_verb() -> None:
-    """Write what a calibration or a log holds into a file of another program."""
+        print_view([f"{done.rows} rows of {len(done.columns)} columns"], out)
 
 
 def export_urdf_verb(
-    calibration: Annotated[Path, typer.Argument(help="calibration.yaml of `drivegain fit`.")],
+    calibration: CalibrationArgument,
     out: Annotated[Path, typer.Option("--out", help="URDF to write.")],
     cell: Annotated[Path | None, typer.Option("--cell", help="Cell file: URDF, gravity, drive train, limits.")] = None,
     urdf: Annotated[
@@ -109,50 +64,64 @@ def export_urdf_verb(
 ) -> None:
     """Write masses, centres of mass, inertias and joint friction into a copy of the robot's URDF.
 
-    The identified parameters are combinations; a URDF needs bodies. The nearest bodies that can exist are found with a
-    semidefinite programme (pip install 'drivegain[physical]'), and the change of torque is reported.
+    A URDF needs the bodies behind the identified parameter combinations. A semidefinite programme finds the nearest
+    physical bodies (pip install 'drivegain[physical]'); the change of torque is reported.
     """
-    given = _one_of(cell, urdf)
+    from daq.cli.terminal import check_output, one_of, print_view, status
+    from daq.config.cell_file import URDF, bundle
+    from daq.config.yaml_file import read_bytes
+    from daq.environment import software
+    from daq.report.urdf import urdf_document, urdf_view
+    from daq.workflow.calibration_file import load
+    from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
+
+    one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
+    given = cell or urdf or Path()
     require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load(calibration)
     require_good(known, str(calibration))
     content = bundle(given)[URDF] if urdf is None else read_bytes(given)
     if out.exists() and out.read_bytes() == content:
-        raise UsageError(str(out), found="the URDF to read", expected="a name of its own", remedy="choose another name")
+        raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
     parse_markup(content, str(given))  # before any other reader sees it
     text = content.decode("utf-8")
     model, limits, same = _declared(known, given) if urdf is None else (*_plain(text), None)
-    with status("looking for the nearest robot that can exist"):
+    with status("finding the nearest physical robot"):
         robot = physical_robot(known, model, limits, text)
     updates = joint_updates(robot)
     provenance = f"Inertias by {software()} from the calibration of {known.cell}, {known.created}"
     updated = update_urdf(content, str(given), updates, provenance)
     _write(updated, robot, out)
     if json:
-        print_json(report(known, robot, updates, updated, out, same))
+        print_json(urdf_document(known, robot, updates, updated, out, same))
     else:
-        show(known, robot, updates, updated, out, same, Console(soft_wrap=True, highlight=False))
+        print_view(urdf_view(known, robot, updates, updated, same), out)
 
 
 def require_good(calibration: Calibration, name: str) -> None:
-    """A model that leaves a quarter of the torque says nothing of bodies.
+    """Refuse a calibration that explains too little of the torque to derive bodies from it.
 
     Raises:
         ModelContradicted: the calibration's relative error is above DOUBTFUL_PERCENT.
     """
+    from daq.workflow.fit import DOUBTFUL_PERCENT
+
     left = calibration.relative_error_percent.total
     if not left <= DOUBTFUL_PERCENT:
         raise ModelContradicted(
             name,
             found=f"a relative error of {left:.3g} %",
             expected=f"at most {DOUBTFUL_PERCENT:g} %",
-            remedy="fit again; `drivegain fit` says what to look for",
+            remedy="fit again; `drivegain fit` lists what to check",
         )
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
-    """Body and friction of each moving joint; a friction that is only a part of its axis' and negative counts as 0."""
+    """Return body and friction of each moving joint; a negative friction, part of its axis' friction, counts as 0."""
+    from daq.workflow.urdf_export import JointUpdate
+    from ident.model.bodies import body_of
+
     parameters = robot.parameters
     values = dict(zip((column.name for column in parameters.model.columns), parameters.standard, strict=True))
     return {
@@ -165,134 +134,11 @@ def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
     }
 
 
-def report(
-    calibration: Calibration,
-    robot: PhysicalRobot,
-    updates: dict[str, JointUpdate],
-    updated: Updated,
-    out: Path,
-    same_configuration: bool | None,
-) -> dict[str, Any]:
-    """What was found and how near it is, for --json."""
-    parameters = robot.parameters
-    change = parameters.torque_change_percent
-    joints = parameters.model.robot.joints
-    return {
-        "urdf": str(out),
-        "calibration": calibration.cell,
-        "same_configuration": same_configuration,
-        "exact": parameters.exact,
-        "torque_change_percent": {"axes": list(change.axes), "total": change.total},
-        "shifts": [
-            {
-                "name": shift.name,
-                "identified": shift.identified,
-                "physical": shift.realised,
-                "standard_deviations": shift.deviations,
-            }
-            for shift in robot.shifts
-        ],
-        "margin": MARGIN,
-        "joints": [
-            {
-                "name": joint.name,
-                "link": updated.links[joint.name],
-                "mass_kg": update.body.mass_kg,
-                "centre_m": update.body.centre_m.tolist(),
-                "inertia_kg_m2": update.body.inertia_kg_m2.tolist(),
-                "damping": update.damping,
-                "friction": update.friction,
-                "smallest_eigenvalue": float(eigenvalue),
-                "prior_assumed": number in robot.prior.assumed,
-            }
-            for number, (joint, update, eigenvalue) in enumerate(
-                zip(joints, updates.values(), parameters.eigenvalues, strict=True)
-            )
-        ],
-        "merged_links": list(updated.merged),
-        "not_in_urdf": [
-            {"name": column.name, "value": float(value), "unit": column.unit}
-            for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
-            if column.name.startswith(("Ia", "off", "fvm", "fsm"))
-        ],
-        "effects_left_out": [f"{effect.name} on {effect.axis}" for effect in calibration.effects],
-    }
-
-
-def show(
-    calibration: Calibration,
-    robot: PhysicalRobot,
-    updates: dict[str, JointUpdate],
-    updated: Updated,
-    out: Path,
-    same_configuration: bool | None,
-    console: Console,
-) -> None:
-    """The same for a person."""
-    console.print(link_table(updates, updated))
-    change = robot.parameters.torque_change_percent
-    if robot.parameters.exact:
-        console.print("These bodies need exactly the identified torque.")
-    else:
-        axes = ", ".join(f"{value:.2f}" for value in change.axes)
-        console.print(
-            f"No robot has exactly the identified parameters; this one's torque differs by {change.total:.2g} % "
-            f"(axes: {axes} %). Moved most: "
-            + ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in robot.shifts[:_SHOWN_SHIFTS])
-            + "."
-        )
-    if robot.prior.assumed:
-        names = ", ".join(robot.parameters.model.robot.joints[number].name for number in robot.prior.assumed)
-        console.print(
-            f"The URDF has no possible inertia behind {names}: where the data say nothing, a ball was assumed.",
-            markup=False,
-        )
-    if updated.merged:
-        console.print(
-            f"Now part of the moving link that holds them: {printable(', '.join(updated.merged))}.", markup=False
-        )
-    left_out = ["rotor inertias", "offsets"]
-    left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
-    left_out += [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
-    console.print(f"A URDF has no place for: {printable(', '.join(left_out))} (see --json).", markup=False)
-    if same_configuration is False:
-        console.print("The cell's configuration has changed since the fit: look at what.", style="bold")
-    say_written(console, out)
-
-
-def link_table(updates: dict[str, JointUpdate], updated: Updated) -> Table:
-    """Mass and centre of mass of each link, friction of its joint."""
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    table.add_column("joint", no_wrap=True)
-    table.add_column("link", no_wrap=True)
-    for heading in ("mass kg", "centre of mass m", "damping", "friction"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name, update in updates.items():
-        centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
-        table.add_row(
-            printable(name),
-            printable(updated.links[name]),
-            f"{update.body.mass_kg:.3g}",
-            centre,
-            f"{update.damping:.3g}",
-            f"{update.friction:.3g}",
-        )
-    return table
-
-
-def _one_of(cell: Path | None, urdf: Path | None) -> Path:
-    given = [path for path in (cell, urdf) if path is not None]
-    if len(given) != 1:
-        raise UsageError(
-            "--cell, --urdf",
-            found="both" if given else "neither",
-            expected="one of them",
-            remedy="give the cell file; --urdf is for a robot without one",
-        )
-    return given[0]
-
-
 def _declared(calibration: Calibration, path: Path) -> tuple[Model, FloatArray, bool]:
+    from daq.config.cell import model_of
+    from daq.config.cell_file import load_cell
+    from daq.workflow.urdf_export import cell_limits
+
     cell = load_cell(path)
     if cell.name != calibration.cell:
         raise ConfigurationInconsistent(
@@ -305,18 +151,28 @@ def _declared(calibration: Calibration, path: Path) -> tuple[Model, FloatArray, 
 
 
 def _plain(urdf: str) -> tuple[Model, FloatArray]:
-    """A motor for each joint, and ranges of the size that arms have."""
+    """Return a model with a motor for each joint, and limits typical of arms."""
+    import numpy as np
+
+    from ident.model.model import DriveTrain, Model
+    from ident.model.robot import robot_from_urdf
+
     robot = robot_from_urdf(urdf)
     count = robot.joint_count
     return Model(robot, DriveTrain(np.eye(count))), np.repeat(np.array([[0.0], [np.pi], [3.0], [10.0]]), count, axis=1)
 
 
 def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
-    """Whole or not at all, after the new file has been read as a robot with these links.
+    """Write the URDF whole or not at all, after reading it back as a robot with these links.
 
     Raises:
-        OutputFailed: the file system refuses, or the file gives back other inertias.
+        OutputFailed: the file system refuses, or the file reads back with other inertias.
     """
+    import numpy as np
+
+    from daq.cli.terminal import writing
+    from daq.files import replace_file
+    from ident.physical.inertia_prior import urdf_links
 
     def check(content: bytes) -> None:
         if not np.allclose(urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12):
@@ -327,12 +183,11 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
                 remedy="nothing was written; please report this URDF",
             )
 
-    try:
+    with writing(out):
         replace_file(out, updated.content, check=check)
-    except OSError as error:
-        raise OutputFailed.of(out, error) from error
 
 
+EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --csv --out loaded.csv")
 EXPORT_URDF = Verb(
     "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
 )

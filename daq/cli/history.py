@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from daq.cli.terminal import say_written
-from daq.cli.verb import JsonOption, Verb, print_json, printable
+from daq.cli.verb import JsonOption, Verb, print_json
 from daq.cli.writing import applier
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
@@ -33,6 +33,7 @@ from daq.report.history_view import (
     show,
     show_axis,
 )
+from daq.report.text import printable
 from daq.workflow.calibration_file import decode, read
 from daq.writeback.file_access import resolve_links
 

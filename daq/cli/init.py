@@ -21,57 +21,57 @@ TEMPLATES = (
     ("robots/tx40.urdf", "robots/tx40.urdf"),
     ("imports/tx40.yaml", "imports/{name}.yaml"),
 )
-"""Shipped files, and what they are called in the new folder."""
-
+"""Shipped files, and their names in the new folder."""
 
 HEADS = {
     "cells": """\
 # The cell {name}. Its numbers are those of the arm that `drivegain demo` moves: replace every one of them.
 """,
     "controllers": """\
-# Joint drive gains of {name}: put your controller's own file in the place of this one. drivegain changes the numbers
-# that `controller.gains` in the cell file names, and keeps comments, order and spacing.
+# Joint drive gains of {name}: replace this file with your controller's own. drivegain changes the numbers that
+# `controller.gains` in the cell file names, and keeps comments, order and spacing.
 """,
     "imports": """\
-# How CSV files that another controller has recorded become a log; not needed where drivegain records.
+# Converts CSV files of another controller to a log; not needed where drivegain records.
 #   drivegain import imports/{name}.yaml --data FOLDER --out run.mcap
 """,
 }
-"""Comment at the head of a new file, by the folder of its template, instead of what the template says of itself."""
+"""First comment of a new file, by the folder of its template; it replaces the template's own."""
+
 BUS = """\
 bus:
   # A cell on two buses has a list here, and each axis says `bus: left` or `bus: right`:
   #   - {name: left, interface: socketcan, channel: can0}
   #   - {name: right, interface: socketcan, channel: can1}
 """
-"""What stands over the bus of a new cell."""
+"""Comment on the bus of a new cell."""
+
 AXES = """\
 axes:
   # One entry for each motor, from the base to the tool, in the order of the joints in the URDF.
-  #   name                     what people call the axis; messages, tables and logs use it
+  #   name                     name of the axis in messages, tables and logs
   #   node_id                  CANopen node id of its amplifier, 1 to 127
   #   drive                    drive profile: the name of a file in ../drives/
-  #   identity                 object 1018h as `drivegain scan` shows it, so that no wrong amplifier is ever moved;
+  #   identity                 object 1018h as `drivegain scan` shows it, so that a wrong amplifier is never moved;
   #                            leave the line out to accept any
   #   counts_per_revolution    of the motor's encoder, as object 6064h counts
   #   zero_offset_deg          joint angle of the URDF where the motor's counts are zero
   #   nameplate_gain_nm_per_a  the manufacturer's gain: Nm at the joint per A of the current reference; negative where
   #                            the current counts against the joint
-  #   limits                   what a plan may use of the joint, well inside of its mechanical stops
-  # A prismatic axis has lead_mm (its way for a turn), zero_offset_mm, nameplate_gain_n_per_a, and limits position_mm,
-  # velocity_mm_s and acceleration_mm_s2; its standstill speed stands in standstill_mm_s.
+  #   limits                   range that a plan may use, well inside the mechanical stops
+  # A prismatic axis has lead_mm (travel per turn), zero_offset_mm, nameplate_gain_n_per_a, and limits position_mm,
+  # velocity_mm_s and acceleration_mm_s2; its standstill speed is standstill_mm_s.
 """
-"""What stands over the axes of a new cell."""
+"""Comment on the axes of a new cell."""
 
 PAYLOADS = """\
 payloads:
-  # mass_kg is what must be weighed. What a drawing says may stand beside it, for `drivegain fit --known cad`:
+  # mass_kg must be weighed. Values from a drawing may be added, for `drivegain fit --known cad`:
   #   centre_m: [x, y, z]                       centre of mass in the frame of the last joint
   #   inertia_kg_m2: [xx, xy, xz, yy, yz, zz]   about the centre of mass, signs as in a URDF (xy = -integral of xy dm)
-  # Single parameters about the frame's origin go under known: {mz: 0.4}. Every way of mounting has a name of its own.
+  # Single parameters about the frame's origin go under known: {mz: 0.4}. Every mounting has its own name.
 """
-"""What stands over the payloads of a new cell."""
-
+"""Comment on the payloads of a new cell."""
 
 SIMULATED_BUS = """\
 bus:
@@ -84,19 +84,18 @@ sync:
   period_us: 1000
   pacing: lockstep                         # the simulated cell answers as fast as this computer can
 """
-"""Bus and sampling of a cell whose amplifiers `drivegain simulate demo` makes."""
+"""Bus and sampling of a cell whose amplifiers `drivegain simulate demo` simulates."""
 
 
 def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
-    """Copy the templates into a new folder; all of them or none.
+    """Copy the templates into a new folder, all of them or none; return the files.
 
     Args:
         folder: new, or empty.
-        simulated: let the cell file say the bus of `drivegain simulate demo`.
+        simulated: write the bus of `drivegain simulate demo` into the cell file.
 
     Raises:
-        UsageError: the folder's name is no name of a cell.
-        UsageError: the folder holds something.
+        UsageError: the folder's name cannot be a cell's, or the folder is not empty.
         OutputFailed: the file system refuses.
     """
     name = folder.resolve().name
@@ -117,7 +116,7 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
             whole = Path(temporary) / name
             written = tuple(_copy(source, whole, target.format(name=name), name) for source, target in TEMPLATES)
             if simulated:
-                _put_on_the_hub(whole / "cells" / f"{name}.yaml")
+                _use_simulated_bus(whole / "cells" / f"{name}.yaml")
             whole.chmod(0o755)
             whole.rename(folder)
     except OSError as error:
@@ -126,12 +125,12 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="Folder to make; its name becomes the cell's.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to create; its name becomes the cell's.")],
     simulated: Annotated[
-        bool, typer.Option("--simulated", help="For the cell of `drivegain simulate demo`, to try the verbs on.")
+        bool, typer.Option("--simulated", help="Use the bus of `drivegain simulate demo`, to try the verbs.")
     ] = False,
 ) -> None:
-    """Make a folder for a new cell, with commented templates to fill in."""
+    """Create a folder for a new cell, with commented templates to fill in."""
     for path in make_folder(folder, simulated=simulated):
         typer.echo(path)
 
@@ -153,7 +152,7 @@ def _copy(source: str, folder: Path, target: str, name: str) -> Path:
     return path
 
 
-def _put_on_the_hub(cell: Path) -> None:
+def _use_simulated_bus(cell: Path) -> None:
     text = cell.read_text(encoding="utf-8")
     cell.write_text(
         re.sub(r"^bus:\n.*?(?=^axes:)", SIMULATED_BUS, text, flags=re.MULTILINE | re.DOTALL), encoding="utf-8"

@@ -1,53 +1,48 @@
-"""`drivegain recalibrate`: the scheduled job. It moves the robot, by the cell's policy and its interlock."""
+"""`drivegain recalibrate` and `install-units`: the scheduled job, which moves the robot, and the timer that runs it."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
 import sys
-from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.residual import save_report
-from daq.cli.terminal import interruptible
-from daq.cli.verb import JsonOption, Verb, print_json, printable
-from daq.config.cell_file import load_cell
-from daq.environment import login
-from daq.errors import DaqError, ExitCode, OutputFailed, UsageError, exit_code
-from daq.files import replace_file
-from daq.jobs.conclusion import document, text
-from daq.jobs.job import preview, recalibrate
-from daq.jobs.journal import Form, Journal, Level, form_of
-from daq.jobs.preflight import section_of, target_of
-from daq.jobs.tools import Tools
-from daq.jobs.units import MARK, Installation, Unit, cell_option, cron_line, next_commands, units_of
+from daq.cli.verb import JsonOption, Verb, print_json
+from daq.errors import DaqError, ExitCode, UsageError, exit_code
 from drivers.errors import WHILE, DriverError
 from ident.errors import IdentificationError
 
+if TYPE_CHECKING:
+    from daq.jobs.journal import Journal
+
 
 def recalibrate_verb(
-    cell: Annotated[Path, typer.Option(help="Cell file; its `recalibration` and `policy` say what is done.")],
+    cell: Annotated[Path, typer.Option(help="Cell file; `recalibration` and `policy` configure the job.")],
     dry_run: Annotated[
         bool,
-        typer.Option("--dry-run", help="Ask interlock and drives, say what would be done, move and write nothing."),
+        typer.Option(
+            "--dry-run", help="Query interlock and drives and show the next steps; nothing is moved or written."
+        ),
     ] = False,
     now: Annotated[
-        bool, typer.Option("--now", help="Also where the last good calibration is young: a motor was replaced.")
+        bool,
+        typer.Option("--now", help="Run even if the last good calibration is recent: a motor was replaced."),
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Record, fit, decide, and propose or apply, without anybody: for a timer. Events go to stderr, a line each.
+    """Record, fit, decide, and propose or apply, unattended, for a timer. Events go to stderr, a line each.
 
-    Nothing moves unless the cell file says `policy: {motion: allowed}` and its interlock lets the robot move, which is
-    asked before every motion. A job that was ended is taken up by the next one. Exit codes: 0 applied, unchanged or not
-    due; 10 a change waits for a person; 11 the interlock does not let the robot move; 12 the bus is taken; 13 out of
-    time; 14 held for another reason; else as every verb.
+    Nothing moves unless the cell file has `policy: {motion: allowed}` and its interlock releases the robot, which is
+    checked before every motion. An interrupted job is resumed by the next one. Exit codes: 0 applied, unchanged or not
+    due; 10 a change waits for approval; 11 the interlock does not release the robot; 12 the bus is taken; 13 out of
+    time; 14 held for another reason; others as for every verb.
     """
+    import os
+    from datetime import UTC, datetime
+
+    from daq.jobs.journal import Form, Journal, Level, form_of
+
     journal = Journal(sys.stderr, form_of(sys.stderr, os.environ), lambda: datetime.now(UTC))
     try:
         _run(cell, dry_run, now, json, journal)
@@ -59,16 +54,27 @@ def recalibrate_verb(
         journal.say(Level.ERROR, "failed", error=type(error).__name__, text=str(error), notes=error_notes(error))
         if journal.form is Form.TEXT:
             raise
-        # A program reads stderr: the message for a person would be no line of JSON.
+        # A program reads stderr, and the message for the terminal is no line of JSON.
         raise typer.Exit(exit_code(type(error)) or ExitCode.UNEXPECTED) from error
 
 
 def error_notes(error: BaseException) -> list[str]:
-    """What was noted on an error on its way up."""
+    """Return the notes of an error."""
     return list(getattr(error, "__notes__", ()))
 
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
+    from dataclasses import replace
+
+    from daq.cli.terminal import interruptible
+    from daq.config.cell_file import load_cell
+    from daq.environment import login
+    from daq.jobs.conclusion import document, text
+    from daq.jobs.job import preview, recalibrate
+    from daq.jobs.tools import Tools
+    from daq.report.residual_page import save_report
+    from daq.report.text import printable
+
     declared = load_cell(cell)
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
@@ -94,44 +100,50 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
 RECALIBRATE = Verb("recalibrate", recalibrate_verb, "drivegain recalibrate --cell cells/demo.yaml --dry-run")
 
 
-# `drivegain install-units`: let systemd or cron run the cell's scheduled recalibration. A dry run at first.
-
-
-SYSTEM, OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
+_SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
 
 def install_units(
     cell: Annotated[Path, typer.Option(help="Cell file with `recalibration`.")],
     to: Annotated[
         Path | None,
-        typer.Option("--to", help="Folder of the units; /etc/systemd/system, or the user's, where it is not given."),
+        typer.Option("--to", help="Folder of the units; by default /etc/systemd/system, or the user's with --user."),
     ] = None,
-    user: Annotated[bool, typer.Option("--user", help="Units of this user, not of the system.")] = False,
+    user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
     schedule: Annotated[
         str, typer.Option(help="When: weekly, daily, or a calendar expression of systemd such as 'Sun 03:00'.")
     ] = "weekly",
     cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Write the units; without it they are only shown.")] = False,
 ) -> None:
-    """Make a service and a timer for `drivegain recalibrate`; nothing is enabled, the last lines say how to.
+    """Create a service and a timer for `drivegain recalibrate`; the last lines printed show how to enable them.
 
-    The timer never makes up for a date that it missed, and the job's interlock is asked before every motion.
+    The timer does not catch up on a missed date, and the job checks the interlock before every motion.
     """
+    from daq.cli.terminal import writing
+    from daq.config.cell_file import load_cell
+    from daq.files import replace_file
+    from daq.jobs.preflight import section_of, target_of
+    from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
+
     declared = load_cell(cell)
     section, _ = section_of(declared), target_of(declared)
     wanted = Installation(cell.resolve(), program(), schedule, user, owner_of(cell.resolve()))
     if cron:
         typer.echo(cron_line(wanted))
         if yes:
-            typer.echo("Not installed: put this line into the table that `crontab -e` opens.", err=True)
+            typer.echo("Not installed: add this line to the table that `crontab -e` opens.", err=True)
         return
     check_schedule(schedule)
-    folder = to or (Path.home() / OF_USER if user else SYSTEM)
+    folder = to or (Path.home() / _OF_USER if user else _SYSTEM)
     units = units_of(declared, section, wanted)
     for unit in units:
         require_own_unit(folder / unit.name, cell_option(wanted) if unit.name.endswith(".service") else "")
     if yes:
-        _write(folder, units)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            for unit in units:
+                replace_file(folder / unit.name, unit.text.encode())
     for unit in units:
         typer.echo(f"Written: {folder / unit.name}" if yes else f"# {folder / unit.name}\n{unit.text}")
     typer.echo("Then:" if yes else "Dry run, nothing was written. To write this, repeat the command with --yes; then:")
@@ -140,25 +152,27 @@ def install_units(
 
 
 def program() -> Path:
-    """The command that a timer must call, where it is.
+    """Return the path of the command that the timer calls.
 
     Raises:
         UsageError: drivegain is not installed as a command.
     """
+    import shutil
+
     beside = Path(sys.executable).parent / "drivegain"
     found = beside if beside.exists() else shutil.which("drivegain")
     if found is None:
         raise UsageError(
             "drivegain",
-            found=f"no such command beside {sys.executable} and none on the path",
-            expected="an installed drivegain: a timer must find it",
+            found=f"no such command beside {sys.executable} or on PATH",
+            expected="an installed command, for the timer to call",
             remedy="install it (`pip install .`), then repeat this",
         )
     return Path(found).absolute()
 
 
 def owner_of(path: Path) -> str:
-    """Name of a file's owner, or the number of one without a name."""
+    """Return the name of a file's owner, or the number of one without a name."""
     try:
         return path.owner()
     except KeyError:
@@ -166,12 +180,15 @@ def owner_of(path: Path) -> str:
 
 
 def check_schedule(schedule: str) -> None:
-    """Have systemd read the calendar expression, where this computer has it.
+    """Check a calendar expression with systemd, where this computer has it.
 
     Raises:
-        UsageError: it is none.
+        UsageError: it is no calendar expression.
     """
-    found = "" if schedule.strip() and schedule.isprintable() else "nothing that can stand in a line"
+    import shutil
+    import subprocess
+
+    found = "" if schedule.strip() and schedule.isprintable() else "an empty or unprintable text"
     analyze = shutil.which("systemd-analyze")
     if not found and analyze is not None:
         done = subprocess.run(
@@ -183,48 +200,40 @@ def check_schedule(schedule: str) -> None:
             f"--schedule {schedule!r}",
             found=found,
             expected="a calendar expression of systemd.time(7): weekly, 'Sun 03:00', 'Mon..Fri 22:30'",
-            remedy="correct it; `systemd-analyze calendar EXPRESSION` tells when it strikes",
+            remedy="correct it; `systemd-analyze calendar EXPRESSION` shows its next date",
         )
 
 
-def require_own_unit(path: Path, saying: str = "") -> None:
-    """Refuse to replace a file that this verb has not made, or that it made for another cell.
+def require_own_unit(path: Path, option: str = "") -> None:
+    """Refuse to replace a file that this verb did not write, or that it wrote for another cell.
 
     Args:
         path: of the unit.
-        saying: what a unit of this cell says.
+        option: text that a unit of this cell contains.
 
     Raises:
-        UsageError: it is somebody else's.
+        UsageError: the file is not ours.
     """
-    try:
-        # What is no regular file is nobody's unit, and a pipe would be waited for.
+    from daq.cli.terminal import writing
+    from daq.jobs.units import MARK
+
+    with writing(path):
+        # Reading a pipe would block; only a regular file can be a unit of ours.
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
-    if text is not None and text.startswith(MARK) and saying not in text:
-        raise UsageError(
-            str(path),
-            found="the unit of another cell file",
-            expected=f"no such file, or one that says {saying}",
-            remedy="name another folder with --to, or remove it where the cell file has moved",
-        )
     if (text is None and path.exists()) or (text is not None and not text.startswith(MARK)):
         raise UsageError(
             str(path),
-            found="a unit that drivegain did not make",
+            found="a unit that drivegain did not write",
             expected="no such file, or one of an earlier `install-units`",
             remedy="name another folder with --to, or move it away",
         )
-
-
-def _write(folder: Path, units: tuple[Unit, ...]) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for unit in units:
-            replace_file(folder / unit.name, unit.text.encode())
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
+    if text is not None and option not in text:
+        raise UsageError(
+            str(path),
+            found="the unit of another cell file",
+            expected=f"no such file, or one with {option}",
+            remedy="name another folder with --to, or remove it if the cell file has moved",
+        )
 
 
 INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units --cell cells/demo.yaml --schedule weekly")

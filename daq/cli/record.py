@@ -1,32 +1,26 @@
-"""`drivegain record`: make a plan's moves and log every sample. This moves the robot."""
+"""`drivegain record`: execute a plan and log every sample. This moves the robot."""
 
 from __future__ import annotations
 
 import shlex
 import uuid
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.terminal import interruptible, progress_bar
-from daq.cli.verb import JsonOption, Verb, print_json
-from daq.config.bus import bus_loads
-from daq.config.cell import Cell, MotionPolicy, Pacing
-from daq.config.cell_file import load_cell
-from daq.environment import login
+from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
-from daq.workflow.plan import slowed
-from daq.workflow.plan_file import load_plan
-from daq.workflow.record import record
-from daq.workflow.safeguards import bus_lock, check_entered_mass
 from drivers.errors import DriverError, SampleLost
-from ident.model.bodies import Payload
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from ident.model.bodies import Payload
 
 
 def record_verb(
-    cell: Annotated[Path, typer.Argument(help="Cell file.")],
-    plan: Annotated[Path, typer.Argument(help="Plan of `drivegain plan`.")],
+    cell: CellArgument,
+    plan: Annotated[Path, typer.Argument(help="Plan written by `drivegain plan`.")],
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
     enable_motion: Annotated[
         bool,
@@ -38,19 +32,32 @@ def record_verb(
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     mass: Annotated[
         float | None,
-        typer.Option(help="Mass of the payload in kg, read off the scale now; it must be the cell file's.", min=0.0),
+        typer.Option(
+            help="Mass of the payload [kg], read off the scale now; it must agree with the cell file.", min=0.0
+        ),
     ] = None,
-    operator: Annotated[str | None, typer.Option(help="Who stands for this recording; you, by default.")] = None,
+    operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None,
     speed: Annotated[
         float,
-        typer.Option(help="Speed override for a first run: share of the plan's; the log says it.", min=0.05, max=1.0),
+        typer.Option(help="Share of the plan's speed, for a first run; it is kept in the log.", min=0.05, max=1.0),
     ] = 1.0,
     json: JsonOption = False,
 ) -> None:
-    """Make the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
+    """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
 
-    A run with losses is kept, marked invalid, and ends with exit code 4: no fit takes it.
+    A run with losses is kept, marked invalid, and ends with exit code 4; `fit` refuses it.
     """
+    from daq.cli.terminal import interruptible, progress_bar
+    from daq.config.bus import bus_loads
+    from daq.config.cell import Pacing
+    from daq.config.cell_file import load_cell
+    from daq.environment import login
+    from daq.report.bus import load_lines
+    from daq.workflow.plan import slowed
+    from daq.workflow.plan_file import load_plan
+    from daq.workflow.record import record
+    from daq.workflow.safeguards import bus_lock, check_entered_mass
+
     declared = load_cell(cell)
     moves = slowed(declared, load_plan(plan, declared), speed)
     who = operator or login()
@@ -58,14 +65,14 @@ def record_verb(
     check_entered_mass(declared, carried, mass)
     if carried is not None and mass is None:
         typer.echo(
-            "the payload's mass was not entered from the scale (--mass KG): `drivegain apply` will ask", err=True
+            "the payload's mass was not entered from the scale (--mass KG); `drivegain apply` will ask for it", err=True
         )
     part = _free(out)
     for line in load_lines(declared):
         typer.echo(line, err=True)
     allowed_by = granted(declared, who, enable_motion)
     if allowed_by is not None and not enable_motion:
-        typer.echo(f"motion is allowed by {allowed_by} (its file says so): the axes move now", err=True)
+        typer.echo(f"motion is enabled by {allowed_by} in the cell file; the axes move now", err=True)
     try:
         with bus_lock(declared), interruptible() as block_signals, progress_bar("recording") as report_progress:
             done = record(
@@ -89,13 +96,13 @@ def record_verb(
     except DriverError as error:
         if part.exists():
             error.add_note(
-                f"kept: what was recorded until then is in {part}, which no fit reads; {_next_command(part)}"
+                f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
             )
         lost = isinstance(error, SampleLost)
         if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
-                "lockstep` in the cell file; with a real cell look at the load on bus and computer"
+                "lockstep` in the cell file; on a real cell, check the load of bus and computer"
             )
         raise
     for warning in done.warnings:
@@ -110,22 +117,15 @@ def record_verb(
         verdict = "complete" if log.valid else f"INVALID: {log.reason}; a fit will refuse it"
         typer.echo(f"{out}: {log.samples} samples, {log.lost_cycles} cycles lost, {verdict}")
     if not log.valid:
-        # The log is kept and told of; a script must not go on with it as if it were good.
+        # The log is kept; the exit code keeps a script from using it.
         raise typer.Exit(ExitCode.DATA_UNFIT)
 
 
-def load_lines(cell: Cell) -> tuple[str, ...]:
-    """For a person: what the recording will take of each bus."""
-    lockstep = cell.sync is not None and cell.sync.pacing is Pacing.LOCKSTEP
-    says = "in lockstep; a real one would be loaded by" if lockstep else "loaded by"
-    return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))
-
-
 def _free(out: Path) -> Path:
-    """Where the log grows until it is finished, before anything is asked of the bus.
+    """Return the file in which the log grows until it is finished; called before the bus is used.
 
     Raises:
-        UsageError: the log, or the rest of a recording of that name, is there already.
+        UsageError: the log exists, or an unfinished recording of that name.
     """
     part = out.with_name(out.name + ".part")
     if out.exists():
@@ -135,9 +135,9 @@ def _free(out: Path) -> Path:
     if part.exists():
         raise UsageError(
             str(part),
-            found="the rest of a recording of that name that failed, was interrupted, or still runs",
+            found="the rest of a recording of that name that failed, was interrupted, or is still running",
             expected="none",
-            remedy=f"no fit reads it; {_next_command(part)}",
+            remedy=f"`fit` does not read it; {_next_command(part)}",
         )
     return part
 
@@ -153,35 +153,38 @@ def _next_command(part: Path) -> str:
 
 
 def _interrupted(interrupt: KeyboardInterrupt, made: Path | None, out: Path) -> str:
-    """What became of the axes and of the recording, in one line."""
-    # What the stop could not confirm is noted on the interrupt on its way up; one that came while a stop was being made
-    # for another reason has cut that short.
+    """Describe in one line what became of the axes and of the recording."""
+    # A stop that could not be confirmed is noted on the interrupt; an interrupt during a stop for another reason cut
+    # that stop short.
     first = interrupt.__context__
     while first is not None and not isinstance(first, DriverError | OutputFailed | DiskSpaceShort | KeyboardInterrupt):
         first = first.__context__
     notes = [] if first is None else [f"it came while they were stopped after {type(first).__name__}: {first}"]
     notes += [note for error in (first, interrupt) for note in getattr(error, "__notes__", ())]
     problems = "; ".join(notes)
-    axes = f"NOT ALL AXES ARE KNOWN TO STAND, press the emergency stop ({problems})" if problems else "axes stopped"
+    axes = f"NOT ALL AXES ARE CONFIRMED STOPPED, press the emergency stop ({problems})" if problems else "axes stopped"
     if made is None:
         return f"interrupted: {axes}; nothing was recorded"
     if made == out:
-        return f"interrupted: {axes}; all moves had been made, and {out} is complete"
-    return f"interrupted: {axes}; what was recorded is in {made}, which is not usable for a fit; {_next_command(made)}"
+        return f"interrupted: {axes}; all moves were finished, and {out} is complete"
+    kept = f"the samples recorded so far are in {made}, which `fit` does not read"
+    return f"interrupted: {axes}; {kept}; {_next_command(made)}"
 
 
 def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
-    """Who allows the motion: the person who asks for it, the cell's policy, or nobody."""
+    """Return who enables the motion: the operator or the cell's policy; None where motion is disabled."""
+    from daq.config.cell import MotionPolicy
+
     if enable_motion:
         return who
     return f"the policy of cell {cell.name}, for {who}" if cell.motion is MotionPolicy.ALLOWED else None
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:
-    """The payload of that name.
+    """Return the payload of that name.
 
     Raises:
-        UsageError: the cell has none of that name.
+        UsageError: the cell declares no such payload.
     """
     if name is None:
         return None
@@ -192,7 +195,7 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
         f"payload {name!r}",
         found="no such payload in the cell file",
         expected=", ".join(payload.name for payload in cell.payloads) or "none: the cell declares no payloads",
-        remedy="weigh it and add it to the cell's payloads",
+        remedy="weigh it and add it to `payloads` of the cell file",
     )
 
 

@@ -1,4 +1,4 @@
-"""Where a verb may write: never over what it was given, nor over a file of another kind; and what it says of it."""
+"""The terminal of a verb: output files that are not overwritten by accident, progress, views, and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -9,71 +9,115 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from daq.cli.verb import printable
-from daq.errors import UsageError
-from drivers.canopen.network import SignalBlocker
+from daq.errors import OutputFailed, UsageError
+from daq.report.text import printable
 
-_LOOK_BYTES = 4096
+if TYPE_CHECKING:
+    from drivers.canopen.network import SignalBlocker
+
+_HEAD_BYTES = 4096
+
+ProgressCallback = Callable[[int, int, str], None]
+"""Called with the number done, the total, and a remark."""
 
 
-def check_output(out: Path | None, inputs: Iterable[Path], format_: str) -> None:
-    """Refuse an output that would destroy something.
+def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
+    """Refuse an output file that would overwrite an input or a file of another kind.
 
     Args:
         out: file to write, None where nothing is written.
-        inputs: files that the verb reads.
-        format_: what the first lines of a file of the same kind say (``format: …``); such a file may be replaced.
+        inputs: files that the verb reads, None for options that were not given.
+        format_: name of the kind; its files say ``format: …`` in their first lines, and may be replaced.
 
     Raises:
-        UsageError: it is one of the inputs, or a file of another kind.
+        UsageError: it is an input, or a file of another kind.
     """
     if out is None or not out.exists():
         return
-    if any(given.exists() and out.samefile(given) for given in inputs):
+    if any(given is not None and given.exists() and out.samefile(given) for given in inputs):
         raise UsageError(
-            str(out), found="one of the files to read", expected="a name of its own", remedy="choose another name"
+            str(out), found="one of the input files", expected="a file of its own", remedy="choose another name"
         )
-    if not out.is_file() or f"format: {format_}".encode() not in _head(out):
+    check_replaceable(out, f"format: {format_}", format_)
+
+
+def check_replaceable(out: Path, mark: str, kind: str) -> None:
+    """Refuse to overwrite a file of another kind.
+
+    Args:
+        out: file to write.
+        mark: text in the first lines of every file of this kind.
+        kind: name of the kind, for the message.
+
+    Raises:
+        UsageError: the file exists and lacks the mark.
+    """
+    if out.exists() and not (out.is_file() and mark.encode() in _head(out)):
         raise UsageError(
             str(out),
-            found="something that is no " + format_,
+            found=f"an existing file that is no {kind}",
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )
 
 
-def say_written(console: Console, *paths: Path | None) -> None:
-    """Tell what was written, a line each, as the last thing that a verb says.
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(_HEAD_BYTES)
 
-    Args:
-        console: for a person.
-        paths: files and folders; None for what nobody asked for.
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report a refusal of the file system within the block as an output that failed.
+
+    Raises:
+        OutputFailed: the file system refuses.
     """
+    try:
+        yield
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+
+
+def one_of(remedy: str, **options: object) -> None:
+    """Require exactly one of several options, by their names on the command line.
+
+    Raises:
+        UsageError: none, or more than one, is given.
+    """
+    given = [name for name, value in options.items() if value]
+    if len(given) != 1:
+        raise UsageError(
+            ", ".join(f"--{name}" for name in options),
+            found="both" if given else "neither",
+            expected="one of them",
+            remedy=remedy,
+        )
+
+
+def print_view(parts: Iterable[RenderableType], *written: Path | None) -> None:
+    """Print tables and lines on stdout, then the files written; lines are not broken, so that they can be copied."""
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    for part in parts:
+        console.print(part)
+    say_written(console, *written)
+
+
+def say_written(console: Console, *paths: Path | None) -> None:
+    """Print the files and folders that were written, a line each; None for those that were not asked for."""
     for path in paths:
         if path is not None:
             name = f"{path}/" if path.is_dir() else str(path)
             console.print(f"Written: {printable(name)}", markup=False, highlight=False)
 
 
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(_LOOK_BYTES)
-
-
-# Progress of long work, on stderr: stdout is for results.
-
-
-ProgressCallback = Callable[[int, int, str], None]
-"""Done, total, and a remark."""
-
-
 class Stepper:
-    """A bar for each of several steps, one after the other; a context manager."""
+    """Progress bars on stderr for steps that follow each other; a context manager."""
 
     def __init__(self) -> None:
         columns = (
@@ -97,12 +141,12 @@ class Stepper:
         self._bars.stop()
 
     def step(self, title: str) -> None:
-        """End the step before, and begin another."""
+        """End the current step and begin the next."""
         self._end()
         self._task = self._bars.add_task(title, total=None, remark="")
 
     def progress(self, done: int, total: int, remark: str) -> None:
-        """Within the step; a total of 0 is not known."""
+        """Report progress within the step; a total of 0 is unknown."""
         if self._task is not None:
             of = f"{done}/{total} " if total else ""
             self._bars.update(self._task, completed=done, total=total or None, remark=of + remark)
@@ -115,7 +159,7 @@ class Stepper:
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
-    """One bar."""
+    """Show one progress bar on stderr."""
     with Stepper() as stepper:
         stepper.step(title)
         yield stepper.progress
@@ -123,7 +167,7 @@ def progress_bar(title: str) -> Iterator[ProgressCallback]:
 
 @contextmanager
 def status(title: str) -> Iterator[Callable[[str], None]]:
-    """A spinner for work whose length nobody knows; every step it is told is a line."""
+    """Show a spinner on stderr for work of unknown length; each reported step is a line."""
     console = Console(stderr=True, highlight=False)
     with console.status(title):
 
@@ -131,9 +175,6 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
             console.print(f"  {step}", style="dim")
 
         yield show_step
-
-
-# Being told to stop while a robot moves: by Ctrl-C, by a service manager (SIGTERM), by a terminal that has gone.
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -145,14 +186,14 @@ GRACE_S = 10.0
 def interruptible(
     clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
 ) -> Iterator[SignalBlocker]:
-    """Turn some signals within the block into KeyboardInterrupt; pass over those that follow too soon.
+    """Turn signals within the block into KeyboardInterrupt, and ignore those that follow within `GRACE_S`.
 
-    By default SIGTERM and SIGHUP end a process at once, and the axes would go on; a shell script starts what it puts
-    into the background (&) deaf to SIGINT, and only a handler of its own makes it hear again. What follows the first
-    signal is the stop of the axes: a second one, of an impatient person, must not cut that short. Later ones count
-    again, so that nobody is left without a way out. A stop that a fault began is protected as long by whoever makes it,
-    with what is yielded; a signal that comes meanwhile is dropped, for it asks for what is being done. In another
-    thread than the main one nothing changes: Python handles no signals there.
+    By default SIGTERM and SIGHUP end a process at once, and the axes would keep moving; a shell starts background jobs
+    (&) with SIGINT ignored, and only a handler of our own makes them interruptible. The first signal starts the stop of
+    the axes, which a second one must not cut short; later signals count again, so that a hanging stop can be left. The
+    yielded context manager protects a stop that a fault has started in the same way; a signal that arrives meanwhile is
+    dropped, because it asks for what is happening already. Outside the main thread, where Python handles no signals,
+    nothing changes.
 
     Args:
         clock: monotonic time [s].

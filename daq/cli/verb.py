@@ -1,18 +1,26 @@
-"""What makes a verb of the command line, and what all of them share."""
+"""A verb of the command line, and the options that several verbs share.
+
+A verb parses, calls and prints. Its module imports what the help needs; the verb imports what it runs when it runs, so
+that no help waits for numerics or for the bus.
+"""
 
 from __future__ import annotations
 
 import importlib
-import json
-import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from daq.report.text import json_text
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+CellArgument = Annotated[Path, typer.Argument(help="Cell file.")]
+CellOption = Annotated[Path | None, typer.Option("--cell", help="Another cell file than the one in the logs.")]
+CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml written by `drivegain fit`.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +28,8 @@ class Verb:
     """One verb.
 
     Attributes:
-        name: as technicians say it.
-        function: takes its arguments as typer reads them; its docstring is the help.
+        name: on the command line.
+        function: takes its arguments as typer parses them; its docstring is the help.
         example: a command line that works, shown at the end of the help.
     """
 
@@ -29,62 +37,25 @@ class Verb:
     function: Callable[..., None]
     example: str
 
+    def command(self) -> Any:
+        """Click command of this verb."""
+        app = _app()
+        self.add_to(app)
+        return typer.main.get_command(app)
 
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """A verb as the list of verbs has it, before it is imported.
+    def add_to(self, app: typer.Typer) -> None:
+        """Add the verb to an application."""
+        app.command(self.name, epilog=self.epilog)(self.function)
 
-    Attributes:
-        name: as technicians say it.
-        place: of its `Verb`, as an entry point is written: module, colon, name.
-        summary: one line for the list.
-    """
-
-    name: str
-    place: str
-    summary: str
-
-    def load(self) -> Verb:
-        """Import it."""
-        module, _, name = self.place.partition(":")
-        verb = getattr(importlib.import_module(module), name)
-        if not isinstance(verb, Verb):
-            raise TypeError(f"{self.place} is no Verb")
-        return verb
-
-
-def json_text(document: Any) -> str:
-    """One JSON document; numbers that JSON cannot say become null, bytes of names that are no UTF-8 are spelt out."""
-    text = json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return text.encode(errors="backslashreplace").decode()
-
-
-def print_json(document: Any) -> None:
-    """One JSON document on stdout."""
-    sys.stdout.write(json_text(document))
-
-
-def printable(text: str) -> str:
-    """Text from a file as a terminal may show it: control characters, which could command it, are spelt out."""
-    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
-
-
-def _json_safe(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {str(key): _json_safe(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_safe(item) for item in value]
-    return value
-
-
-# A verb of several kinds, each with arguments of its own: `drivegain export urdf …`.
+    @property
+    def epilog(self) -> str:
+        """Example as click shows it; \\b keeps it on one line, ready to copy."""
+        return f"\b\nExample:\n  {self.example}"
 
 
 @dataclass(frozen=True, slots=True)
 class VerbGroup(Verb):
-    """One verb with kinds; `function` takes no arguments, its docstring is the help of all.
+    """Verb of several kinds, each with its own arguments: `drivegain export urdf …`.
 
     Attributes:
         kinds: in the order of the help.
@@ -93,20 +64,42 @@ class VerbGroup(Verb):
     kinds: tuple[Verb, ...]
 
     def command(self) -> Any:
-        """As click runs it."""
-        group = typer.Typer(
-            no_args_is_help=True,
-            add_completion=False,
-            pretty_exceptions_enable=False,
-            rich_markup_mode=None,
-            epilog=_epilog(self),
-        )
+        """Click group of the kinds; the docstring of `function`, which takes no arguments, is the help."""
+        group = _app(no_args_is_help=True, epilog=self.epilog)
         group.callback()(self.function)
         for kind in self.kinds:
-            group.command(kind.name, epilog=_epilog(kind))(kind.function)
+            kind.add_to(group)
         return typer.main.get_command(group)
 
 
-def _epilog(verb: Verb) -> str:
-    # \b keeps the example on one line: it is there to be copied.
-    return f"\b\nExample:\n  {verb.example}"
+def _app(**settings: Any) -> typer.Typer:
+    # rich would read the units in brackets, [s], as markup and drop them.
+    return typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, **settings)
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """Entry of the list of verbs, before the verb is imported.
+
+    Attributes:
+        name: on the command line.
+        place: where its `Verb` is defined, as module:name.
+        summary: one line for the list.
+    """
+
+    name: str
+    place: str
+    summary: str
+
+    def load(self) -> Verb:
+        """Import the verb."""
+        module, _, name = self.place.partition(":")
+        verb = getattr(importlib.import_module(module), name)
+        if not isinstance(verb, Verb):
+            raise TypeError(f"{self.place} is no Verb")
+        return verb
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document on stdout."""
+    sys.stdout.write(json_text(document))

@@ -34,7 +34,7 @@ from daq.jobs.tools import Tools
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
-from daq.report.residual_document import summary
+from daq.report.residual import summary
 from daq.workflow.calibration_file import load
 from daq.workflow.calibration_file import save as save_calibration
 from daq.workflow.plan import Plan

@@ -1,207 +1,150 @@
-"""The pictures of a fit: torques as the paper's Fig. 2, the gains, and the residual before and after each effect."""
+"""A fit in tables, sentences and JSON: gains, errors, what they rest on, and what the data cannot show."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-import numpy as np
-from rich import box
+from rich.console import RenderableType
 from rich.table import Table
+from rich.text import Text
 
-from daq.config.cell import MILLIMETRE, Cell, JointUnit
-from daq.report.effect_names import effect_text, other_axis, variable_text
-from daq.report.gains import plot_gains
-from daq.report.picture import BLACK, QUANTITY, SKY, FloatArray, legend_below, panels, save_png, thinned, unformatted
-from daq.report.residual_plots import plot_residual
-from daq.workflow.fit import DOUBTFUL_PERCENT, Fit
-from drivers.profiles.profile import TapPoint
+from daq.report import paper_tables
+from daq.report.bus import actual_current_note
+from daq.report.gains import gain_table, partial_note
+from daq.report.text import percent_text, plain_table
+from daq.workflow.calibration_file import as_document
+from daq.workflow.cases import CASES, CaseFit
+from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
 from ident.calibration import Calibration, Parameter
 from ident.discovery.loop import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
-from ident.effects.signals import Abscissa, fitted_signals, session_began_s
-from ident.equations.rows import decimate_rows
 from ident.estimators.comparison import Comparison, Trial
+from ident.estimators.estimate import RelativeError
 from ident.planning.verdict import GOOD_PERCENT, GainVerdict
 
-# Measured against predicted torque of every axis, as the paper's Fig. 2.
 
-
-def plot_torques(
-    path: Path | None,
-    time_s: FloatArray,
-    measured_nm: FloatArray,
-    predicted_nm: FloatArray,
-    axes: tuple[str, ...],
-    *,
-    title: str,
-    forces: tuple[str, ...] = (),
-    shown_s: float = 10.0,
-) -> bytes:
-    """Draw τ = V g with the identified gains (full) and the model's τ (dotted), one panel an axis.
-
-    The relative error over each panel is that of the whole run, not only of what is drawn.
+def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> Iterator[RenderableType]:
+    """Gains and errors, what they rest on, and what the data cannot show.
 
     Args:
-        path: of the PNG; None where its bytes alone are wanted.
-        time_s: shape (k,) [s].
-        measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
-        predicted_nm: torque from the model, same shape [forces].
-        axes: names of the n axes.
-        title: says which run it is.
-        forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
-        shown_s: length of the stretch that is drawn, from the beginning [s]; longer ones hide the model in the lines.
-
-    Returns:
-        the PNG.
-
-    Raises:
-        OSError: from the file system.
+        found: the fit.
+        calibration: its result.
+        comparison: of all estimators, None where it was not asked for.
     """
-    shown = time_s <= time_s[0] + shown_s
-    whole_s = float(time_s[-1] - time_s[0])
-    extent = f", first {shown_s:g} s of {whole_s:.0f} s" if whole_s > shown_s else ""
-    figure, places = panels(
-        len(axes), 2, f"{unformatted(title)}{extent}\ngaps: samples left out, most of them at standstill"
+    fitted = found.fitted
+    axes, estimate = fitted.cell.axis_names, fitted.estimate
+    yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
+    if (note := partial_note(calibration)) is not None:
+        yield Text(note, style="bold")
+    if (note := actual_current_note(fitted.cell)) is not None:
+        yield note
+    if fitted.paper is not None:
+        values = ", ".join(f"{value:.4g}" for value in fitted.paper.gains)
+        yield f"For comparison, the paper's total least squares on the same rows: {values}"
+    yield ""
+    errors = {"fit": calibration.relative_error_percent, "held out": calibration.holdout_error_percent}
+    yield error_table("Relative error ‖ρ‖/‖Y‖ [%]", axes, errors)
+    filter_ = fitted.identification.conditioning
+    yield (
+        f"{estimate.rows} rows, {len(fitted.final.columns)} base parameters and effects, condition "
+        f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
+        f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )
-    units = forces or ("Nm",) * len(axes)
-    for index, (name, unit, place) in enumerate(zip(axes, units, places, strict=True)):
-        measured, predicted = measured_nm[shown, index], predicted_nm[shown, index]
-        place.plot(*thinned(time_s[shown], measured), color=SKY, linewidth=2.4, label="current × identified gain")
-        place.plot(*thinned(time_s[shown], predicted), color=BLACK, linewidth=1.5, linestyle=":", label="model")
-        both = np.isfinite(measured_nm[:, index]) & np.isfinite(predicted_nm[:, index])
-        error = _relative_error_percent(measured_nm[both, index], predicted_nm[both, index])
-        place.set_title(f"{unformatted(name)}   relative error {error:.1f} %", fontsize=9, loc="left")
-        place.set_ylabel(f"{QUANTITY[unit]} [{unit}]", fontsize=8)
-        if index >= len(axes) - 2:
-            place.set_xlabel("time [s]", fontsize=8)
-    legend_below(figure, places[0])
-    return save_png(figure, path)
+    yield from (*identifiability_notes(fitted), *advice(fitted, needed_verdicts(fitted)))
+    if comparison is not None:
+        for table in comparison_tables(comparison, axes):
+            yield ""
+            yield table
+    if found.essential is not None:
+        removed = ", ".join(step.name for step in found.essential.removed) or "none"
+        yield f"{len(found.essential.system.columns)} essential parameters; removed: {removed}"
 
 
-def _relative_error_percent(measured: FloatArray, predicted: FloatArray) -> float:
-    """‖ρ‖/‖Y‖ (paper, Table 6) of what is drawn [%]; NaN where nothing is."""
-    norm = float(np.linalg.norm(measured))
-    return 100.0 * float(np.linalg.norm(measured - predicted)) / norm if norm else float("nan")
+def fit_document(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> dict[str, Any]:
+    """Build the object of `fit --json`; arguments as of `fit_view`."""
+    fitted = found.fitted
+    axes, paper = fitted.cell.axis_names, fitted.paper
+    compared = {}
+    if paper is not None:
+        gains = [
+            {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
+            for axis, value, std in zip(axes, paper.gains, paper.gains_std, strict=True)
+        ]
+        compared = {"tls": {"gains": gains, "condition": paper.condition}}
+    return {
+        **as_document(calibration),
+        "compared": compared,
+        "removed": _removed(found),
+        "verdicts": [verdict_document(gain, axes) for gain in needed_verdicts(fitted)],
+        **({} if comparison is None else {"comparison": comparison_document(comparison, axes)}),
+    }
 
 
-def draw(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
-    """Torques of the unused run (paper Fig. 2), residual before and after each effect, and the gains.
+def cases_document(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> dict[str, Any]:
+    """Build the object of `fit --cases --json`; both by the name of the case."""
+    return {
+        "cases": {
+            case.name: {
+                "title": case.title,
+                "known": case.known.value,
+                **as_document(calibrations[case.name]),
+                "removed": _removed(fits[case.name]),
+            }
+            for case in CASES
+        }
+    }
 
-    Raises:
-        OSError: from the file system.
-    """
-    before = start_of(fitted)
-    final = fitted.steps[-1].after if fitted.steps else before
-    draw_torques(out / "torques.png", final, fitted.cell)
-    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
-    for step in fitted.steps:
-        for placed in (placed for placed in step.after.effects if placed not in before.effects):
-            name = fitted.cell.axis_names[placed.axis]
-            draw_effect(out / f"residual-{name}-{placed.effect.name}.png", before, step.after, placed, fitted.cell)
-        before = step.after
+
+def _removed(found: CaseFit) -> list[dict[str, Any]]:
+    steps = () if found.essential is None else found.essential.removed
+    return [{"name": step.name, "std_percent": step.std_percent} for step in steps]
+
+
+def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
+    """Cases that failed, and the paper's tables."""
+    for name, found in fits.items():
+        left = found.fitted.identification.training_error.total
+        if left > DOUBTFUL_PERCENT:
+            yield Text(f"{name} failed: its relative error is {left:.3g} %.", style="bold")
+    for table in tables:
+        yield from table.view()
+        yield ""
+
+
+def case_tables(calibrations: dict[str, Calibration]) -> tuple[paper_tables.PaperTable, ...]:
+    """Tables 1 to 4 of the paper, from the calibrations by name of their case."""
+    wls, tls = ((calibrations[f"case-{drawn}"], calibrations[f"case-{mass}"]) for drawn, mass in ((1, 2), (3, 4)))
+    return (
+        paper_tables.parameter_table(1, *wls, "IDIM-WLS"),
+        paper_tables.gain_table(2, *wls, "IDIM-WLS"),
+        paper_tables.parameter_table(3, *tls, "IDIM-TLS"),
+        paper_tables.gain_table(4, *tls, "IDIM-TLS"),
+    )
+
+
+def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, RelativeError | None]) -> Table:
+    """Relative error of each axis and of all together, a row for each entry that is known."""
+    table = plain_table(("", *axes, "total"), title=title)
+    for name, error in errors.items():
+        if error is not None:
+            table.add_row(name, *map(percent_text, (*error.axes, error.total)))
+    return table
 
 
 def start_of(fitted: Fit) -> Evidence:
-    """The rows under the declared model; the logs are read again only where nobody has kept them.
+    """Return the rows under the declared model; the logs are read again only where the rows were not kept.
 
     Raises:
-        DataError: a log cannot be read any more.
+        DataError: a log can no longer be read.
     """
     if not fitted.steps:
         return fitted.evidence()
     return without_effects(fitted.steps[0].after, fitted.identification.estimate)
 
 
-def draw_torques(path: Path | None, final: Evidence, cell: Cell) -> bytes:
-    """Measured against predicted torque of the first run held out, or of the fit.
-
-    Raises:
-        OSError: from the file system.
-    """
-    rows = final.training if final.holdout is None else final.holdout
-    rows = rows.only(rows.run == rows.run[0])
-    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
-    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
-    which = "a run not used in the fit" if final.holdout is not None else "the first run of the fit"
-    forces = tuple(axis.unit.force for axis in cell.axes)
-    title = f"Joint torques of {which}"
-    return plot_torques(path, rows.time_s, measured, predicted, cell.axis_names, title=title, forces=forces)
-
-
-def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> bytes:
-    """The residual of an effect's axis before and after it joined the model, on the first run held out, or of the fit.
-
-    Raises:
-        OSError: from the file system.
-    """
-    index = len(after.trained) if after.held_out else 0
-    rows_before = before.holdout if before.holdout is not None else before.training
-    rows_after = after.holdout if after.holdout is not None else after.training
-    chosen, data = rows_after.run == index, after.datasets[index]
-    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
-    along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
-    variable, velocity = (
-        decimate_rows(data, rows_after.conditioning, column[None])[0]
-        for column in (along, data.velocity_rad_s[:, placed.axis])
-    )
-    use = rows_after.use[placed.axis, chosen]
-    residuals = (
-        np.where(use, model.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
-        for model, rows in ((before, rows_before), (after, rows_after))
-    )
-    name, unit = cell.axes[placed.axis].name, cell.axes[placed.axis].unit
-    return plot_residual(
-        path,
-        rows_after.time_s[chosen],
-        *residuals,
-        variable=variable,
-        variable_label=_label(placed, cell.axis_names, unit),
-        velocity_rad_s=velocity,
-        title=f"{name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
-        force=unit.force,
-    )
-
-
-def _label(placed: PlacedEffect, axes: tuple[str, ...], unit: JointUnit) -> str:
-    """The variable with its unit at this joint: what acts on a prismatic one is a force, and its position is in m."""
-    abscissa = placed.effect.abscissa
-    words, _, measure = abscissa.value.partition(" [")
-    label = f"{variable_text(placed.effect, axes) if other_axis(placed.effect) is not None else words} [{measure}"
-    if unit is not MILLIMETRE or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
-        return label
-    return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
-
-
-# What the recorded current is, in words: a gain by the actual current is not one by the reference.
-
-
-def current_signals(cell: Cell) -> dict[str, str]:
-    """Of each axis with an amplifier: "current reference 6074h:00, rms" or "ACTUAL current 6077h:00, unstated"."""
-    return {
-        axis.name: f"{axis.profile.signal}, amplitude {axis.profile.amplitude.value}"
-        for axis in cell.axes
-        if axis.profile is not None
-    }
-
-
-def actual_current_note(cell: Cell) -> str | None:
-    """A warning where an axis has no current reference, None where every axis has one."""
-    actual = [axis for axis in cell.axes if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL]
-    if not actual:
-        return None
-    drives = ", ".join(dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None))
-    return (
-        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} has none to log): its "
-        "gains are Nm per A of actual current"
-    )
-
-
-# What a fit says of the coefficients of an effect in it.
-
-
 def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, ...]:
-    """The linear parameters of an effect with their σ, by their short names; empty where it is not in the model."""
+    """Linear parameters of an effect with their σ, by their short names; empty where the model lacks the effect."""
     estimate = evidence.estimate
     index = {column.name: number for number, column in enumerate(estimate.unknowns)}
     return tuple(
@@ -216,11 +159,8 @@ def coefficients(evidence: Evidence, placed: PlacedEffect) -> tuple[Parameter, .
     )
 
 
-# What the data of a fit cannot tell, and by what they tell each gain, in words.
-
-
 def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
-    """What no residual of these data could show, in words."""
+    """Describe errors that leave no residual in these data."""
     if fitted.estimate.gains_fixed:
         return ()
     mounted = {payload.mounting for payload in fitted.identification.system.payloads}
@@ -235,13 +175,13 @@ def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
     return (
         *(
             (
-                f"Of {', '.join(drawn)} more than the mass is taken as exact. A drawing that is off by some per cent "
-                "moves the gains by as much, and no σ says so: compare with --known mass, the better in the paper.",
+                f"More than the mass of {', '.join(drawn)} is taken as exact. A drawing that is wrong by some per cent "
+                "shifts the gains by as much, which σ does not show: compare with --known mass, better in the paper.",
             )
             if drawn
             else ()
         ),
-        "What these data cannot tell: a wrong payload mass scales all gains alike and leaves no residual"
+        "Not identifiable from these data: a wrong payload mass scales all gains alike and leaves no residual"
         + (f" ({'; '.join(scales)}); " if scales else "; ")
         + "so does a wrong value of gravity; a gear efficiency that is the same in "
         "both directions is part of its gain.",
@@ -249,14 +189,14 @@ def identifiability_notes(fitted: Fit) -> tuple[str, ...]:
 
 
 def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
-    """By what each gain is seen and what would help, where one is known worse than to a per cent."""
+    """Describe which data identify each uncertain gain, and which moves would help."""
     if fitted.estimate.gains_fixed:
         return ()
     error = fitted.final.training_error.total
     if error > DOUBTFUL_PERCENT:
         return (
-            f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. No σ tells how wrong "
-            "the gains are then: channels, signs, drive train, gravity or payload are not as the cell file says.",
+            f"DOUBTFUL: the model leaves {error:.3g} % of the torque, expected some 3 to 15 %. σ does not cover "
+            "this error: check channels, signs, drive train, gravity and payload against the cell file.",
         )
     if not judged:
         return (f"Excitation: every gain is known to {GOOD_PERCENT:g} % or better.",)
@@ -264,7 +204,7 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
 
 
 def verdict_document(gain: GainVerdict, axes: tuple[str, ...]) -> dict[str, Any]:
-    """One gain's verdict, for --json."""
+    """Verdict on one gain, for --json."""
     return {
         "axis": axes[gain.axis],
         "std_percent": gain.std_percent,
@@ -274,20 +214,12 @@ def verdict_document(gain: GainVerdict, axes: tuple[str, ...]) -> dict[str, Any]
     }
 
 
-# Every estimator side by side, and what scaling and filters do to it, for a person and for --json.
-
-
 def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
-    """Gains under the declared filters, and by how much they change between half and twice the cut-offs.
-
-    Args:
-        comparison: of all estimators.
-        axes: names, one a gain.
-    """
+    """Gains by every estimator under the declared filters, and their spread between half and twice the cut-offs."""
     first = comparison.trials[0]
     filters = f"{first.position_cutoff_hz:g} Hz / {first.decimation_cutoff_hz:g} Hz"
-    gains = _table(f"Gains by every estimator, filters {filters}", (*axes, "‖ρ‖/‖Y‖ %"))
-    spreads = _table("Spread of the gains between half and twice these cut-offs [%]", axes)
+    gains = plain_table(("estimator", *axes, "‖ρ‖/‖Y‖ %"), title=f"Gains by every estimator, filters {filters}")
+    spreads = plain_table(("estimator", *axes), title="Spread of the gains between half and twice these cut-offs [%]")
     for trial in comparison.declared:
         if trial.gains is None:
             gains.add_row(trial.estimator, *("-" for _ in axes), trial.reason)
@@ -299,16 +231,8 @@ def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Ta
     return gains, spreads
 
 
-def _table(title: str, headings: tuple[str, ...]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    table.add_column("estimator", no_wrap=True)
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    return table
-
-
 def comparison_document(comparison: Comparison, axes: tuple[str, ...]) -> list[dict[str, Any]]:
-    """All trials, for --json."""
+    """Return all trials, for --json."""
     return [_trial(trial, axes) for trial in comparison.trials]
 
 

@@ -1,16 +1,22 @@
-"""The results of a fleet: rows for a spreadsheet, a document for a program."""
+"""The results of a fleet: a table, a CSV, and JSON."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
+
+from rich import box
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
 
 from daq.jobs.cell_fit import Failure
 from daq.jobs.fleet import FleetRow
 from daq.jobs.fleet_survey import Summary
-from daq.report.text import inert, inert_row
+from daq.report.gains import with_deviation
+from daq.report.text import inert, inert_row, printable, spelled_bytes
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
@@ -29,10 +35,70 @@ LAST_COLUMNS = (
 )
 
 
-def fleet_csv(rows: Sequence[FleetRow]) -> str:
-    """A line a cell, numbers to the last digit; gain, σ and unit of every axis that any of the cells has.
+def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
+    """Table of the cells, and remarks on it."""
+    yield _fleet_table(rows)
+    yield from map(printable, _remarks(rows))
 
-    What a cell lacks is empty. No text in it is a formula to a spreadsheet.
+
+def _fleet_table(rows: Sequence[FleetRow]) -> Table:
+    """Table of the cells, a row each; errors are red."""
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    table.add_column("cell", overflow="fold")
+    table.add_column("gains ± σ", ratio=1)
+    table.add_column("worst σ %", justify="right", no_wrap=True)
+    table.add_column("error %", justify="right", no_wrap=True)
+    effects = any(isinstance(row.result, Summary) and row.result.effects for row in rows)
+    if effects:
+        table.add_column("effects")
+    table.add_column("s", justify="right", no_wrap=True)
+    for row in rows:
+        cells = _failure_cells(row.result) if isinstance(row.result, Failure) else _summary_cells(row.result)
+        style = "bold red" if isinstance(row.result, Failure) else None
+        shown = (*cells[:3], *(cells[3:] if effects else ()), f"{row.seconds:.2f}")
+        table.add_row(*map(Text, (printable(row.cell), *shown)), style=style)
+    return table
+
+
+def _failure_cells(failure: Failure) -> tuple[str, str, str, str]:
+    return printable(f"{failure.kind}: {failure.text}"), "", "", ""
+
+
+def _summary_cells(summary: Summary) -> tuple[str, str, str, str]:
+    """Gains, the worst of them, the error and the effects."""
+    # Lines break between gains, not within one.
+    gains = ", ".join(with_deviation(gain.value, gain.std).replace(" ", "\xa0") for gain in summary.gains)
+    units = ", ".join(dict.fromkeys(gain.unit for gain in summary.gains))
+    worst = f"{summary.worst.axis} {summary.worst.std_percent:.2f}"
+    error = f"{summary.error_percent:.2f}" + ("" if summary.held_out else "*")
+    effects = ", ".join(f"{name} {axis}" for name, axis in summary.effects)
+    return f"{gains} {printable(units)}", printable(worst), error, printable(effects)
+
+
+def _remarks(rows: Sequence[FleetRow]) -> list[str]:
+    fitted = [(row, row.result) for row in rows if isinstance(row.result, Summary)]
+    kept = sum(row.kept for row, _ in fitted)
+    again = f" ({kept} of them kept from earlier, with the same logs)" if kept else ""
+    lines = [f"{len(fitted)} of {len(rows)} fitted{again}."]
+    if not all(summary.held_out for _, summary in fitted):
+        lines.append("* on the moves of the fit: the cell has no second run with the same payload to hold out.")
+    several = {row.cell: row.configurations for row in rows if row.configurations > 1}
+    lines += [
+        f"{cell}: logs of {count} configurations, each fitted on its own; check which one is current."
+        for cell, count in several.items()
+    ]
+    lines += [
+        f"{row.cell}: PARTIAL or lossy data: not for a controller; `apply` refuses it."
+        for row, summary in fitted
+        if summary.partial
+    ]
+    return lines
+
+
+def fleet_csv(rows: Sequence[FleetRow]) -> str:
+    """Write a line per cell, with all digits; gain, σ and unit of every axis that any of the cells has.
+
+    Missing values are empty. No text is a formula to a spreadsheet.
     """
     summaries = [row.result for row in rows if isinstance(row.result, Summary)]
     axes = list(dict.fromkeys(gain.axis for summary in summaries for gain in summary.gains))
@@ -47,7 +113,7 @@ def fleet_csv(rows: Sequence[FleetRow]) -> str:
 
 
 def fleet_document(rows: Sequence[FleetRow]) -> dict[str, Any]:
-    """The object of --json."""
+    """Build the object of `fleet --json`."""
     fitted = sum(row.fitted for row in rows)
     return {"cells": [_document(row) for row in rows], "fitted": fitted, "failed": len(rows) - fitted}
 
@@ -82,11 +148,11 @@ def _document(row: FleetRow) -> dict[str, Any]:
     failure = result if isinstance(result, Failure) else None
     summary = result if isinstance(result, Summary) else None
     return {
-        "cell": _spelt(row.cell),
+        "cell": spelled_bytes(row.cell),
         "configuration_sha256": row.configuration_sha256 or None,
         "configurations": row.configurations,
-        "fit": [_spelt(name) for name in row.fit],
-        "holdout": [_spelt(name) for name in row.holdout],
+        "fit": [spelled_bytes(name) for name in row.fit],
+        "holdout": [spelled_bytes(name) for name in row.holdout],
         "gains": [] if summary is None else [_gain(gain) for gain in summary.gains],
         "worst": None if summary is None else _gain(summary.worst),
         "error_percent": None if summary is None else summary.error_percent,
@@ -95,15 +161,10 @@ def _document(row: FleetRow) -> dict[str, Any]:
         "partial": None if summary is None else summary.partial,
         "seconds": row.seconds,
         "kept": row.kept,
-        "calibration": None if row.file is None else _spelt(str(row.file)),
+        "calibration": None if row.file is None else spelled_bytes(str(row.file)),
         "exit_code": 0 if failure is None else failure.exit_code,
-        "error": None if failure is None else {"kind": failure.kind, "text": _spelt(failure.text)},
+        "error": None if failure is None else {"kind": failure.kind, "text": spelled_bytes(failure.text)},
     }
-
-
-def _spelt(text: str) -> str:
-    """Bytes of a file's name that are no UTF-8, and so can be in no document, as `\\udcff`."""
-    return text.encode(errors="backslashreplace").decode()
 
 
 def _measured_on(summary: Summary) -> str:

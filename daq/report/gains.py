@@ -1,4 +1,4 @@
-"""The picture of the gains: how far each is from its nameplate, ± σ, and the truth of a simulated cell."""
+"""The gains with their σ: a table, a picture beside the nameplate, and a picture before and after effects."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from rich import box
 from rich.table import Table
-from rich.text import Text
 
 from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, save_png, unformatted
-from daq.report.text import terminal_text
+from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import GainChange
 
 _SIGMAS = 2.0
+_BESIDE = 0.12
+"""Offset of the points before and after, in units of the distance between axes."""
 
 
 def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> None:
@@ -28,7 +28,7 @@ def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] |
         path: of the PNG.
         gains: one an axis.
         truth: true gain by axis, for a simulated cell only.
-        title: says which cell it is.
+        title: names the cell.
 
     Raises:
         OSError: from the file system.
@@ -44,7 +44,7 @@ def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] |
     )
     if truth is not None:
         true = [100.0 * (truth[gain.axis] / gain.nameplate - 1.0) for gain in gains]
-        # Beside the estimate, or one would cover the other.
+        # Beside the estimate, so that neither covers the other.
         place.plot(positions + 0.14, true, "D", color=GREEN, markersize=5, label="truth of the simulated cell")
     place.set_xticks(positions, [f"{gain.axis}\n{gain.value:.4g} {gain.unit}" for gain in gains])
     place.set_xlim(-0.6, len(gains) - 0.4)
@@ -54,39 +54,39 @@ def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] |
     save_png(figure, path)
 
 
-# The table of the gains: a priori, identified ± σ, and the error where the truth is known.
-
-
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
-    """One row an axis; fits a terminal of 80 columns.
+    """Table of the gains, a row an axis; fits a terminal of 80 columns.
 
     Args:
         gains: one an axis.
         truth: true gain by axis, for a simulated cell only.
-        title: over the table.
+        title: above the table.
     """
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    table.add_column("axis", no_wrap=True)
-    headings = ["a priori", "identified ± σ", "σ %", "change %"] + ([] if truth is None else ["truth", "error %"])
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
+    headings = [
+        "axis",
+        "a priori",
+        "identified ± σ",
+        "σ %",
+        "change %",
+        *(("truth", "error %") if truth else ()),
+        "unit",
+    ]
+    table = plain_table(headings, title=title, left=(0, len(headings) - 1))
     for gain in gains:
-        row: list[str | Text] = [
-            terminal_text(gain.axis),
+        row = [
             f"{gain.nameplate:.4g}",
             with_deviation(gain.value, gain.std),
             f"{gain.std_percent:.2f}" if gain.std else "-",
             f"{gain.change_percent:+.1f}",
         ]
-        if truth is not None:
+        if truth:
             row += [f"{truth[gain.axis]:.4g}", f"{100.0 * (gain.value / truth[gain.axis] - 1.0):+.2f}"]
-        table.add_row(*row, terminal_text(gain.unit))
+        table.add_row(terminal_text(gain.axis), *row, terminal_text(gain.unit))
     return table
 
 
 def partial_note(calibration: Calibration) -> str | None:
-    """What to say of a calibration that rests on a log that never finished, or lost frames."""
+    """Warning for a calibration from a log that is partial or lost frames, None for any other."""
     partial = [source.name for source in calibration.sources if source.partial]
     return (
         f"PARTIAL or lossy data ({', '.join(partial)}): not for a controller; `apply` refuses it." if partial else None
@@ -94,7 +94,7 @@ def partial_note(calibration: Calibration) -> str | None:
 
 
 def with_deviation(value: float, std: float) -> str:
-    """`33.90 ± 0.14`: both to the second digit of σ (ISO Guide 98-3, 7.2.6); `32.96 (fixed)` where σ is 0."""
+    """Write `33.90 ± 0.14`, to the second digit of σ (ISO Guide 98-3, 7.2.6); `32.96 (fixed)` where σ is 0."""
     if std == 0:
         return f"{value:.4g} (fixed)"
     if not math.isfinite(std) or std < 0:
@@ -103,25 +103,19 @@ def with_deviation(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
-# The gains with their intervals before and after effects joined the model.
-
-
-_BESIDE = 0.12
-
-
 def plot_gain_changes(
     path: Path | None, changes: tuple[GainChange, ...], axes: tuple[str, ...], *, title: str
 ) -> bytes:
     """Draw each gain before and after, in per cent of the one before, with the interval of either.
 
-    The two share their noise: whether a change is more than noise is told by the σ of the change, not by whether the
-    intervals overlap; axes where it is are starred.
+    Both estimates share their noise, so the σ of the change decides whether a change is more than noise, not the
+    overlap of the intervals; axes where it is are starred.
 
     Args:
-        path: of the PNG; None where its bytes alone are wanted.
+        path: of the PNG; None for its bytes alone.
         changes: one an axis.
         axes: their names.
-        title: says which cell it is.
+        title: names the cell.
 
     Returns:
         the PNG.

@@ -10,7 +10,6 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from daq.cli.verb import printable
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.ledger.audit import AuditEntry
@@ -20,6 +19,7 @@ from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.history import rows
+from daq.report.text import printable
 from daq.writeback.drive_record import drives_of
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes

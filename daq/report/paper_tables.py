@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from rich import box
-from rich.table import Table
-from rich.text import Text
+from rich.console import RenderableType
 
+from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.cross_validation import CrossValidation, Failure
 from ident.calibration import Calibration, Parameter
 
 NONE = "—"
-SIGMA_NOTE = "%σ as of the method: eqs. (10) of wls and (23) of tls take rows as independent, and say too little."
+SIGMA_NOTE = "%σ by the formulas of the method: eqs. (10) of wls and (23) of tls take rows as independent: too small."
 
 
 @dataclass(frozen=True, slots=True)
 class PaperTable:
-    """A table of text: a title, a heading for each column, rows, and what must be said with it."""
+    """Table of text, with the notes that belong to it."""
 
     title: str
     headings: tuple[str, ...]
@@ -27,7 +26,7 @@ class PaperTable:
     notes: tuple[str, ...] = ()
 
     def markdown(self) -> str:
-        """As a section of a Markdown page."""
+        """Section of a Markdown page."""
         lines = [
             f"## {self.title}",
             "",
@@ -39,20 +38,17 @@ class PaperTable:
             lines += ["", note]
         return "\n".join(lines) + "\n"
 
-    def on_screen(self) -> Table:
-        """For a terminal."""
-        table = Table(
-            title=Text(self.title), title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False
-        )
-        for index, heading in enumerate(self.headings):
-            table.add_column(Text(heading), justify="left" if index == 0 else "right")
+    def view(self) -> Iterator[RenderableType]:
+        """Table and notes for a terminal."""
+        table = plain_table(self.headings, title=self.title, wrap=range(len(self.headings)))
         for row in self.rows:
-            table.add_row(*map(Text, row))
-        return table
+            table.add_row(*map(terminal_text, row))
+        yield table
+        yield from map(printable, self.notes)
 
 
 def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Tables 1 and 3: essential parameters with the payload's drawing and with its mass alone.
+    """Build Table 1 or 3: essential parameters with the payload's drawing and with its mass alone.
 
     Args:
         number: of the table in the paper.
@@ -65,7 +61,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
     for name in names:
         one, other = values[0].get(name), values[1].get(name)
         difference = _difference_percent(one, other)
-        # The mean is over what both have identified: a parameter that the drawing gave is no comparison.
+        # The mean is over the parameters that both identified; one given by the drawing is no comparison.
         if difference is not None and one is not None and one.std > 0.0:
             differences.append(difference)
         rows.append((_short(name), *_parameter(one), *_parameter(other), percent(difference)))
@@ -83,7 +79,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
 
 
 def gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Tables 2 and 4: a priori and identified gains, with the payload's drawing and with its mass alone.
+    """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone.
 
     Args:
         number: of the table in the paper.
@@ -112,7 +108,7 @@ def gain_table(number: int, first: Calibration, second: Calibration, method: str
 
 
 def condition_table(found: CrossValidation) -> PaperTable:
-    """Table 5."""
+    """Build Table 5: condition number of each run."""
     return PaperTable(
         title="Table 5: condition number of each run's observation matrix",
         headings=("", *(run.run for run in found.runs)),
@@ -122,7 +118,7 @@ def condition_table(found: CrossValidation) -> PaperTable:
 
 
 def error_table(found: CrossValidation) -> PaperTable:
-    """Table 6."""
+    """Build Table 6: relative error of each run and joint by every calibration."""
     labels, axes = tuple(found.calibrations), found.axes
     rows = []
     for run in found.runs:
@@ -143,7 +139,7 @@ def error_table(found: CrossValidation) -> PaperTable:
             reasons.setdefault(run.left_out, []).append(run.run)
     unmet = [f"{', '.join(runs)}: {reason}." for reason, runs in reasons.items()]
     seen = sorted({run.run for run in found.runs if run.seen_by})
-    notes = [f"Seen by a fit: {', '.join(seen)}."] if seen else []
+    notes = [f"Used by a fit: {', '.join(seen)}."] if seen else []
     return PaperTable(
         title="Table 6: relative error norms ‖ρ‖/‖Y‖ [%]",
         headings=("run, joint", *labels),
@@ -153,7 +149,7 @@ def error_table(found: CrossValidation) -> PaperTable:
 
 
 def mass_tables(found: CrossValidation) -> tuple[PaperTable, ...]:
-    """Tables 7 and 8: one for each payload."""
+    """Build Tables 7 and 8, one for each payload."""
     payloads = dict.fromkeys((run.payload.name, run.payload.mounting) for run in found.weighed)
     return tuple(
         _mass_table(found, name, mounting, 7 + index if index < 2 else 8)
@@ -203,20 +199,20 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
         rows=tuple(rows),
         notes=(
             f"{method}; gains held, all ten parameters of the payload unknown. %σ: from the scatter of the moves; "
-            "below it with the σ of the gains, whose errors go together. A scale is a weak check: axes "
-            "can err against each other.",
+            "below it with the σ of the gains, whose errors are correlated. A scale is a weak check: errors of "
+            "several axes can cancel.",
             *dict.fromkeys(notes),
         ),
     )
 
 
 def page(title: str, tables: Iterable[PaperTable], *, marker: str) -> str:
-    """A Markdown page of tables; its first line says what it is, so that only its like is ever overwritten."""
+    """Markdown page of tables; its first line names the kind of file, so that no other file is overwritten."""
     return f"<!-- format: {marker} -->\n# {title}\n\n" + "\n".join(table.markdown() for table in tables)
 
 
 def percent(value: float | None) -> str:
-    """Two decimals below ten, one above; a dash for nothing."""
+    """Two decimals, none from 100 % on; a dash for an unknown value."""
     if value is None or not math.isfinite(value):
         return NONE
     return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.0f}"
@@ -245,7 +241,7 @@ def _difference_percent(one: Parameter | None, other: Parameter | None) -> float
 
 
 def _in_order(first: list[str], second: list[str]) -> list[str]:
-    """Names of both, each where the lists put it."""
+    """Merge two lists of names, keeping the order of each."""
     order = list(first)
     for index, name in enumerate(second):
         if name not in order:

@@ -1,17 +1,23 @@
-"""`report.html`: the residual, what was added for it and what that changed, for a person and for paper."""
+"""`report.html`: the effects that were added and what they changed, for reading and printing; and both report files."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
+from pathlib import Path
 from unicodedata import category
 
+from daq.errors import OutputFailed
+from daq.files import replace_file
 from daq.report.effect_names import effect_text, placed_name, variable_text
-from daq.report.fit import coefficients, draw_effect, draw_torques, identifiability_notes, start_of
+from daq.report.fit import coefficients, identifiability_notes, start_of
+from daq.report.fit_plots import draw_effect, draw_torques
 from daq.report.gains import partial_note, plot_gain_changes, with_deviation
-from daq.report.residual_document import WHEN, ErrorRow, error_rows, percent_text, summary
+from daq.report.residual import WHEN, ErrorRow, error_rows, summary
+from daq.report.residual_document import FORMAT, VERSION, residual_document
 from daq.report.residual_plots import Bar, plot_ranking
+from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
@@ -19,12 +25,9 @@ from ident.discovery.loop import Evidence, Step
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 
-# Pieces of a page that stands for itself: no script, no address, pictures inside; every text is escaped here.
-
-
 GENERATOR = "drivegain"
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
-"""Categories of Unicode: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
+"""Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
 _STYLE = """
 body { font: 11pt/1.45 sans-serif; color: #111; max-width: 60em; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.5em; } h2 { font-size: 1.2em; margin-top: 2em; border-bottom: 1px solid #999; }
@@ -40,13 +43,13 @@ img { max-width: 100%; }
 
 
 def page(title: str, body: Iterable[str]) -> str:
-    """A whole document.
+    """Build a document that needs no other file: no script, no address, pictures inside.
 
     Args:
         title: plain text.
-        body: pieces made by the functions below.
+        body: pieces made by the functions below, which escape every text.
     """
-    # The policy makes sure of it: whatever a file's text may hold, a browser opens no address for this page.
+    # The security policy keeps a browser from opening an address, whatever text a file holds.
     return "\n".join(
         (
             "<!DOCTYPE html>",
@@ -57,11 +60,11 @@ def page(title: str, body: Iterable[str]) -> str:
             '<meta http-equiv="Content-Security-Policy" '
             "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">",
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{_spelt(title)}</title>",
+            f"<title>{_spelled(title)}</title>",
             f"<style>{_STYLE}</style>",
             "</head>",
             "<body>",
-            f"<h1>{_spelt(title)}</h1>",
+            f"<h1>{_spelled(title)}</h1>",
             *body,
             "</body>",
             "</html>",
@@ -71,36 +74,38 @@ def page(title: str, body: Iterable[str]) -> str:
 
 
 def section(title: str, *body: str) -> str:
-    """A part of the page under a heading."""
-    return "\n".join(("<section>", f"<h2>{_spelt(title)}</h2>", *body, "</section>"))
+    """Build a section under a heading."""
+    return "\n".join(("<section>", f"<h2>{_spelled(title)}</h2>", *body, "</section>"))
 
 
 def paragraph(text: str) -> str:
-    """Plain text."""
-    return f"<p>{_spelt(text)}</p>"
+    """Build a paragraph of plain text."""
+    return f"<p>{_spelled(text)}</p>"
 
 
 def listed(texts: Iterable[str], kind: str = "") -> str:
-    """Plain texts one below the other.
+    """Build a list of plain texts.
 
     Args:
         texts: an entry each.
-        kind: class of the list in the page's style, a word.
+        kind: CSS class of the list.
     """
-    entries = "".join(f"<li>{_spelt(text)}</li>" for text in texts)
-    return f'<ul class="{_spelt(kind)}">{entries}</ul>' if kind else f"<ul>{entries}</ul>"
+    entries = "".join(f"<li>{_spelled(text)}</li>" for text in texts)
+    return f'<ul class="{_spelled(kind)}">{entries}</ul>' if kind else f"<ul>{entries}</ul>"
 
 
 def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Plain texts in rows; the first cell of each row is its heading."""
-    head = "".join(f'<th scope="col">{_spelt(heading)}</th>' for heading in headings)
+    """Build a table of plain texts; the first cell of each row is its heading."""
+    head = "".join(f'<th scope="col">{_spelled(heading)}</th>' for heading in headings)
     lines = [
-        f'<tr><th scope="row">{_spelt(row[0])}</th>' + "".join(f"<td>{_spelt(cell)}</td>" for cell in row[1:]) + "</tr>"
+        f'<tr><th scope="row">{_spelled(row[0])}</th>'
+        + "".join(f"<td>{_spelled(cell)}</td>" for cell in row[1:])
+        + "</tr>"
         for row in rows
     ]
     return "\n".join(
         (
-            f"<table><caption>{_spelt(caption)}</caption>",
+            f"<table><caption>{_spelled(caption)}</caption>",
             f"<thead><tr>{head}</tr></thead>",
             "<tbody>",
             *lines,
@@ -110,28 +115,46 @@ def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) 
 
 
 def picture(png: bytes, caption: str) -> str:
-    """A picture inside the page, with what it shows in words."""
+    """Embed a picture with its caption."""
     data = base64.b64encode(png).decode("ascii")
-    words = _spelt(caption)
+    words = _spelled(caption)
     return f'<figure><img alt="{words}" src="data:image/png;base64,{data}"><figcaption>{words}</figcaption></figure>'
 
 
-def _spelt(text: str) -> str:
-    """Text as a browser may show it: markup escaped, and what is not seen spelt out.
+def _spelled(text: str) -> str:
+    """Escape markup and spell out invisible characters.
 
-    Control characters are no HTML, and those that turn the direction of writing (U+202E and its kind, category Cf) let
-    a name look like another one.
+    HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category
+    Cf) can make a name look like another.
     """
     shown = "".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text)
     return escape(shown)
 
 
 SHOWN = 10
-"""Candidates of a turn that are drawn or listed; residual.json has them all."""
+"""Candidates of a turn that are drawn; residual.json has them all."""
+PAGE, DOCUMENT = "report.html", "residual.json"
+MARKS = {PAGE: f'<meta name="generator" content="{GENERATOR}">', DOCUMENT: f'"format": "{FORMAT}"'}
+"""Text at the beginning of each file of a report, by which an earlier report is recognised."""
+
+
+def save_report(fitted: Fit, account: Account, calibration: Calibration, folder: Path) -> None:
+    """Write report.html and residual.json, each whole or not at all; arguments as of `residual_page`.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    document = {"format": FORMAT, "version": VERSION, **residual_document(fitted, account, calibration)}
+    content = {PAGE: residual_page(fitted, account, calibration), DOCUMENT: json_text(document)}
+    try:
+        for name, text in content.items():
+            replace_file(folder / name, text.encode())
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
 
 
 def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> str:
-    """The whole page.
+    """Build the page.
 
     Args:
         fitted: with the turns of the loop.
@@ -149,25 +172,25 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
             listed(summary(fitted, account), "summary"),
             section(
                 "Before and after",
-                error_table(axes, error_rows(account)),
+                _error_table(axes, error_rows(account)),
                 paragraph(
-                    "Error: what the model leaves of each motor's current, ‖e‖/‖v‖, over the rows in motion; in total "
-                    "with each current weighed by its gain. It means nothing without the filter at the end of this "
-                    "page. Noise floor: what the current's noise at standstill would leave; in motion there is more."
+                    "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
+                    "in total with each current weighted by its gain. Compare errors only under the same filters (end "
+                    "of this page). Noise floor: the share that the noise at standstill would leave; in motion the "
+                    "noise is larger."
                 ),
             ),
             *_effects(fitted, account, start),
             section("Torques", picture(draw_torques(None, final, fitted.cell), "Measured and predicted joint torques")),
             _gains(fitted, account),
             *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
-            section("What these data can and cannot tell", listed(_limits(fitted))),
+            section("What these data can and cannot show", listed(_limits(fitted))),
             _origin(calibration),
         ),
     )
 
 
-def error_table(axes: tuple[str, ...], rows: tuple[ErrorRow, ...]) -> str:
-    """Relative error of each axis and of all together."""
+def _error_table(axes: tuple[str, ...], rows: tuple[ErrorRow, ...]) -> str:
     return table(
         "Relative error ‖e‖/‖v‖ [%]",
         ("", *axes, "total"),
@@ -191,12 +214,12 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     final = fitted.steps[-1].after
     kept = placed in final.effects
     known = final if kept else step.after
-    replaced = "" if kept else " A later turn made it idle and took it out again."
+    replaced = "" if kept else " A later turn removed it again, because it no longer reduced the error."
     ambiguous = ", ".join(placed_name(rival, axes) for rival in rivals)
     pairs = (
         ("fit", turn.before.in_sample, turn.after.in_sample),
         ("moves left out", turn.before.cross_validated, turn.after.cross_validated),
-        ("unused", turn.before.holdout, turn.after.holdout),
+        ("held out", turn.before.holdout, turn.after.holdout),
     )
     return section(
         f"{axes[placed.axis]}: {effect_text(placed.effect, axes)}",
@@ -204,9 +227,9 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
             f"Effect {placed_name(placed, axes)}"
             + (f" ({settings})." if settings else ".")
             + (
-                f" These data cannot tell it from: {ambiguous}."
+                f" These data cannot distinguish it from: {ambiguous}."
                 if ambiguous
-                else " Every other one does clearly worse."
+                else " Every other candidate is clearly worse."
             )
             + replaced
         ),
@@ -227,7 +250,7 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
         picture(
             draw_effect(None, before, step.after, placed, fitted.cell),
             f"Residual of {axes[placed.axis]} over time and against {variable_text(placed.effect, axes)}, "
-            "without and with the effect. A mean that still leaves zero is torque that the model still lacks.",
+            "without and with the effect. A mean away from zero is torque that the model still lacks.",
         ),
     )
 
@@ -253,7 +276,7 @@ def _gains(fitted: Fit, account: Account) -> str:
         picture(
             plot_gain_changes(None, changes, axes, title=f"Drive gains of {fitted.cell.name}"),
             "Gains with their intervals, before and after, in per cent of the gain before; * changed by more than "
-            "noise. Both estimates share their noise, so intervals that overlap do not say that nothing changed.",
+            "noise. Both estimates share their noise, so overlapping intervals do not exclude a change.",
         ),
     )
 
@@ -280,7 +303,7 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     ranking = (
         picture(
             plot_ranking(None, bars, title=f"Turn {number}: the best candidates"),
-            "Candidates by what they take off the error of moves that their fit did not see.",
+            "Candidates by how much they reduce the error of left-out moves.",
         )
         if bars
         else paragraph("No candidate could be tried.")
@@ -298,10 +321,10 @@ def _limits(fitted: Fit) -> tuple[str, ...]:
         *identifiability_notes(fitted),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
-        *(("The gains were given: an error in them is hidden in the parameters.",) if held else ()),
-        "Play or give behind an encoder on the motor may leave no trace in these signals.",
-        "Effects are named by what depends on the same variable in the same way: another cause that does so would get "
-        "the same name. What cannot be told apart is listed with each effect.",
+        *(("The gains were held: an error in them is hidden in the parameters.",) if held else ()),
+        "Backlash or elasticity behind an encoder on the motor may leave no trace in these signals.",
+        "An effect is named after the variable it depends on and the shape of that dependence; another cause with the "
+        "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
         "The noise floor is that of standstill, a lower bound: an error above it need not be an effect.",
     )
 

@@ -1,44 +1,92 @@
-"""Text from a file as a terminal may show it: it neither commands the terminal nor is read as rich's markup."""
+"""Text that comes from a file, made safe to show: on a terminal, in a JSON document, in a spreadsheet; and tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
+from rich import box
+from rich.table import Table
 from rich.text import Text
 
 
+def printable(text: str) -> str:
+    """Spell out control characters, which could command a terminal; line ends stay."""
+    return "".join(c if c.isprintable() or c == "\n" else f"\\x{ord(c):02x}" for c in text)
+
+
 def terminal_text(text: str) -> Text:
-    """The same text, control characters spelt out."""
+    """One line of text that rich does not read as markup; control characters and line ends are spelled out."""
     return Text("".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text))
 
 
 def terminal_lines(text: str) -> str:
-    """Lines for `rich.syntax`, which knows no markup: control characters spelt out, but for tabs; line ends as \\n."""
+    """Lines for `rich.syntax`, which reads no markup: control characters except tabs spelled out, line ends as \\n."""
     lines = text.splitlines()
     return "\n".join("".join(c if c.isprintable() or c == "\t" else f"\\x{ord(c):02x}" for c in line) for line in lines)
 
 
-# Cells of a CSV as a spreadsheet may open them: text from elsewhere stays text.
+def plain_table(
+    headings: Iterable[str], *, title: str | None = None, left: Collection[int] = (0,), wrap: Collection[int] = ()
+) -> Table:
+    """Table without a frame.
+
+    Args:
+        headings: of the columns.
+        title: above the table.
+        left: indices of the columns of words; the others hold numbers and are aligned to the right.
+        wrap: indices of the columns whose cells may be broken into lines.
+    """
+    heading = None if title is None else terminal_text(title)
+    table = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for index, name in enumerate(headings):
+        table.add_column(terminal_text(name), justify="left" if index in left else "right", no_wrap=index not in wrap)
+    return table
+
+
+def percent_text(percent: float) -> str:
+    """Two decimals; a dash for an unknown value."""
+    return f"{percent:.2f}" if math.isfinite(percent) else "-"
+
+
+def json_text(document: Any) -> str:
+    """JSON document; numbers that JSON lacks become null, bytes of file names that are not UTF-8 are spelled out."""
+    return spelled_bytes(json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def spelled_bytes(text: str) -> str:
+    """Spell out the bytes of a file's name that are not UTF-8, which no document can hold, as `\\udcff`."""
+    return text.encode(errors="backslashreplace").decode()
+
+
+def _json_safe(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, dict):
+        return {str(key): _json_safe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_safe(item) for item in value]
+    return value
 
 
 _FORMULA = tuple("=+-@\t\n＝＋－＠")
-"""What a cell begins with that is taken for a formula, which may start programs (OWASP, CSV Injection)."""
+"""First characters of a cell that a spreadsheet runs as a formula, which may start programs (OWASP, CSV Injection)."""
 
 
 def inert(value: Any) -> Any:
-    """One cell: text that would be a formula gets an apostrophe before it, by which spreadsheets know text.
+    """Cell of a CSV: text that a spreadsheet would run as a formula gets an apostrophe, which marks it as text.
 
-    Numbers stay as they are. What of a file's name is no character (bytes that are not UTF-8) is spelt out.
+    Numbers are unchanged; bytes of a file's name that are not UTF-8 are spelled out.
     """
     if not isinstance(value, str):
         return value
-    text = value.encode(errors="backslashreplace").decode()
-    # csv puts no quotation marks about a carriage return alone, and what comes behind it would be a cell of its own.
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    # csv does not quote a carriage return alone, and the text after it would become a cell of its own.
+    text = spelled_bytes(value).replace("\r\n", "\n").replace("\r", "\n")
     return f"'{text}" if text.startswith(_FORMULA) else text
 
 
 def inert_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A line, by the columns' headings."""
+    """Row of a CSV, by heading, made inert."""
     return {heading: inert(value) for heading, value in row.items()}

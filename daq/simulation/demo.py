@@ -19,7 +19,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
-from daq.report.fit import draw
+from daq.report.fit_plots import draw_fit
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.calibration_file import as_document, save
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
@@ -138,7 +138,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     reporter.step("draw the pictures")
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
-    draw(fitted, calibration, truth, out)
+    draw_fit(fitted, calibration, truth, out)
     return Outcome(cell, nodes, plans, recorded, fitted, calibration, truth, proposal, written)
 
 

@@ -5,31 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
 
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
+from daq.workflow.choices import Known
 from daq.workflow.fit import Fit, Reading, calibration_of, check_signs
 from ident.calibration import Calibration, Parameter, Source
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
 from ident.errors import DataUnfit
 from ident.estimators.comparison import Essential, essential
-from ident.estimators.estimate import Method
 from ident.estimators.identify import Identification, estimate_with, require_seen_payload
 from ident.estimators.least_squares import tls
+from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
-
-
-class Known(Enum):
-    """What the fit is told of a mounted payload (n_kL of eq. 5)."""
-
-    NOTHING = "nothing"
-    MASS = "mass"
-    CAD = "cad"
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,9 +29,10 @@ from ident.effects.effect import PlacedEffect, Side
 from ident.effects.signals import session_began_s
 from ident.errors import IdentificationError, PayloadUnseen
 from ident.estimators.comparison import Comparison, compare
-from ident.estimators.estimate import Estimate, Method, RelativeError, of_squares
+from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
+from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
 from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
 from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts

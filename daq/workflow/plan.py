@@ -11,18 +11,13 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
+from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
 from daq.workflow.experiment import Experiment, PlannedMove, duration_of, experiment_of
 from daq.workflow.plan_search import Search
 from drivers.motion.move import Trapezoid, synchronised
 from ident.model.kinematics import poses
 from ident.model.robot import JointKind
 from ident.planning.verdict import ExtraMoves
-
-LARGEST_CONDITION = 3500.0
-"""Of the weighted observation matrix; the paper's trajectories have 1930 to 2817 (Table 5)."""
-LARGEST_STD_PERCENT = 10.0
-"""Predicted for the worst gain; a plan above it could as well not be made."""
-EXCHANGES = 3000
 
 
 @dataclass(frozen=True, slots=True)

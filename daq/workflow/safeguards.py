@@ -22,7 +22,7 @@ from daq.config.cell import Bus, Cell, WeighedPayload
 from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError
 from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
-from daq.report.fit import actual_current_note
+from daq.report.bus import actual_current_note
 from drivers.profiles.scale import ScaleReading, check_name_plate
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain

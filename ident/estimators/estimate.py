@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from scipy import linalg
 from ident.equations.observation import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
+from ident.estimators.method import Method
 from ident.model.model import Column
 
 # How much of the torque a model does not tell, in per cent.
@@ -46,15 +46,6 @@ def of_squares(size: FloatArray, left: FloatArray) -> RelativeError:
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-
-
-class Method(Enum):
-    """The estimators, by the names technicians use."""
-
-    LS = "ls"
-    WLS = "wls"
-    TLS = "tls"
-    ML = "ml"
 
 
 @dataclass(frozen=True, slots=True)

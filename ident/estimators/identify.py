@@ -13,9 +13,10 @@ from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System, require_distinct
 from ident.errors import DataUnfit, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
-from ident.estimators.estimate import Estimate, Method, RelativeError
+from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
+from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Column, Model
 

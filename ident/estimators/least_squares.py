@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ident.equations.system import System, require_known_payload
 from ident.equations.triangles import Triangles, solve
-from ident.estimators.estimate import Estimate, Method
+from ident.estimators.estimate import Estimate
+from ident.estimators.method import Method
 
 FloatArray = NDArray[np.float64]
 

@@ -23,8 +23,9 @@ from ident.effects.position import Spring
 from ident.effects.signals import Abscissa, session_began_s
 from ident.equations.rows import decimate_rows, row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
-from ident.estimators.estimate import Method, RelativeError
+from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import identify
+from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.prediction import measured_torque, placed_effect, predict_current, predict_torque, standard_parameters
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth

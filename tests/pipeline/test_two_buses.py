@@ -105,8 +105,7 @@ def test_an_amplifier_on_the_wrong_bus_is_found_there(wiring: Wiring, capsys: py
 def test_the_monitor_shows_both_buses(
     wiring: Wiring, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("drivers.stream.monitor", "daq.cli.monitor"):
-        monkeypatch.setattr(f"{module}.QUIET_S", 0.1)
+    monkeypatch.setattr("drivers.stream.monitor.QUIET_S", 0.1)
     assert main(["monitor", str(wiring.path), "--json", "--interval", "0.5"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     assert [axis["silent"] for axis in document["axes"]] == [False] * 6

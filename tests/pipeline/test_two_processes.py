@@ -102,7 +102,7 @@ def test_an_interrupted_recording_stops_the_axes_and_says_so(
     assert process.returncode == ExitCode.INTERRUPTED, err
     assert out == ""
     assert "Traceback" not in err
-    output = f"interrupted: axes stopped; what was recorded is in {part}, which is not usable for a fit"
+    output = f"interrupted: axes stopped; the samples recorded so far are in {part}, which `fit` does not read"
     assert [line for line in err.splitlines() if line.startswith(output)]
     assert main(["record", str(cell), str(plan), "--out", str(log), "--enable-motion"]) == ExitCode.USAGE
     output = " ".join(capsys.readouterr().err.split())

@@ -21,8 +21,8 @@ from daq.environment import shipped_configurations
 from daq.workflow.fit import Fit, calibration_of
 from ident.data.run import Run
 from ident.discovery.loop import find_effects, gather
-from ident.estimators.estimate import Method
 from ident.estimators.identify import estimate_with, identify
+from ident.estimators.method import Method
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
 FIT = ("bare-1", "loaded-1", "bare-2", "loaded-2")

@@ -12,8 +12,8 @@ from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.workflow.plan import plan
-from ident.estimators.estimate import Method
 from ident.estimators.identify import identify
+from ident.estimators.method import Method
 from tests.studies.direct_cell import run_of, simulate_run
 from tests.studies.study_cells import declared_payload, spec_of, study_cell
 

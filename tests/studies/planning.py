@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.cell_file import load_cell
+from daq.workflow.choices import EXCHANGES
 from daq.workflow.experiment import RUNS, Experiment, experiment_of, paths_of
-from daq.workflow.plan import EXCHANGES, Plan, plan
+from daq.workflow.plan import Plan, plan
 from ident.model.bodies import LINK_PARAMETERS
 from ident.planning.excitation import Design, ExpectedPayload
 from tests.ident.recordings import GAINS, PAYLOAD_TRUTH, tx40_truth

@@ -67,7 +67,7 @@ def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     cut.__context__ = ValueError("in between")
     cut.__context__.__context__ = fault
     said = _interrupted(cut, None, out)
-    assert "NOT ALL AXES ARE KNOWN TO STAND" in said
+    assert "NOT ALL AXES ARE CONFIRMED STOPPED" in said
     assert "EMCY 7305h" in said
     assert "node 2 does not answer" in said
     harmless = KeyboardInterrupt()

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from daq.cli.app import main
-from daq.cli.monitor import bus_loads_percent, describe, joint_positions, view
 from daq.config.bus import answer_us, drive_axes
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
+from daq.report.bus import bus_loads_percent, joint_positions, monitor_document, monitor_view
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.link import Link
@@ -185,8 +185,8 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     dead = AxisReading(None, None, None, None, 0.0, 3)
     reading = _reading([0] * 6)
     reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
-    document = describe(CELL, reading, [0.002, None, None, None, None, None], ["a\x1b[2Jb"])
-    Console(file=out, width=100).print(view(document))
+    document = monitor_document(CELL, reading, [0.002, None, None, None, None, None], ["a\x1b[2Jb"])
+    Console(file=out, width=100).print(monitor_view(document))
     text = out.getvalue()
     assert "+0.010 A" in text
     assert "+5 raw" in text
@@ -198,8 +198,7 @@ def test_what_is_not_known_is_shown_as_that() -> None:
 @pytest.fixture
 def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo cell on a bus of this test, on which nobody else speaks: a short silence will do."""
-    for module in ("drivers.stream.monitor", "daq.cli.monitor"):
-        monkeypatch.setattr(f"{module}.QUIET_S", 0.1)
+    monkeypatch.setattr("drivers.stream.monitor.QUIET_S", 0.1)
     text = (CHECKOUT / "configs/cells/demo.yaml").read_text().replace("../robots", str(CHECKOUT / "configs/robots"))
     path = tmp_path / "cell.yaml"
     path.write_text(text.replace("channel: demo", "channel: monitored"))

@@ -20,8 +20,8 @@ from drivers.stream.answers import StreamStatistics
 @pytest.fixture
 def cells(tmp_path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """Cell files by pacing; any plan will do."""
-    monkeypatch.setattr("daq.cli.record.load_plan", lambda *_: None)
-    monkeypatch.setattr("daq.cli.record.slowed", lambda *_: None)
+    monkeypatch.setattr("daq.workflow.plan_file.load_plan", lambda *_: None)
+    monkeypatch.setattr("daq.workflow.plan.slowed", lambda *_: None)
     folder = tmp_path / "cells"
     folder.mkdir()
     text = (checkout / "configs/cells/demo.yaml").read_text().replace("../robots", str(checkout / "configs/robots"))
@@ -54,7 +54,7 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
 ) -> None:
     counted = RunStatistics(1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers")
     monkeypatch.setattr(
-        "daq.cli.record.record", lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics())
+        "daq.workflow.record.record", lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics())
     )
     command = ["record", cells["lockstep"], "plan.yaml", "--out", str(tmp_path / "a.mcap"), "--enable-motion"]
     assert main(command) == code
@@ -73,12 +73,12 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
 ) -> None:
     out, part = tmp_path / name, tmp_path / f"{name}.part"
     command = ["record", cells["lockstep"], "plan.yaml", "--out", str(out), "--enable-motion"]
-    monkeypatch.setattr("daq.cli.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part))
+    monkeypatch.setattr("daq.workflow.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part))
     assert main(command) == ExitCode.DEVICE_FAULT
     first = " ".join(capsys.readouterr().err.split())
-    assert f"kept: what was recorded until then is in {part}" in first
+    assert f"kept: the samples recorded until then are in {part}" in first
     # The second attempt does not even reach the bus.
-    monkeypatch.setattr("daq.cli.record.record", lambda *_, **__: pytest.fail("the recording began"))
+    monkeypatch.setattr("daq.workflow.record.record", lambda *_, **__: pytest.fail("the recording began"))
     assert main(command) == ExitCode.USAGE
     second = " ".join(capsys.readouterr().err.split())
     assert "the rest of a recording" in second
@@ -106,7 +106,7 @@ def test_a_lost_sample_with_a_timed_pacing_names_lockstep(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("daq.cli.record.record", _failing(error, None))
+    monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
     command = ["record", cells[pacing], "plan.yaml", "--out", str(tmp_path / "run.mcap")]
     assert main(command) == ExitCode.DEVICE_FAULT
     output = " ".join(capsys.readouterr().err.split())

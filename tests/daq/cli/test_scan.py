@@ -11,11 +11,11 @@ from rich.cells import cell_len
 from rich.console import Console
 
 from daq.cli import main
-from daq.cli.scan import scan_rows, scan_table
 from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.errors import ExitCode
+from daq.report.bus import scan_rows, scan_table
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode

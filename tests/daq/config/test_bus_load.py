@@ -11,7 +11,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from daq.cli.record import load_lines
 from daq.config.bus import (
     LARGEST_MEAN,
     SETPOINTS,
@@ -26,6 +25,7 @@ from daq.config.bus import (
 )
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.environment import shipped_configurations
+from daq.report.bus import load_lines
 from drivers.motion.execute import execute
 from drivers.motion.move import Move
 from drivers.profiles.profile import DriveProfile, ObjectEntry
@@ -176,7 +176,7 @@ def test_the_demo_cell_may_be_sampled_by_the_clock_and_its_starts_are_warned_of(
     # Six set-points of six bytes beside six answers: not within a millisecond of a wire of 1 Mbit/s.
     assert load.start == pytest.approx(1.37, abs=0.01)
     assert load_lines(CELL) == (
-        "demo (virtual:demo): in lockstep; a real one would be loaded by 77 % on average, 86 % at worst",
+        "demo (virtual:demo): in lockstep; a real bus would be loaded by 77 % on average, 86 % at worst",
     )
     assert load_warnings(CELL) == ()
     files = bundle(shipped_configurations() / "cells/demo.yaml")

@@ -15,7 +15,6 @@ from typing import Any
 
 import yaml
 
-from daq.cli.residual import save_report
 from daq.cli.simulate import MountedFile
 from daq.config.bus import bus_address
 from daq.config.cell import Cell
@@ -27,6 +26,7 @@ from daq.jobs.journal import Form, Journal
 from daq.jobs.session import Session, sessions
 from daq.jobs.tools import Tools
 from daq.ledger.audit import AuditEntry, read, verify
+from daq.report.residual_page import save_report
 from daq.simulation.simulation_file import load_simulation
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan

@@ -108,7 +108,7 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     (folder / f"{NAME}.timer").write_text("[Timer]\nOnCalendar=yearly\n")
     before = (folder / f"{NAME}.service").read_bytes()
     assert main([*command, "--yes"]) == ExitCode.USAGE
-    assert "did not make" in capsys.readouterr().err
+    assert "did not write" in capsys.readouterr().err
     assert (folder / f"{NAME}.timer").read_text() == "[Timer]\nOnCalendar=yearly\n"
     assert (folder / f"{NAME}.service").read_bytes() == before
 
@@ -153,7 +153,7 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
     (folder / f"{NAME}.service").unlink()
     os.mkfifo(folder / f"{NAME}.service")
     assert main([*command, str(rig.cell_file)]) == ExitCode.USAGE
-    assert "did not make" in capsys.readouterr().err
+    assert "did not write" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("schedule", ["", "  ", "weekly\nPersistent=true"])

@@ -16,14 +16,15 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
-from daq.cli.residual import DOCUMENT, PAGE, check_report, save_report
-from daq.cli.verb import json_text
+from daq.cli.residual import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputFailed, UsageError
 from daq.report.effect_names import WORDS, effect_text, other_axis, placed_name
-from daq.report.residual_document import error_change_text, residual_document, summary
-from daq.report.residual_page import page, paragraph, residual_page, table
+from daq.report.residual import error_change_text, summary
+from daq.report.residual_document import residual_document
+from daq.report.residual_page import DOCUMENT, PAGE, page, paragraph, residual_page, save_report, table
+from daq.report.text import json_text
 from daq.workflow import fit as fit_module
 from daq.workflow.fit import Fit, calibration_of, fit
 from ident.discovery.before_after import Account, account
@@ -182,7 +183,7 @@ def test_the_page_says_the_outcome_first(closed: Closed) -> None:
     page = Reader(closed.page())
     first = next(text for text in page.texts if text.startswith("J3 has"))
     assert first.startswith(
-        f"J3 has a spring: the error of J3 on runs that were not used falls from {before:.1f} to {after:.1f} % ("
+        f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
     )
     assert page.texts.index(first) < page.texts.index("Before and after")
     assert "These data cannot tell it from: load-friction on J2." in page.text
@@ -308,7 +309,7 @@ def test_a_folder_that_takes_no_file_is_refused_before_any_work(
         raise PermissionError(13, "Permission denied")
 
     # As a file system says it to everybody but root, who may write anywhere.
-    monkeypatch.setattr("daq.cli.residual.TemporaryFile", refused)
+    monkeypatch.setattr("tempfile.TemporaryFile", refused)
     assert main(["residual", "no.mcap", "--report", str(tmp_path)]) == ExitCode.UNEXPECTED
     assert "permission denied" in capsys.readouterr().err
     monkeypatch.undo()
@@ -362,7 +363,7 @@ def test_the_verb_writes_the_report_and_says_the_same(
     for sentence in document["summary"]:
         assert sentence in text
     rows = {line.rsplit(maxsplit=7)[0].strip(): line.split()[-7:] for line in text.splitlines() if ", " in line[:30]}
-    for name, key in (("fit", "relative_error_percent"), ("unused", "holdout_error_percent")):
+    for name, key in (("fit", "relative_error_percent"), ("held out", "holdout_error_percent")):
         for when in ("before", "after"):
             error = document[when][key]
             assert [float(value) for value in rows[f"{name}, {when}"]] == pytest.approx(

@@ -20,13 +20,14 @@ from daq.report.paper_tables import condition_table, error_table, gain_table, ma
 from daq.workflow import cross_validation as cross_validation_module
 from daq.workflow import fit as fit_module
 from daq.workflow.calibration_file import load, save
-from daq.workflow.cases import CASES, Known, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.workflow.cases import CASES, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
+from daq.workflow.choices import Known
 from daq.workflow.cross_validation import CrossValidation, Failure, Mass, cross_validate
 from daq.workflow.fit import fit
 from ident.calibration import Calibration
 from ident.data.run import Run
 from ident.errors import DataUnfit
-from ident.estimators.estimate import Method
+from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from tests.ident.recordings import GAINS, MOUNTED, PAYLOAD_TRUTH, record, tx40_truth
 

@@ -37,8 +37,8 @@ from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import Stribeck
 from ident.effects.timing import Lag, TimeSkew
-from ident.estimators.estimate import Method
 from ident.estimators.identify import estimate_with
+from ident.estimators.method import Method
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
 from tests.daq.workflow.test_record import WALL_NS, Rig
 from tests.ident.recordings import GAINS, MOUNTED, tx40_truth

@@ -13,17 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from daq.cli.fit import error_table
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import LogRepeated, LogsDiffer, ModelContradicted
 from daq.log.reader import LossyLogs
+from daq.report.fit import fit_view
 from daq.workflow import fit as fit_module
+from daq.workflow.cases import CaseFit
 from daq.workflow.fit import calibration_of, check_explained, fit
 from ident.data.run import Run
 from ident.errors import PayloadUnseen
-from ident.estimators.estimate import Method, RelativeError
+from ident.estimators.estimate import RelativeError
+from ident.estimators.method import Method
 from tests.ident.recordings import MOUNTED, record, tx40_truth
 
 
@@ -113,9 +115,10 @@ def test_an_axis_that_did_not_move_has_a_dash_and_no_number(shelf: Shelf, monkey
     calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
     rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
     out = io.StringIO()
-    Console(file=out, width=100).print(error_table(found, replace(calibration, holdout_error_percent=rested)))
-    (unused,) = (line.split() for line in out.getvalue().splitlines() if "unused" in line)
-    assert unused == ["unused", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
+    rested_on = replace(calibration, holdout_error_percent=rested)
+    Console(file=out, width=100).print(*fit_view(CaseFit(found, (), None), rested_on, None), sep="\n")
+    (held_out,) = (line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out"))
+    assert held_out == ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
 
 
 @given(total=st.floats(0.0, 200.0), axis=st.floats(0.0, 1000.0))

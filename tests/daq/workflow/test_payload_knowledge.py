@@ -15,7 +15,8 @@ from daq.config.cell import Cell, WeighedPayload
 from daq.config.cell_file import drawn_parameters, load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, SchemaMismatch
-from daq.workflow.cases import Known, payload_as
+from daq.workflow.cases import payload_as
+from daq.workflow.choices import Known
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
 DRAWN = "mass_kg: 4.59\n    centre_m: [-0.06, -0.063, 0.095]\n    inertia_kg_m2: [0.016, 0.001, 0.0, 0.017, 0.0, 0.012]"

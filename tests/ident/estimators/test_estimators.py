@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from ident.data.run import Run
 from ident.equations.system import require_distinct
 from ident.errors import DataUnfit, RankDeficient
-from ident.estimators.estimate import Estimate, Method
+from ident.estimators.estimate import Estimate
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.maximum_likelihood import ml
+from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record

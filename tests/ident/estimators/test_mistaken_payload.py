@@ -9,8 +9,8 @@ import pytest
 
 from ident.data.run import Run
 from ident.errors import PayloadUnseen
-from ident.estimators.estimate import Method
 from ident.estimators.identify import identify
+from ident.estimators.method import Method
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, Truth, record
 
 

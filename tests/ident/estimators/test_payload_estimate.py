@@ -10,9 +10,9 @@ import pytest
 from ident.data.run import Run
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.errors import DataUnfit, RankDeficient, TooFewMoves
-from ident.estimators.estimate import Method
 from ident.estimators.identify import identify
 from ident.estimators.least_squares import wls
+from ident.estimators.method import Method
 from ident.estimators.payload_estimate import as_one_body, joined, payload_beside_bare_runs, payload_on_known_robot
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.estimators.estimate import Estimate, Method
+from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
+from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import JointKind, robot_from_urdf

@@ -1,0 +1,276 @@
+"""A bus and its axes: the nodes that `drivegain scan` finds, the state that `drivegain monitor` shows, the currents."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich import box
+from rich.cells import cell_len
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from daq.config.bus import bus_loads, frame_bits
+from daq.config.cell import Pacing
+from daq.report.text import plain_table, printable
+from drivers.canopen.link import nmt_name
+from drivers.profiles.cia402 import State, decode
+from drivers.profiles.profile import TapPoint
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from drivers.canopen.scan import FoundNode
+    from drivers.stream.monitor import CellReading
+
+ENABLED = (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+"""States in which the drive function is enabled and the motor has torque (CiA 402-2, finite state automaton)."""
+FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
+
+def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], width: int) -> Iterator[RenderableType]:
+    """Table of the nodes, and what needs attention.
+
+    Args:
+        cell: that was scanned.
+        rows: of all buses, from `scan_rows`.
+        reset: axes whose fault was reset.
+        width: of the terminal, in columns.
+    """
+    yield scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
+    for row in rows:
+        if row["enabled"]:
+            name = f"node {row['node_id']}" + (f" ({printable(row['axis'])})" if row["axis"] else "")
+            yield Text(f"{name} IS ENABLED: its motor has torque and may move at any time.", "bold red")
+    for name in reset:
+        yield Text(f"The fault of {printable(name)} was reset; it has no power.")
+    if any(row["in_fault"] for row in rows):
+        yield Text(_IN_FAULT, "yellow")
+    note = actual_current_note(cell)
+    if note is not None:
+        yield Text(note, "yellow")
+
+
+_IN_FAULT = (
+    "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the last run (`drivegain "
+    "explain-emcy`) shows the cause. Remove the cause, then reset the fault with --reset-faults; nothing moves."
+)
+
+
+def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[str, Any]]:
+    """Rows of the nodes of one bus, configured or found.
+
+    Args:
+        cell: with the expected nodes.
+        found: nodes on the bus.
+        bus: name of the bus.
+    """
+    homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
+    axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
+    nodes = {node.node_id: node for node in found}
+    rows = []
+    for node_id in sorted(axes.keys() | nodes.keys()):
+        axis, node = axes.get(node_id), nodes.get(node_id)
+        identity = None if node is None else node.identity
+        expected = None if axis is None else axis.identity
+        if node is None:
+            verdict = "missing"
+        elif axis is None:
+            verdict = f"belongs on {homes[node_id]}" if node_id in homes else "not configured"
+        else:
+            verdict = "ok" if expected is None or expected == identity else "other identity"
+        in_fault = node is not None and node.state in FAULTY
+        if in_fault:
+            verdict = "in fault" if verdict == "ok" else f"{verdict}, in fault"
+        rows.append(
+            {
+                "bus": bus,
+                "node_id": node_id,
+                "axis": None if axis is None else axis.name,
+                "vendor_id": None if identity is None else identity.vendor_id,
+                "product_code": None if identity is None else identity.product_code,
+                "serial": None if identity is None else identity.serial,
+                "device_name": None if node is None else node.device_name,
+                "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),
+                "state": None if node is None or node.state is None else str(node.state),
+                "enabled": None if node is None or node.state is None else node.state in ENABLED,
+                "in_fault": in_fault,
+                "verdict": verdict,
+            }
+        )
+    return rows
+
+
+_GAP = 3
+_DISPENSABLE = ("nmt", "vendor", "product", "serial", "state")
+"""Columns left out, in this order, where a terminal is too narrow; `--json` has them all."""
+_POWER = {True: "ENABLED", False: "off", None: "?"}
+
+
+def scan_table(rows: list[dict[str, Any]], width: int = 80, several: bool = False) -> Table:
+    """Table of the nodes, at most `width` columns wide; bus, node, axis, power and verdict are always shown."""
+    columns = {
+        **({"bus": [printable(row["bus"]) for row in rows]} if several else {}),
+        "node": [str(row["node_id"]) for row in rows],
+        "axis": [printable(row["axis"] or "") for row in rows],
+        "vendor": ["" if row["vendor_id"] is None else f"{row['vendor_id']:#x}" for row in rows],
+        "product": ["" if row["product_code"] is None else f"{row['product_code']:#x}" for row in rows],
+        "serial": ["" if row["serial"] is None else str(row["serial"]) for row in rows],
+        "nmt": [(row["nmt"] or "").lower() for row in rows],
+        "state": [(row["state"] or "").lower() for row in rows],
+        "power": [_POWER[row["enabled"]] for row in rows],
+        "verdict": [row["verdict"] for row in rows],
+    }
+    wide = {heading: max(map(cell_len, (heading, *texts))) for heading, texts in columns.items()}
+    for heading in _DISPENSABLE:
+        if sum(wide.values()) + _GAP * (len(wide) - 1) <= width:
+            break
+        del wide[heading], columns[heading]
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+    for heading, least in wide.items():
+        table.add_column(heading.upper() if heading == "nmt" else heading, no_wrap=True, min_width=least)
+    for row, texts in zip(rows, zip(*columns.values(), strict=True), strict=True):
+        style = "bold red" if row["enabled"] or row["verdict"] != "ok" else None
+        table.add_row(*map(Text, texts), style=style)
+    return table
+
+
+def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None], events: list[str]) -> dict[str, Any]:
+    """JSON document of one reading of the bus.
+
+    Args:
+        cell: that was read.
+        reading: of its buses.
+        ampere: amperes per raw unit of each axis' current, None where unknown.
+        events: texts of recent events, oldest first.
+    """
+    axes = []
+    for declared, axis, position, ampere_per_unit in zip(
+        cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True
+    ):
+        raw, word = axis.current_raw, axis.statusword
+        state = None if word is None else decode(word)
+        axes.append(
+            {
+                "axis": declared.name,
+                "node_id": declared.node_id,
+                "position": None if position is None else position / declared.unit.si,
+                "unit": declared.unit.name,
+                "position_counts": axis.position_counts,
+                "current_a": None if raw is None or ampere_per_unit is None else raw * ampere_per_unit,
+                "current_raw": raw,
+                "state": None if state is None else str(state),
+                "enabled": None if state is None else state in ENABLED,
+                "statusword": word,
+                "nmt": None if axis.nmt is None else nmt_name(axis.nmt),
+                "rate_hz": axis.rate_hz,
+                "lost": axis.lost,
+                "silent": axis.rate_hz == 0.0,
+            }
+        )
+    loads = bus_loads_percent(cell, reading)
+    return {
+        "cell": cell.name,
+        "source": reading.source.value,
+        "seconds": reading.seconds,
+        "sync_hz": reading.sync_hz,
+        "frames_per_s": sum(map(sum, reading.frames)) / reading.seconds,
+        "bus_load_percent": max(loads),
+        "buses": [{"bus": bus.name, "load_percent": load} for bus, load in zip(cell.buses, loads, strict=True)],
+        "axes": axes,
+        "events": events,
+    }
+
+
+def joint_positions(cell: Cell, reading: CellReading) -> list[float | None]:
+    """Position of each joint [rad or m], q = R⁻¹ q_motor + offset (paper eq. 24); None where a motor is unknown."""
+    to_joint = np.linalg.inv(cell.ratio)
+    turns = [
+        None
+        if axis.position_counts is None or not declared.counts_per_revolution
+        else axis.position_counts / declared.counts_per_revolution
+        for declared, axis in zip(cell.axes, reading.axes, strict=True)
+    ]
+    motor_rad = np.array([0.0 if turn is None else 2.0 * np.pi * turn for turn in turns])
+    unknown = np.array([turn is None for turn in turns])
+    offset = np.array([axis.zero_offset_rad for axis in cell.axes])
+    joint = to_joint @ motor_rad + offset
+    # A joint's position depends on the motors that move it, and on no others.
+    blind = (np.abs(to_joint) > 1e-12 * np.abs(to_joint).max()) @ unknown
+    return [None if hidden else float(value) for hidden, value in zip(blind, joint, strict=True)]
+
+
+def bus_loads_percent(cell: Cell, reading: CellReading) -> tuple[float, ...]:
+    """Load of each bus, with every frame as long as bit stuffing can make it [%]."""
+    return tuple(
+        100.0
+        * sum(count * frame_bits(length) for length, count in enumerate(frames))
+        / (bus.bitrate_bit_s * reading.seconds)
+        for bus, frames in zip(cell.buses, reading.frames, strict=True)
+    )
+
+
+_SOURCE_TEXT = {
+    "overheard": "another master leads this bus; its traffic is read and nothing is sent",
+    "asked": "no other master: the axes are queried, nothing is written",
+}
+
+
+def monitor_view(document: dict[str, Any]) -> Group:
+    """Table of the axes, with the load of the buses and recent events, from `monitor_document`."""
+    table = plain_table(("axis", "position", "current", "state", "rate Hz", "lost"), left=(0, 3))
+    for axis in document["axes"]:
+        table.add_row(*map(Text, _monitor_cells(axis)), style=_monitor_style(axis))
+    head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[document['source']]}"))
+    loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
+    load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
+    return Group(head, table, load, *(Text(printable(event), "yellow") for event in document["events"]))
+
+
+def _monitor_cells(axis: dict[str, Any]) -> tuple[str, ...]:
+    position = "?" if axis["position"] is None else f"{axis['position']:.3f} {axis['unit']}"
+    if axis["current_a"] is not None:
+        current = f"{axis['current_a']:+.3f} A"
+    else:
+        current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
+    state = (axis["state"] or "?").lower()
+    if axis["silent"]:
+        state += " (SILENT)"
+    elif axis["enabled"]:
+        state += " (ENABLED)"
+    return printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"])
+
+
+def _monitor_style(axis: dict[str, Any]) -> str | None:
+    if axis["silent"]:
+        return "red"
+    return "bold" if axis["enabled"] else None
+
+
+def current_signals(cell: Cell) -> dict[str, str]:
+    """Recorded current of each axis with an amplifier, such as "current reference 6074h:00, rms"."""
+    return {
+        axis.name: f"{axis.profile.signal}, amplitude {axis.profile.amplitude.value}"
+        for axis in cell.axes
+        if axis.profile is not None
+    }
+
+
+def actual_current_note(cell: Cell) -> str | None:
+    """Warning where an axis has no current reference: its gain is per actual current, not per reference."""
+    actual = [axis for axis in cell.axes if axis.profile is not None and axis.profile.tap is TapPoint.ACTUAL]
+    if not actual:
+        return None
+    drives = ", ".join(dict.fromkeys(axis.profile.name for axis in actual if axis.profile is not None))
+    return (
+        f"{', '.join(axis.name for axis in actual)}: ACTUAL current, not the reference ({drives} reports none): the "
+        "gains are Nm per A of actual current"
+    )
+
+
+def load_lines(cell: Cell) -> tuple[str, ...]:
+    """Describe the load that a recording puts on each bus."""
+    lockstep = cell.sync is not None and cell.sync.pacing is Pacing.LOCKSTEP
+    says = "in lockstep; a real bus would be loaded by" if lockstep else "loaded by"
+    return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))

@@ -1,0 +1,160 @@
+"""Pictures of a fit: measured and predicted torques, and the residual before and after each effect."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from daq.config.cell import MILLIMETRE, Cell, JointUnit
+from daq.report.effect_names import effect_text, other_axis, variable_text
+from daq.report.fit import start_of
+from daq.report.gains import plot_gains
+from daq.report.picture import BLACK, QUANTITY, SKY, FloatArray, legend_below, panels, save_png, thinned, unformatted
+from daq.report.residual_plots import plot_residual
+from daq.workflow.fit import Fit
+from ident.calibration import Calibration
+from ident.discovery.loop import Evidence
+from ident.effects.effect import PlacedEffect
+from ident.effects.signals import Abscissa, fitted_signals, session_began_s
+from ident.equations.rows import decimate_rows
+
+
+def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
+    """Draw the torques of a held-out run (paper Fig. 2), the residual before and after each effect, and the gains.
+
+    Args:
+        fitted, calibration: the fit and its result.
+        truth: true gain by axis, for a simulated cell only.
+        out: folder of the pictures.
+
+    Raises:
+        OSError: from the file system.
+    """
+    before = start_of(fitted)
+    final = fitted.steps[-1].after if fitted.steps else before
+    draw_torques(out / "torques.png", final, fitted.cell)
+    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
+    for step in fitted.steps:
+        for placed in (placed for placed in step.after.effects if placed not in before.effects):
+            name = fitted.cell.axis_names[placed.axis]
+            draw_effect(out / f"residual-{name}-{placed.effect.name}.png", before, step.after, placed, fitted.cell)
+        before = step.after
+
+
+def plot_torques(
+    path: Path | None,
+    time_s: FloatArray,
+    measured_nm: FloatArray,
+    predicted_nm: FloatArray,
+    axes: tuple[str, ...],
+    *,
+    title: str,
+    forces: tuple[str, ...] = (),
+    shown_s: float = 10.0,
+) -> bytes:
+    """Draw τ = V g with the identified gains (full) and the model's τ (dotted), one panel an axis (paper Fig. 2).
+
+    The relative error over each panel is that of the whole run, not only of the stretch that is drawn.
+
+    Args:
+        path: of the PNG; None for its bytes alone.
+        time_s: shape (k,) [s].
+        measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
+        predicted_nm: torque from the model, same shape [forces].
+        axes: names of the n axes.
+        title: names the run.
+        forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
+        shown_s: length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge.
+
+    Returns:
+        the PNG.
+
+    Raises:
+        OSError: from the file system.
+    """
+    shown = time_s <= time_s[0] + shown_s
+    whole_s = float(time_s[-1] - time_s[0])
+    extent = f", first {shown_s:g} s of {whole_s:.0f} s" if whole_s > shown_s else ""
+    figure, places = panels(
+        len(axes), 2, f"{unformatted(title)}{extent}\ngaps: samples left out, most of them at standstill"
+    )
+    units = forces or ("Nm",) * len(axes)
+    for index, (name, unit, place) in enumerate(zip(axes, units, places, strict=True)):
+        measured, predicted = measured_nm[shown, index], predicted_nm[shown, index]
+        place.plot(*thinned(time_s[shown], measured), color=SKY, linewidth=2.4, label="current × identified gain")
+        place.plot(*thinned(time_s[shown], predicted), color=BLACK, linewidth=1.5, linestyle=":", label="model")
+        both = np.isfinite(measured_nm[:, index]) & np.isfinite(predicted_nm[:, index])
+        error = _relative_error_percent(measured_nm[both, index], predicted_nm[both, index])
+        place.set_title(f"{unformatted(name)}   relative error {error:.1f} %", fontsize=9, loc="left")
+        place.set_ylabel(f"{QUANTITY[unit]} [{unit}]", fontsize=8)
+        if index >= len(axes) - 2:
+            place.set_xlabel("time [s]", fontsize=8)
+    legend_below(figure, places[0])
+    return save_png(figure, path)
+
+
+def _relative_error_percent(measured: FloatArray, predicted: FloatArray) -> float:
+    """‖ρ‖/‖Y‖ (paper, Table 6) [%]; NaN without samples."""
+    norm = float(np.linalg.norm(measured))
+    return 100.0 * float(np.linalg.norm(measured - predicted)) / norm if norm else float("nan")
+
+
+def draw_torques(path: Path | None, final: Evidence, cell: Cell) -> bytes:
+    """Draw measured and predicted torque of the first held-out run, or of the fit.
+
+    Raises:
+        OSError: from the file system.
+    """
+    rows = final.training if final.holdout is None else final.holdout
+    rows = rows.only(rows.run == rows.run[0])
+    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
+    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
+    which = "a held-out run" if final.holdout is not None else "the first run of the fit"
+    forces = tuple(axis.unit.force for axis in cell.axes)
+    title = f"Joint torques of {which}"
+    return plot_torques(path, rows.time_s, measured, predicted, cell.axis_names, title=title, forces=forces)
+
+
+def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> bytes:
+    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit.
+
+    Raises:
+        OSError: from the file system.
+    """
+    index = len(after.trained) if after.held_out else 0
+    rows_before = before.holdout if before.holdout is not None else before.training
+    rows_after = after.holdout if after.holdout is not None else after.training
+    chosen, data = rows_after.run == index, after.datasets[index]
+    seen = fitted_signals(after.model, data, after.training, after.estimate, session_began_s(after.trained))
+    along = seen.variable(placed.effect.abscissa, placed.axis, other_axis(placed.effect))
+    variable, velocity = (
+        decimate_rows(data, rows_after.conditioning, column[None])[0]
+        for column in (along, data.velocity_rad_s[:, placed.axis])
+    )
+    use = rows_after.use[placed.axis, chosen]
+    residuals = (
+        np.where(use, model.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
+        for model, rows in ((before, rows_before), (after, rows_after))
+    )
+    name, unit = cell.axes[placed.axis].name, cell.axes[placed.axis].unit
+    return plot_residual(
+        path,
+        rows_after.time_s[chosen],
+        *residuals,
+        variable=variable,
+        variable_label=_label(placed, cell.axis_names, unit),
+        velocity_rad_s=velocity,
+        title=f"{name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
+        force=unit.force,
+    )
+
+
+def _label(placed: PlacedEffect, axes: tuple[str, ...], unit: JointUnit) -> str:
+    """Label the variable with its unit at this joint: force and metres along a prismatic one."""
+    abscissa = placed.effect.abscissa
+    words, _, measure = abscissa.value.partition(" [")
+    label = f"{variable_text(placed.effect, axes) if other_axis(placed.effect) is not None else words} [{measure}"
+    if unit is not MILLIMETRE or abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT, Abscissa.OTHER_VELOCITY}:
+        return label
+    return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")

@@ -1,0 +1,127 @@
+"""The contents of a log, as `drivegain info` shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+from rich.text import Text
+
+from daq.config.cell import Cell
+from daq.config.cell_file import cell_from_bundle
+from daq.errors import LogIncomplete
+from daq.log.conversion import scaling
+from daq.log.metadata import RunStatistics
+from daq.log.reader import LogHead, LogReader
+from daq.report.bus import current_signals
+from daq.report.text import printable
+from drivers.stream.sample import EventKind
+
+_ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
+"""Events of every run; all others are shown."""
+
+
+def describe_log(path: Path) -> dict[str, Any]:
+    """Read everything known of a log, in one pass and bounded memory.
+
+    Raises:
+        LogUnreadable: the log cannot be read, or its counts contradict its samples; a fit refuses it too.
+        ConfigurationError: the cell in it is inconsistent.
+    """
+    reader = LogReader(path)
+    samples, first_ns, last_ns, widths = 0, None, 0, set[int]()
+    for block in reader:
+        samples += len(block.cycle)
+        widths.add(block.position_counts.shape[1])
+        first_ns = int(block.time_ns[0]) if first_ns is None else first_ns
+        last_ns = int(block.time_ns[-1])
+    head, statistics = reader.head, reader.statistics
+    cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
+    run = head.run
+    _check_counts(path, cell, head, statistics, samples, widths)
+    return {
+        "log": str(path),
+        "sha256": reader.digest,
+        "run_id": run.run_id,
+        "cell": cell.name,
+        "cell_sha256": cell.digest,
+        "axes": list(cell.axis_names),
+        "current": current_signals(cell),
+        "role": run.role.value,
+        "payload": None
+        if run.payload is None
+        else {"name": run.payload.name, "mounting": run.payload.mounting, "known": run.payload.known},
+        "rate_hz": run.rate_hz,
+        "speed": run.speed,
+        "samples": samples,
+        "duration_s": samples / run.rate_hz,
+        "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
+        "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
+        "lost_cycles": statistics.lost_cycles,
+        "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
+        "partial": reader.partial,
+        "valid": statistics.valid,
+        "reason": statistics.reason,
+        "events": [
+            {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
+            for e in reader.events
+            if e.kind not in _ROUTINE
+        ],
+        "operator": run.operator,
+        "software": run.software,
+        "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
+        "wall_clock_step_s": None
+        if statistics.wall_minus_monotonic_ns is None
+        else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
+        "origin": run.origin,
+        "attachments": {name: len(data) for name, data in sorted(head.files.items())},
+    }
+
+
+def _check_counts(
+    path: Path, cell: Cell, head: LogHead, statistics: RunStatistics, samples: int, widths: set[int]
+) -> None:
+    """Make the checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory."""
+    scaling(cell, head.readback)
+    axes = len(cell.axes)
+    pairs = (
+        (f"{samples} samples", samples == statistics.samples, f"{statistics.samples}, as its recorder counted"),
+        (f"samples of {sorted(widths)} axes", widths <= {axes}, f"{axes}, as in its cell configuration"),
+        (f"losses of {len(statistics.missing)} axes", len(statistics.missing) == axes, f"{axes}"),
+    )
+    for found, agrees, expected in pairs:
+        if not agrees:
+            raise LogIncomplete(
+                str(path),
+                found=found,
+                expected=expected,
+                remedy="another tool may have cut or changed the log; take the original",
+            )
+
+
+def log_table(description: Mapping[str, Any]) -> Table:
+    """Table of a log's description, a line each; long values are folded."""
+    table = Table(show_header=False, box=None)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for key, value in description.items():
+        table.add_row(key.replace("_", " "), Text(printable(_readable(value))))
+    return table
+
+
+def _readable(value: Any) -> str:
+    if value is None or value in ("", [], {}):
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_readable(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_readable(item) for item in value)
+    return str(value)

@@ -1,0 +1,65 @@
+"""A plan and what it promises: the predicted σ of each gain and the verdict on it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from daq.config.cell import Cell
+from daq.workflow.experiment import Experiment
+from daq.workflow.plan import Plan
+from ident.planning.verdict import GainVerdict
+
+
+def plan_document(
+    out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]
+) -> dict[str, object]:
+    """Build the JSON document of a plan.
+
+    Args:
+        out: its file.
+        cell, experiment: it was made for.
+        made: the plan.
+        judged: verdict on the gain of each axis.
+    """
+    return {
+        "plan": str(out),
+        "cell": made.cell,
+        "seed": made.seed,
+        "payload": experiment.payload.name,
+        "moves": len(made.moves),
+        "duration_s": round(made.duration_s, 3),
+        "condition": round(made.condition, 1),
+        "assumed": list(experiment.remarks),
+        "gains": [
+            {
+                "axis": axis.name,
+                "predicted_std_percent": round(gain.std_percent, 3),
+                "verdict": gain.verdict.value,
+                "seen_by": [source.value for source in gain.sources],
+                "alone_percent": {
+                    source.value: round(alone, 3) if math.isfinite(alone) else None
+                    for source, alone in gain.alone_percent.items()
+                },
+                "words": gain.words(axis.name),
+            }
+            for axis, gain in zip(cell.axes, judged, strict=True)
+        ],
+    }
+
+
+def plan_text(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]) -> str:
+    """Describe a plan in lines for the operator; arguments as of `plan_document`."""
+    width = max(len(name) for name in (*cell.axis_names, "axis"))
+    lines = [
+        f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",
+        f"  {'axis':{width}}  predicted σ  verdict",
+        *(
+            f"  {axis.name:{width}}  {gain.std_percent:9.2f} %  {gain.verdict.value}"
+            for axis, gain in zip(cell.axes, judged, strict=True)
+        ),
+        *(f"  {gain.words(axis.name)}" for axis, gain in zip(cell.axes, judged, strict=True)),
+        "Assumed: " + "; ".join(experiment.remarks) + ".",
+        "Read the plan before the robot executes it; the way to its first target is not checked.",
+    ]
+    return "\n".join(lines)

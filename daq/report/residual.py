@@ -1,0 +1,238 @@
+"""The closed loop in sentences and tables: the effects that were added, and what they changed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from daq.report.effect_names import effect_text, is_unnamed, placed_name
+from daq.report.fit import error_table
+from daq.report.gains import gain_table, partial_note, with_deviation
+from daq.report.text import plain_table
+from daq.workflow.fit import Fit
+from ident.calibration import Calibration
+from ident.discovery.before_after import Account, BeforeAfter, Errors, GainChange
+from ident.discovery.loop import MAX_EFFECTS
+from ident.discovery.search import Finding
+from ident.effects.effect import PlacedEffect, Side
+from ident.effects.timing import TimeSkew
+from ident.estimators.estimate import RelativeError
+
+_SHOWN = 6
+"""Findings listed for each turn; the JSON has them all."""
+_SHOWN_RIVALS = 3
+
+ErrorRow = tuple[str, RelativeError]
+"""Name of the error and of the data it is measured on, and the error [%]."""
+WHEN = ("before", "after")
+
+
+def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> Iterator[RenderableType]:
+    """Turns of the loop, the effects with their coefficients, the summary, errors and gains.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+        calibration: with the accepted effects.
+    """
+    yield from turns_view(fitted)
+    for effect in calibration.effects:
+        sizes = ", ".join(f"{c.name} {with_deviation(c.value, c.std)} {c.unit}" for c in effect.coefficients)
+        more = len(effect.ambiguity) - _SHOWN_RIVALS
+        rivals = ", ".join(effect.ambiguity[:_SHOWN_RIVALS]) + (f" and {more} more" if more > 0 else "")
+        rivals = f"; not distinguishable from {rivals}" if rivals else ""
+        yield f"{effect.axis}: {effect.name}: {sizes}{rivals}"
+    yield from summary(fitted, account)
+    yield ""
+    yield before_after_table(account, fitted.cell.axis_names)
+    yield ""
+    yield gain_table(calibration.gains, title="Drive gains with the effects in the model")
+    if (note := partial_note(calibration)) is not None:
+        yield Text(note, style="bold")
+
+
+def turns_view(fitted: Fit) -> Iterator[RenderableType]:
+    """Candidates of each turn of the loop, and the one that was added."""
+    for number, step in enumerate(fitted.steps, start=1):
+        yield ranking_table(fitted, step.findings, f"Turn {number}: best candidates on left-out moves")
+        if step.accepted is None:
+            yield "No candidate passes every gate; nothing is added.\n"
+        else:
+            placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
+            yield f"Added: {placed_name(placed, fitted.cell.axis_names)}.\n"
+
+
+def ranking_table(fitted: Fit, findings: tuple[Finding, ...], title: str) -> Table:
+    """Table of the best findings and whether they passed every gate."""
+    headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
+    table = plain_table(headings, title=title)
+    for finding in findings[:_SHOWN]:
+        table.add_row(
+            finding.effect.name,
+            fitted.cell.axes[finding.axis].name,
+            f"{finding.probability:.3f}",
+            f"{100 * finding.folds_better:.0f} %",
+            f"{100 * finding.explained:.1f} %",
+            f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
+            "pass" if finding.passed else "no",
+        )
+    return table
+
+
+def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
+    """Relative error of each axis before and after, and the share that noise alone would leave."""
+    return error_table("Relative error ‖e‖/‖v‖ of the motor currents by ml [%]", axes, dict(error_rows(account)))
+
+
+def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
+    """Summarise in sentences: each accepted effect, the whole, the gains, and the limit of detection.
+
+    Args:
+        fitted: with the turns of the loop.
+        account: of them.
+    """
+    kept = fitted.steps[-1].after.effects
+    found = tuple(
+        _effect_sentence(fitted, account, turn, placed, step.accepted.share_of_excess)
+        for step, turn in zip(fitted.steps, account.turns, strict=True)
+        if step.accepted is not None and turn is not None
+        for placed in turn.added
+        if placed in kept
+    )
+    if not found:
+        error, where = strictest_error(account.total.after)
+        return (
+            f"No structure found: the error {where} is {error.total:.1f} %{_of_all(account)}.",
+            _silence(fitted),
+            *_skew_sentence(fitted),
+        )
+    (before, _), (after, where) = strictest_error(account.total.before), strictest_error(account.total.after)
+    return (
+        *found,
+        f"All axes together: the error {where} {error_change_text(before.total, after.total)}{_of_all(account)}.",
+        *(() if fitted.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
+        _silence(fitted),
+        *_skew_sentence(fitted),
+    )
+
+
+def time_skew(fitted: Fit) -> tuple[float, float] | None:
+    """Delay of current samples after position samples, equal on all axes, and its σ [s]; None where unknown.
+
+    It is taken from the last turn, where no accepted effect accounts for it.
+    """
+    skews = [finding for finding in fitted.steps[-1].findings if finding.effect == TimeSkew()]
+    return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
+
+
+def _skew_sentence(fitted: Fit) -> tuple[str, ...]:
+    skew = time_skew(fitted)
+    if skew is None:
+        return ()
+    seconds, std = skew
+    beside = " beside the effects found" if fitted.steps[-1].after.effects else ""
+    return (
+        f"Currents were sampled {1e3 * abs(seconds):.2f} ± {1e3 * std:.2f} ms {'after' if seconds > 0 else 'before'} "
+        f"the positions on all axes alike{beside}.",
+    )
+
+
+def error_rows(account: Account) -> tuple[ErrorRow, ...]:
+    """Rows of the table of errors; errors that were not computed or are unknown are left out."""
+    before, after = account.total.before, account.total.after
+    pairs = (
+        ("fit", before.in_sample, after.in_sample),
+        ("moves left out", before.cross_validated, after.cross_validated),
+        ("runs left out", _together(before), _together(after)),
+        ("held out", before.holdout, after.holdout),
+    )
+    floors = (("noise floor", account.floor), ("noise floor, held out", account.holdout_floor))
+    named = [(f"{name}, {when}", error) for name, *both in pairs for when, error in zip(WHEN, both, strict=True)]
+    return tuple(
+        (name, error) for name, error in (*named, *floors) if error is not None and any(map(math.isfinite, error.axes))
+    )
+
+
+def strictest_error(errors: Errors) -> tuple[RelativeError, str]:
+    """Return the most independent error, and the data it is measured on."""
+    if errors.holdout is not None:
+        return errors.holdout, "on held-out runs"
+    if errors.left_out_runs is not None and errors.left_out_runs.together is not None:
+        return errors.left_out_runs.together, "on runs left out in turn"
+    return errors.cross_validated, "on moves left out in turn"
+
+
+def error_change_text(before_percent: float, after_percent: float) -> str:
+    """Describe the change of an error: `falls from 6.9 to 2.8 %`."""
+    before, after = f"{before_percent:.1f}", f"{after_percent:.1f}"
+    if before == after:
+        return f"stays at {after} %"
+    return f"{'falls' if after_percent < before_percent else 'rises'} from {before} to {after} %"
+
+
+def _effect_sentence(
+    fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, share_of_excess: float | None
+) -> str:
+    axes = fitted.cell.axis_names
+    name = axes[placed.axis]
+    (before, _), (after, where) = strictest_error(turn.before), strictest_error(turn.after)
+    floor = _floor(account).axes[placed.axis]
+    floor_text = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
+    excess = ""
+    if is_unnamed(placed.effect) and share_of_excess is not None:
+        excess = f" ({100.0 * share_of_excess:.0f} % of the residual beyond noise)"
+    if placed.effect.side is Side.ALL_MOTORS:
+        before_all, after_all = (strictest_error(errors)[0].total for errors in (turn.before, turn.after))
+        change = error_change_text(before_all, after_all)
+        return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."
+    return (
+        f"{name} has {effect_text(placed.effect, axes)}{excess}: the error of {name} {where} "
+        f"{error_change_text(before.axes[placed.axis], after.axes[placed.axis])} ({floor_text})."
+    )
+
+
+def _floor(account: Account) -> RelativeError:
+    """Noise floor of the rows that `strictest_error` is measured on."""
+    return account.floor if account.holdout_floor is None else account.holdout_floor
+
+
+def _of_all(account: Account) -> str:
+    floor = _floor(account).total
+    return f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
+
+
+def _gains_sentence(axes: Sequence[str], changes: Sequence[GainChange]) -> str:
+    parts = [
+        f"{axis} by {change.change_percent:+.1f} %"
+        for axis, change in zip(axes, changes, strict=True)
+        if change.significant
+    ]
+    if not parts:
+        return "No drive gain changes by more than noise."
+    return f"Drive gains that change by more than noise: {', '.join(parts)}."
+
+
+def _silence(fitted: Fit) -> str:
+    last = fitted.steps[-1]
+    if last.accepted is not None:
+        return (
+            f"The search ended after {MAX_EFFECTS} effects with more to find: check the declared model first "
+            "(drive train, payload, channels)."
+        )
+    limits = ", ".join(
+        f"{limit:.2g} {axis.unit.force} on {axis.name}"
+        for axis, limit in zip(fitted.cell.axes, last.limits_nm, strict=True)
+    )
+    ended = f"The search ended early: {last.ended}. " if last.ended else ""
+    return (
+        f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
+        f"square in motion): {limits}."
+    )
+
+
+def _together(errors: Errors) -> RelativeError | None:
+    return None if errors.left_out_runs is None else errors.left_out_runs.together

@@ -1,0 +1,131 @@
+"""The bodies that `drivegain export urdf` writes, and how far their torque is from the identified one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from daq.report.text import plain_table, printable, terminal_text
+from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+from ident.calibration import Calibration
+from ident.physical.programme import MARGIN
+
+_SHOWN_SHIFTS = 5
+
+
+def urdf_view(
+    calibration: Calibration,
+    robot: PhysicalRobot,
+    updates: dict[str, JointUpdate],
+    updated: Updated,
+    same_configuration: bool | None,
+) -> Iterator[RenderableType]:
+    """Bodies by link, the change of torque, and the identified parameters that a URDF cannot hold.
+
+    Args:
+        calibration: that was exported.
+        robot: the nearest physical robot.
+        updates: by joint.
+        updated: the new URDF.
+        same_configuration: whether the cell file is that of the fit; None without a cell file.
+    """
+    yield _link_table(updates, updated)
+    change, joints = robot.parameters.torque_change_percent, robot.parameters.model.robot.joints
+    if robot.parameters.exact:
+        yield "The torque of these bodies is exactly the identified one."
+    else:
+        axes = ", ".join(f"{value:.2f}" for value in change.axes)
+        shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in robot.shifts[:_SHOWN_SHIFTS])
+        yield (
+            f"No physical robot has exactly the identified parameters; the torque of this one differs by "
+            f"{change.total:.2g} % (axes: {axes} %). Largest shifts: {shifts}."
+        )
+    if robot.prior.assumed:
+        names = ", ".join(joints[number].name for number in robot.prior.assumed)
+        yield printable(
+            f"The URDF has no possible inertia behind {names}; a ball was assumed where the data have none."
+        )
+    if updated.merged:
+        yield printable(f"Merged into the moving link that carries them: {', '.join(updated.merged)}.")
+    left_out = ["rotor inertias", "offsets"]
+    left_out += ["friction of coupled motors"] if robot.parameters.model.drive_train.coupled else []
+    left_out += [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
+    yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
+    if same_configuration is False:
+        yield Text("The cell's configuration has changed since the fit; check the difference.", style="bold")
+
+
+def urdf_document(
+    calibration: Calibration,
+    robot: PhysicalRobot,
+    updates: dict[str, JointUpdate],
+    updated: Updated,
+    out: Path,
+    same_configuration: bool | None,
+) -> dict[str, Any]:
+    """Build the object of `export urdf --json`; arguments as of `urdf_view`."""
+    parameters = robot.parameters
+    change = parameters.torque_change_percent
+    joints = parameters.model.robot.joints
+    return {
+        "urdf": str(out),
+        "calibration": calibration.cell,
+        "same_configuration": same_configuration,
+        "exact": parameters.exact,
+        "torque_change_percent": {"axes": list(change.axes), "total": change.total},
+        "shifts": [
+            {
+                "name": shift.name,
+                "identified": shift.identified,
+                "physical": shift.realised,
+                "standard_deviations": shift.deviations,
+            }
+            for shift in robot.shifts
+        ],
+        "margin": MARGIN,
+        "joints": [
+            {
+                "name": joint.name,
+                "link": updated.links[joint.name],
+                "mass_kg": update.body.mass_kg,
+                "centre_m": update.body.centre_m.tolist(),
+                "inertia_kg_m2": update.body.inertia_kg_m2.tolist(),
+                "damping": update.damping,
+                "friction": update.friction,
+                "smallest_eigenvalue": float(eigenvalue),
+                "prior_assumed": number in robot.prior.assumed,
+            }
+            for number, (joint, update, eigenvalue) in enumerate(
+                zip(joints, updates.values(), parameters.eigenvalues, strict=True)
+            )
+        ],
+        "merged_links": list(updated.merged),
+        "not_in_urdf": [
+            {"name": column.name, "value": float(value), "unit": column.unit}
+            for column, value in zip(parameters.model.columns, parameters.standard, strict=True)
+            if column.name.startswith(("Ia", "off", "fvm", "fsm"))
+        ],
+        "effects_left_out": [f"{effect.name} on {effect.axis}" for effect in calibration.effects],
+    }
+
+
+def _link_table(updates: dict[str, JointUpdate], updated: Updated) -> Table:
+    """Mass and centre of mass of each link, friction of its joint."""
+    headings = ("joint", "link", "mass kg", "centre of mass m", "damping", "friction")
+    table = plain_table(headings, left=(0, 1))
+    for name, update in updates.items():
+        centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
+        table.add_row(
+            terminal_text(name),
+            terminal_text(updated.links[name]),
+            f"{update.body.mass_kg:.3g}",
+            centre,
+            f"{update.damping:.3g}",
+            f"{update.friction:.3g}",
+        )
+    return table

@@ -1,0 +1,178 @@
+"""A validation: relative errors of other logs, weighed payloads, pictures, and the paper's Tables 5 to 8."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from daq.report import paper_tables
+from daq.report.fit_plots import plot_torques
+from daq.report.text import percent_text, plain_table, printable, terminal_text
+from daq.workflow.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun
+from daq.workflow.fit import DOUBTFUL_PERCENT
+from daq.workflow.validate import DataUse, Validation, conditioning_of, together
+from ident.calibration import Calibration
+from ident.estimators.estimate import RelativeError
+
+
+def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
+    """Relative errors, doubts about the logs, and the paper's tables."""
+    validations = found.validations
+    yield _error_table(calibration, validations)
+    filter_ = conditioning_of(calibration)
+    yield (
+        f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
+        "fit. Compare relative errors only under the same filters."
+    )
+    for validation in validations:
+        if not validation.same_configuration:
+            yield _bold(
+                f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
+            )
+    for validation in validations:
+        if validation.error.total > DOUBTFUL_PERCENT:
+            yield _bold(
+                f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the "
+                "torque. Was the payload mounted as the log says, and is it the same robot?"
+            )
+    for run in found.runs:
+        if run.left_out:
+            yield _bold(f"{run.run}: {run.left_out}")
+    for table in validation_tables(found, complete=False):
+        yield ""
+        yield from table.view()
+
+
+def _bold(text: str) -> Text:
+    return Text(printable(text), style="bold")
+
+
+def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
+    """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
+    whole = complete or len(found.calibrations) > 1
+    return [
+        paper_tables.condition_table(found),
+        *([paper_tables.error_table(found)] if whole else []),
+        *paper_tables.mass_tables(found),
+    ]
+
+
+def draw_validations(calibration: Calibration, validations: tuple[Validation, ...], folder: Path) -> dict[Path, Path]:
+    """Draw each log as the paper's Fig. 2; return the pictures by log.
+
+    Raises:
+        OSError: from the file system.
+    """
+    axes = tuple(gain.axis for gain in calibration.gains)
+    forces = tuple("N" if gain.unit.startswith("N/") else "Nm" for gain in calibration.gains)
+    logs_of = Counter(validation.run for validation in validations)
+    drawn = {}
+    for validation in validations:
+        # Logs in different folders may have the same name.
+        stem = validation.run if logs_of[validation.run] == 1 else f"{validation.run}-{validation.digest[:8]}"
+        path = folder / f"{stem}.png"
+        measured_nm, predicted_nm = (
+            np.where(validation.use, torque_nm, np.nan).T
+            for torque_nm in (validation.measured_nm, validation.predicted_nm)
+        )
+        title = f"{validation.run}, {validation.data_use.value}: torque of {calibration.cell}"
+        folder.mkdir(parents=True, exist_ok=True)
+        plot_torques(path, validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
+        drawn[validation.log] = path
+    return drawn
+
+
+def validation_document(
+    calibration: Calibration, validations: tuple[Validation, ...], drawn: dict[Path, Path]
+) -> dict[str, Any]:
+    """Build the relative errors of `validate --json`; pictures by log."""
+    return {
+        "cell": calibration.cell,
+        "axes": [gain.axis for gain in calibration.gains],
+        "filter": calibration.filter,
+        "fit_relative_error_percent": _error(calibration.relative_error_percent),
+        "logs": [
+            {
+                "log": str(validation.log),
+                "sha256": validation.digest,
+                "seen_by_fit": validation.data_use is DataUse.FIT,
+                "partial": validation.partial,
+                "held_out": validation.data_use is DataUse.HOLDOUT,
+                "same_configuration": validation.same_configuration,
+                "rows": validation.rows,
+                "relative_error_percent": _error(validation.error),
+                "picture": str(drawn[validation.log]) if validation.log in drawn else None,
+            }
+            for validation in validations
+        ],
+        "together": {"relative_error_percent": _error(together(validations))} if validations else None,
+    }
+
+
+def cross_document(found: CrossValidation) -> dict[str, Any]:
+    """Build the part of `validate --json` that Tables 5 to 8 show."""
+    return {
+        "calibrations": list(found.calibrations),
+        "runs": [_checked(run) for run in found.runs],
+        "payloads": [_weighed(run, found) for run in found.weighed],
+    }
+
+
+def _checked(run: CheckedRun) -> dict[str, Any]:
+    return {
+        "log": str(run.log),
+        "condition": run.condition,
+        "relative_error_percent": {label: _error(error) for label, error in run.errors.items()},
+        "left_out": run.left_out or None,
+        "seen_by": list(run.seen_by),
+    }
+
+
+def _weighed(run: WeighedRun, found: CrossValidation) -> dict[str, Any]:
+    return {
+        "log": str(run.log),
+        "payload": run.payload.name,
+        "mounting": run.payload.mounting,
+        "weighed_kg": run.weighed_kg,
+        "with_bare_runs": found.with_bare_runs,
+        "masses": {
+            label: {"reason": mass.reason}
+            if isinstance(mass, Failure)
+            else {
+                "mass_kg": mass.mass_kg,
+                "std_percent": mass.std_percent,
+                "std_with_gains_percent": mass.std_with_gains_percent,
+                "error_percent": mass.error_percent,
+            }
+            for label, mass in run.masses.items()
+        },
+    }
+
+
+def _error(error: RelativeError) -> dict[str, Any]:
+    return {"axes": error.axes, "total": error.total}
+
+
+def _error_table(calibration: Calibration, validations: tuple[Validation, ...]) -> Table:
+    """Relative error of each log, axis by axis."""
+    axes = [gain.axis for gain in calibration.gains]
+    headings = ("log", *axes, "total", "")
+    table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
+    for validation in validations:
+        name = terminal_text(validation.run)
+        table.add_row(name, *_error_cells(validation.error), validation.data_use.value)
+    if len(validations) > 1:
+        table.add_row("together", *_error_cells(together(validations)))
+    table.add_row("fit", *_error_cells(calibration.relative_error_percent))
+    return table
+
+
+def _error_cells(error: RelativeError) -> list[str]:
+    return [percent_text(value) for value in (*error.axes, error.total)]
