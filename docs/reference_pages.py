@@ -267,7 +267,7 @@ def api() -> str:
 def gates() -> str:
     """Return the table of all gates, in the order in which they are checked."""
     head = "| gate | refuses if | default limit | do |\n|---|---|---|---|\n"
-    rows = [f"| {row.gate.value} | {row.closed_when} | {row.limit} | {row.remedy} |" for row in GATES]
+    rows = [f"| {row.gate.value} | {row.fails_if} | {row.limit} | {row.remedy} |" for row in GATES]
     return head + "\n".join(rows)
 
 

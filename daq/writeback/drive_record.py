@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,9 +19,9 @@ from daq.config.cell import Cell
 from daq.config.yaml_file import StrictModel
 from daq.errors import ConfigurationInconsistent, ControllerUnfit
 from daq.files import read_regular, replace_file
+from daq.writeback.file_access import next_order
 from drivers.profiles.profile import Parameter, ParameterKind
 
-_STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.json")
 _MAX_BYTES = 2**20
 _U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
@@ -107,12 +107,7 @@ def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple
         OSError: from the file system.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    stamp, count = now.astimezone(UTC).strftime(_STAMP), 0
-    taken = _names(folder)
-    if taken and taken[-1][:2] >= (stamp, count):
-        # A clock set back, or two writes in one second, must not make an older record look newer.
-        stamp, count = taken[-1][0], taken[-1][1] + 1
-    path = folder / f"{stamp}{f'-{count}' if count else ''}.json"
+    path = folder / f"{next_order([(stamp, count) for stamp, count, _ in _names(folder)], now)}.json"
     body = DriveRecord(cell=cell, at=now.isoformat(), who=who, drives=drives).model_dump(mode="json")
     text = json.dumps({**body, "sha256": _digest(body)}, indent=1, ensure_ascii=False)
     replace_file(path, (text + "\n").encode())

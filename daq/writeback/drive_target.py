@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -27,7 +26,7 @@ from daq.writeback.drive_record import (
     write_record,
 )
 from daq.writeback.file_access import exclusive_writer
-from daq.writeback.request import Edit, Finding, GainChange
+from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes
 from daq.writeback.target import Written
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
@@ -92,15 +91,9 @@ class DriveTarget:
             ControllerUnfit: an object cannot hold a gain to within its σ.
             DriverError: see `drivers.canopen.parameters.read_parameters`.
         """
-        objects, names = self._objects(), self.cell.axis_names
+        objects = self._objects()
+        require_axes(calibration, self.cell.axis_names)
         gains = {gain.axis: gain for gain in calibration.gains}
-        if sorted(gains) != sorted(names) or len(gains) != len(calibration.gains):
-            raise CalibrationRefused(
-                "calibration",
-                found=f"gains of {', '.join(gain.axis for gain in calibration.gains) or 'no axis'}",
-                expected=f"one for each axis of the cell: {', '.join(names)}",
-                remedy="give the calibration and the configuration of the same cell",
-            )
         pairs = [(axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)]
         base = read_parameters(self.network, pairs)
         planned = [_change(gains[value.axis.name], value, one) for value, one in zip(base, objects, strict=True)]
@@ -235,21 +228,12 @@ def content_of(base: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, .
 def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple[GainChange, ParameterWrite]:
     """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
     parameter, factor = gain_object.parameter, gain_object.factor
-    key = f"node {value.axis.node_id}, {parameter}"
-    writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    word = _word(key, gain, gain_object) if writable else value.word
-    change = GainChange(
-        axis=gain.axis,
-        key=key,
-        line=0,
-        old=value.value / factor,
-        new=parameter.value(word) / factor if writable else gain.value,
-        std=gain.std,
-        unit=gain.unit,
-        nameplate=gain.nameplate,
-        spelling=f"{parameter.value(word):.9g}" if writable else "",
-    )
-    return change, ParameterWrite(value.axis, parameter, word)
+    key, word = f"node {value.axis.node_id}, {parameter}", value.word
+    planned = None
+    if is_writable(gain):
+        word = _word(key, gain, gain_object)
+        planned = (parameter.value(word) / factor, f"{parameter.value(word):.9g}")
+    return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(value.axis, parameter, word)
 
 
 def _word(key: str, gain: Gain, gain_object: GainObject) -> int:

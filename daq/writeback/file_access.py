@@ -14,7 +14,7 @@ import os
 import re
 import shlex
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -196,9 +196,6 @@ def _is_at(descriptor: int, path: Path) -> bool:
     return False
 
 
-_STAMP = "%Y%m%dT%H%M%SZ"
-
-
 @dataclass(frozen=True, slots=True)
 class Backup:
     """A backup beside a controller file; all but its content is in its name.
@@ -252,12 +249,7 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
     Raises:
         OSError: from the file system; no backup is left.
     """
-    stamp, count = now.astimezone(UTC).strftime(_STAMP), 0
-    taken = backups(target)
-    if taken and (taken[-1].stamp, taken[-1].count) >= (stamp, count):
-        # A clock set back, or two writes in one second, must not make an older backup look newer.
-        stamp, count = taken[-1].stamp, taken[-1].count + 1
-    order = f"{stamp}-{count}" if count else stamp
+    order = next_order([(one.stamp, one.count) for one in backups(target)], now)
     backup = target.with_name(f"{target.name}.{order}.{short_digest(before)}-{short_digest(after)}.bak")
     # The lock excludes every other drivegain, and time and count are beyond every backup: the name is free.
     try:
@@ -266,6 +258,21 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
         backup.unlink(missing_ok=True)
         raise
     return backup
+
+
+def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
+    """Return time and count for the name of a backup, later in order than all others.
+
+    A clock that was set back, or two writes in one second, must not make an older one look newer.
+
+    Args:
+        taken: time and count of the others, in order.
+        now: wall-clock time.
+    """
+    stamp, count = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ"), 0
+    if taken and taken[-1] >= (stamp, count):
+        stamp, count = taken[-1][0], taken[-1][1] + 1
+    return f"{stamp}-{count}" if count else stamp
 
 
 def put_back(backup: Path, target: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,9 +28,9 @@ from daq.writeback.file_access import (
     require_existing,
     resolve_links,
 )
-from daq.writeback.formats.document import ControllerDocument, decode, read_bytes
-from daq.writeback.formats.scalar import Scalar, rewrite_gain
-from daq.writeback.request import Edit, Finding, GainChange, short_digest
+from daq.writeback.formats.document import decode, read_bytes
+from daq.writeback.formats.scalar import ControllerDocument, Scalar, rewrite_gain
+from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes, short_digest
 from daq.writeback.target import Written, audited_change
 from ident.calibration import Calibration, Gain
 
@@ -123,7 +122,8 @@ class FileTarget:
 
     def plan(self, calibration: Calibration) -> FileEdit:
         """See `Target.plan`."""
-        self._check_axes(calibration)
+        require_axes(calibration, self.keys)
+        self._check_keys()
         require_existing(self.file)
         content = read_bytes(self.file)
         now = decode(content, str(self.file), self.format)
@@ -209,15 +209,7 @@ class FileTarget:
             raise
         return Written(edit, backup)
 
-    def _check_axes(self, calibration: Calibration) -> None:
-        axes = [gain.axis for gain in calibration.gains]
-        if sorted(axes) != sorted(self.keys):
-            raise CalibrationRefused(
-                "calibration",
-                found=f"gains of {', '.join(axes) or 'no axis'}",
-                expected=f"one for each axis of the controller file: {', '.join(self.keys) or 'none'}",
-                remedy="give the calibration and the configuration of the same cell",
-            )
+    def _check_keys(self) -> None:
         keys = list(self.keys.values())
         doubled = sorted({key for key in keys if keys.count(key) > 1})
         if doubled:
@@ -254,19 +246,9 @@ class FileTarget:
 
 
 def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
-    writable = math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
-    put = rewrite_gain(scalar, gain.value, gain.std, factor) if writable else None
-    return GainChange(
-        axis=gain.axis,
-        key=scalar.key,
-        line=scalar.line,
-        old=scalar.value / factor,
-        new=gain.value if put is None else put.new,
-        std=gain.std,
-        unit=gain.unit,
-        nameplate=gain.nameplate,
-        spelling="" if put is None else put.spelling,
-    )
+    put = rewrite_gain(scalar, gain.value, gain.std, factor) if is_writable(gain) else None
+    planned = None if put is None else (put.new, put.spelling)
+    return GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned)
 
 
 def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[Finding, ...]:

@@ -1,6 +1,6 @@
-"""Keys and signatures as bytes and lines of text: the file formats of minisign, with Ed25519 (RFC 8032) and BLAKE2b.
+"""The file formats of minisign: keys and signatures with Ed25519 (RFC 8032) and BLAKE2b.
 
-Layouts as minisign's documentation gives them, numbers little-endian, each as base64 under a line of comment::
+Layouts from minisign's documentation, numbers little-endian, each as base64 under a line of comment::
 
     public key   "Ed" | key id 8 | public key 32
     secret key   "Ed" | kdf 2 | "B2" | salt 32 | opslimit 8 | memlimit 8 | key id 8 | seed 32 | public key 32 | check 32
@@ -9,7 +9,7 @@ Layouts as minisign's documentation gives them, numbers little-endian, each as b
 
 The last 104 bytes of a secret key are XORed with scrypt's key stream where kdf is "Sc"; then check is
 BLAKE2b-256("Ed" | key id | seed | public key). Where kdf is zero they are plain, and check is zero.
-Whatever does not fit is a ValueError that says what was found.
+Text that does not fit is a ValueError with what was found.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MEMLIMIT_ALLOWED, _OPSLIMIT_ALLOWED = 2**30, 2**26
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """What a signature is checked with.
+    """Key that a signature is checked with.
 
     Attributes:
         key_id: 8 bytes that name the key pair.
@@ -52,22 +52,22 @@ class PublicKey:
 
     @property
     def line(self) -> str:
-        """As `minisign -P` and a cell file take it."""
+        """One line, for `minisign -P` and a cell file."""
         return base64.b64encode(_PUBLIC.pack(_KEY, self.key_id, self.key)).decode()
 
     @property
     def text(self) -> str:
-        """Of its file."""
-        return f"{UNTRUSTED}minisign public key {_spelt(self.key_id)}\n{self.line}\n"
+        """Content of its file."""
+        return f"{UNTRUSTED}minisign public key {_shown(self.key_id)}\n{self.line}\n"
 
     def check(self, signature: Signature, content: bytes) -> None:
-        """Whether the holder of the secret key signed these bytes and this comment.
+        """Check that the holder of the secret key signed these bytes and this comment.
 
         Raises:
-            ValueError: no, with what does not fit.
+            ValueError: they did not.
         """
         if signature.key_id != self.key_id:
-            raise ValueError(f"a signature of key {_spelt(signature.key_id)}, not of {_spelt(self.key_id)}")
+            raise ValueError(f"a signature of key {_shown(signature.key_id)}, not of {_shown(self.key_id)}")
         public = Ed25519PublicKey.from_public_bytes(self.key)
         try:
             public.verify(signature.signature, hashlib.blake2b(content).digest())
@@ -81,23 +81,23 @@ class PublicKey:
 
 @dataclass(frozen=True, slots=True)
 class SecretKey:
-    """What a file is signed with, in memory only.
+    """Key that a file is signed with, in memory only.
 
     Attributes:
         key_id: 8 bytes that name the key pair.
-        seed: Ed25519 private key, 32 bytes; out of every representation.
+        seed: Ed25519 private key, 32 bytes; hidden from every representation.
     """
 
     key_id: bytes
     seed: bytes
 
     def __repr__(self) -> str:
-        """Without the secret: this must not reach a log by way of a traceback."""
-        return f"SecretKey({_spelt(self.key_id)})"
+        """Hide the secret, which must not reach a log with a traceback."""
+        return f"SecretKey({_shown(self.key_id)})"
 
     @property
     def public(self) -> PublicKey:
-        """The half that may be known."""
+        """The public half."""
         return PublicKey(self.key_id, Ed25519PrivateKey.from_private_bytes(self.seed).public_key().public_bytes_raw())
 
     def sign(self, content: bytes, comment: str) -> Signature:
@@ -107,10 +107,10 @@ class SecretKey:
         return Signature(self.key_id, signed, comment, private.sign(signed + comment.encode()))
 
     def text(self, password: str, salt: bytes) -> str:
-        """Of its file.
+        """Format its file.
 
         Args:
-            password: empty for a key that nothing but the file's mode protects.
+            password: empty for a key that only the file's mode protects.
             salt: 32 random bytes.
         """
         public = self.public.key
@@ -143,14 +143,14 @@ class Signature:
 
     @property
     def text(self) -> str:
-        """Of its file."""
+        """Content of its file."""
         signed = base64.b64encode(_SIGNATURE.pack(_PREHASHED, self.key_id, self.signature)).decode()
         whole = base64.b64encode(self.whole).decode()
         return f"{UNTRUSTED}signature by drivegain\n{signed}\n{TRUSTED}{self.comment}\n{whole}\n"
 
 
 def parse_public_key(text: str) -> PublicKey:
-    """A public key: its one line of base64, or its file with the comment above.
+    """Parse a public key: its one line of base64, or its file with the comment above.
 
     Raises:
         ValueError: it is none.
@@ -163,12 +163,12 @@ def parse_public_key(text: str) -> PublicKey:
 
 
 def is_encrypted(text: str) -> bool:
-    """Whether a secret key asks for a password; raises ValueError where the text is none."""
+    """Whether a secret key requires a password; raises ValueError where the text is none."""
     return _parts(text)[0] == _SCRYPT
 
 
 def parse_secret_key(text: str, password: str = "") -> SecretKey:
-    """A secret key from its file.
+    """Parse the file of a secret key.
 
     Raises:
         ValueError: it is none, or does not decrypt with this password.
@@ -188,7 +188,7 @@ def parse_secret_key(text: str, password: str = "") -> SecretKey:
 
 
 def parse_signature(text: str) -> Signature:
-    """A signature from its file.
+    """Parse the file of a signature.
 
     Raises:
         ValueError: it is none, or not a prehashed one.
@@ -236,7 +236,7 @@ def _stream(password: str, salt: bytes, opslimit: int, memlimit: int) -> bytes:
 
 
 def _scrypt_parameters(opslimit: int, memlimit: int) -> tuple[int, int]:
-    """N and p for r = 8, as libsodium picks them from its two limits (crypto_pwhash_scryptsalsa208sha256)."""
+    """Return N and p for r = 8, as libsodium derives them from its two limits (crypto_pwhash_scryptsalsa208sha256)."""
     opslimit = max(opslimit, 32768)
     quick = opslimit < memlimit // 32
     largest = opslimit // 32 if quick else memlimit // 1024
@@ -248,6 +248,6 @@ def _xor(left: bytes, right: bytes) -> bytes:
     return bytes(a ^ b for a, b in zip(left, right, strict=True))
 
 
-def _spelt(key_id: bytes) -> str:
-    """As minisign prints it."""
+def _shown(key_id: bytes) -> str:
+    """Format a key id as minisign prints it."""
     return key_id[::-1].hex().upper()

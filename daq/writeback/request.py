@@ -14,10 +14,10 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.config.policy import ApplyPolicy
-from daq.errors import UsageError
+from daq.errors import CalibrationRefused, UsageError
 from daq.files import sha256
 from daq.workflow.calibration_file import encode
-from ident.calibration import Calibration
+from ident.calibration import Calibration, Gain
 
 _DIGITS = 12
 """Hexadecimal digits of SHA-256 in the name of a backup and in --base: 48 bits distinguish a few hundred contents."""
@@ -97,6 +97,18 @@ class GainChange:
     nameplate: float
     spelling: str
 
+    @classmethod
+    def of(cls, gain: Gain, key: str, line: int, old: float, planned: tuple[float, str] | None) -> GainChange:
+        """Make the change of one gain.
+
+        Args:
+            gain: identified.
+            key, line, old: as the attributes.
+            planned: gain as it will be read back [unit], and its spelling; None where there is none to write.
+        """
+        new, spelling = planned or (gain.value, "")
+        return cls(gain.axis, key, line, old, new, gain.std, gain.unit, gain.nameplate, spelling)
+
     @property
     def change_percent(self) -> float:
         """Change from the gain in the controller [%]; inf from zero."""
@@ -161,6 +173,27 @@ class Edit:
     def base(self) -> str:
         """The value of --base that approves exactly this change."""
         return change_digest(self.before or b"", self.after)
+
+
+def require_axes(calibration: Calibration, axes: Collection[str]) -> None:
+    """Refuse a calibration that has not exactly one gain for each axis of the target.
+
+    Raises:
+        CalibrationRefused: it has not.
+    """
+    found = [gain.axis for gain in calibration.gains]
+    if sorted(found) != sorted(axes):
+        raise CalibrationRefused(
+            "calibration",
+            found=f"gains of {', '.join(found) or 'no axis'}",
+            expected=f"one for each axis of the cell: {', '.join(axes) or 'none'}",
+            remedy="give the calibration and the configuration of the same cell",
+        )
+
+
+def is_writable(gain: Gain) -> bool:
+    """Whether a gain can be written; one that cannot is refused by a gate."""
+    return math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0
 
 
 def short_digest(content: bytes) -> str:

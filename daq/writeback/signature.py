@@ -1,4 +1,4 @@
-"""Who stands for a calibration: a signature a person in a file beside it, which `minisign -V` checks too."""
+"""Signatures of a calibration: one file beside it for each person, which `minisign -V` checks too."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ _LARGEST_BYTES = 16_384
 
 
 def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicKey]:
-    """Make a key pair: `<name>.key`, readable by its owner alone, and `<name>.pub` for everybody.
+    """Make a key pair: `<name>.key`, readable by its owner alone, and `<name>.pub` for all.
 
     Args:
         folder: made where it is missing.
         name: of the person.
-        password: that opens the secret key; empty for one that only the file's mode protects.
+        password: of the secret key; empty for one that only the file's mode protects.
 
     Returns:
-        the file of the secret key, and the public key: its `line` goes into the cell file.
+        File of the secret key, and the public key, whose `line` goes into the cell file.
 
     Raises:
         UsageError: not a name for a file.
@@ -74,7 +74,7 @@ def needs_password(secret_key: Path) -> bool:
 
 
 def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None) -> Path:
-    """Put a signature of the file's bytes beside it; an earlier one of the same name gives way.
+    """Write a signature of the file's bytes beside it; it replaces an earlier one of the same name.
 
     Args:
         file: a calibration.
@@ -84,13 +84,13 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
         at: time for the trusted comment, aware; None leaves it out.
 
     Returns:
-        the signature's file, `<file>.<name>.minisig`.
+        File of the signature, `<file>.<name>.minisig`.
 
     Raises:
         UsageError: not a name for a file.
         UsageError: no secret key, another password, or a plain key that others may read.
         CalibrationMissing: the file cannot be read.
-        UsageError: something that is no signature stands where it would go.
+        UsageError: another file has the name of the signature.
         OutputFailed: from the file system.
     """
     path = signature_path(file, _checked(name))
@@ -110,23 +110,23 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
 
 
 def signature_path(file: Path, name: str) -> Path:
-    """Where the signature of this person is looked for."""
+    """Return the file of a person's signature."""
     return file.with_name(f"{file.name}.{name}{SUFFIX}")
 
 
 def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = None) -> tuple[str, ...]:
-    """Who of the trusted has signed a file.
+    """Find the trusted persons who have signed a file.
 
     Args:
         file: a calibration; only its name is used where `content` is given.
-        trusted: public key by name, each its line of base64. Signatures of others are not looked at.
-        content: what was read of the file already, so that what is checked is what is used.
+        trusted: public key by name, each its line of base64. Signatures of others are ignored.
+        content: bytes of the file where it was read already, so that the checked bytes are the used ones.
 
     Returns:
-        the names whose valid signature stands beside the file, in the order of `trusted`.
+        Names with a valid signature beside the file, in the order of `trusted`.
 
     Raises:
-        SignatureInvalid: a trusted person's signature is there and does not fit the file: one of the two was changed.
+        SignatureInvalid: the signature of a trusted person does not fit the file: one of the two was changed.
         ConfigurationInconsistent: a public key is none, or two names share one: they would be one person.
         CalibrationMissing: the file cannot be read.
     """
@@ -143,14 +143,14 @@ def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = N
                     str(path),
                     found=_spelled(error),
                     expected=f"the signature of {name} for {file.name} as it is now",
-                    remedy=f"have {name} look at the calibration and sign it again, or remove the signature",
+                    remedy=f"have {name} review the calibration and sign it again, or remove the signature",
                 ) from error
             found.append(name)
     return tuple(found)
 
 
 def public_keys(trusted: Mapping[str, str]) -> dict[str, PublicKey]:
-    """The trusted persons' keys, each checked.
+    """Parse and check the keys of the trusted persons.
 
     Raises:
         ConfigurationInconsistent: see `signers_of`.
@@ -200,7 +200,7 @@ def _secret_key(path: Path, password: str) -> SecretKey:
             str(path),
             found=f"a key without a password that others may read (mode {mode:04o})",
             expected="mode 0600",
-            remedy=f"if nobody else had it: chmod 600 {path}; otherwise make a new key",
+            remedy=f"if no other user had it: chmod 600 {path}; otherwise make a new key",
         )
     return key
 
@@ -226,7 +226,7 @@ def _spelled(error: Exception) -> str:
 
 
 def _is_in_the_way(path: Path) -> bool:
-    """Whether something stands there that is no earlier signature: a pipe, a folder, a file of another kind."""
+    """Whether the name is taken by another thing than a signature: a pipe, a folder, a file of another kind."""
     if not path.exists():
         return False
     try:
@@ -252,7 +252,7 @@ def _read_signed(file: Path) -> bytes:
 
 
 def _write_new(path: Path, text: str, mode: int) -> None:
-    # O_EXCL: whoever makes a key at the same time keeps it. The mode is right before a byte of the secret is in it.
+    # O_EXCL: a key that is made at the same time stays. The mode is set before a byte of the secret is written.
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     with os.fdopen(descriptor, "wb") as stream:
         os.fchmod(descriptor, mode)

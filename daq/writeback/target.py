@@ -20,7 +20,7 @@ from daq.config.cell import Cell
 from daq.errors import CalibrationRefused
 from daq.ledger.audit import AuditAction, AuditRecorder
 from daq.writeback.gates.gate import GateContext, Refusal, refusal_error
-from daq.writeback.gates.table import closed_gates
+from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, GainChange, Request
 from drivers.canopen.parameters import ParameterChange
 from ident.calibration import Calibration
@@ -102,7 +102,7 @@ class Proposal(Generic[E]):
     Attributes:
         target: where it would be made.
         edit: the change.
-        refusals: closed gates; only a proposal without any can be applied.
+        refusals: failed checks; only a proposal without any can be applied.
         evidence: digests of what the change rests on, for the audit.
     """
 
@@ -113,7 +113,7 @@ class Proposal(Generic[E]):
 
     @property
     def error(self) -> CalibrationRefused:
-        """The error for a proposal with closed gates."""
+        """The error for a proposal with failed checks."""
         return refusal_error(self.edit.subject, self.refusals)
 
 
@@ -126,7 +126,7 @@ def propose(target: Target[E], request: Request) -> Proposal[E]:
         DriverError: from the drives.
     """
     edit = target.plan(request.calibration)
-    refusals = closed_gates(GateContext(request, edit, target.cell))
+    refusals = check_gates(GateContext(request, edit, target.cell))
     return Proposal(target, edit, refusals, request.evidence)
 
 
@@ -143,7 +143,7 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
         the change, None where there was nothing to write.
 
     Raises:
-        CalibrationRefused: a gate is closed, with every one of them.
+        CalibrationRefused: a check failed; every failed one is listed.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """

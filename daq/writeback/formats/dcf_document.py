@@ -1,4 +1,4 @@
-"""A device configuration file (CiA 306 DCF): where the gains of drives stand, and the same bytes with others there.
+"""Find the gains in a device configuration file (CiA 306 DCF).
 
 A number is decimal, or hexadecimal after `0x`. An integer with another zero before it (`010`) is octal to CiA 306 and
 decimal to many a tool: it is refused, not guessed.
@@ -11,20 +11,10 @@ from __future__ import annotations
 
 import configparser
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import (
-    CORRECT_KEY,
-    IntegerStyle,
-    KeyPath,
-    Scalar,
-    check_leaves,
-    check_text,
-    spliced,
-    unfit,
-)
+from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, IntegerStyle, KeyPath, Leaves, Scalar, unfit
 
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
@@ -56,54 +46,26 @@ _REALS = (0x08, 0x11)
 
 
 @dataclass(frozen=True, slots=True)
-class DcfDocument:
-    """A DCF as it was read.
-
-    Attributes:
-        name: what to call it in messages.
-        text: all of it, each byte a character (ISO 8859-1), so that nothing is lost whatever encoding it was meant in.
-    """
-
-    name: str
-    text: str
+class DcfDocument(ControllerDocument):
+    """A DCF as it was read: each byte a character (ISO 8859-1), so that nothing is lost in whatever encoding it is."""
 
     @property
     def content(self) -> bytes:
-        """The text as it stands in the file."""
+        """The text as bytes of the file."""
         return self.text.encode("latin-1")
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the values of some objects, in their order.
-
-        Raises:
-            ControllerUnfit: an object is not there, is there twice, or has no number that can be changed on its own.
-        """
+        """See `ControllerDocument.locate`."""
         sections = _sections(self.text)
         return tuple(self._locate(sections, key) for key in keys)
 
-    def with_values(self, spelling: Mapping[str, str]) -> DcfDocument:
-        """The same text with other values of some objects, read back by two parsers.
+    def readings(self) -> tuple[Leaves, Leaves]:
+        """Read with our parser and with configparser."""
+        return _read(self), _parsed(self)
 
-        Raises:
-            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
-        """
-        changed = DcfDocument(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling))
-        changed.check_against(self, spelling)
-        return changed
-
-    def check_against(self, before: DcfDocument, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named values alone, for our reader and configparser.
-
-        Raises:
-            ControllerUnfit: it differs in more, or in less.
-        """
-        sections = _sections(before.text)
-        targets: dict[KeyPath, str] = {
-            (self._section(sections, key).title, _VALUE): number for key, number in spelling.items()
-        }
-        for leaves in (_read, _parsed):
-            check_leaves(self.name, leaves(before), leaves(self), targets)
-        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
+    def leaf(self, key: str) -> KeyPath:
+        """Return section and entry of an object's value."""
+        return (self._section(_sections(self.text), key).title, _VALUE)
 
     def _section(self, sections: list[_Section], key: str) -> _Section:
         match = _KEY.fullmatch(key)
@@ -165,7 +127,7 @@ class DcfDocument:
         return Scalar(key, float(value), entry.value, entry.start, entry.end, entry.line, style)
 
     def _style(self, entries: dict[str, _Entry], key: str, kind: int) -> IntegerStyle:
-        """The integers of a type within the limits that the file gives them."""
+        """Return the integers of a type within the limits of the file."""
         bits, signed = _INTEGERS[kind]
         lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
         whole = IntegerStyle(bits, lowest, highest)
@@ -202,7 +164,7 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True)
 class _Section:
-    """What stands under one `[title]`, keys and titles in lower case: CiA 306 does not tell them apart."""
+    """The entries under one `[title]`; keys and titles in lower case, as CiA 306 ignores the case."""
 
     title: str
     line: int
@@ -210,7 +172,7 @@ class _Section:
 
 
 def dcf_document(content: bytes, name: str) -> DcfDocument:
-    """A DCF from its bytes.
+    """Parse a DCF.
 
     Raises:
         ControllerUnfit: they are no text, or in an encoding of two bytes a character.
@@ -226,13 +188,13 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
 
 
 def _named(title: str) -> tuple[int, int] | None:
-    """Index and subindex that a title names: `2003sub1` and `2003sub01` are one object; None where it names none."""
+    """Parse index and subindex of a title (`2003sub1` and `2003sub01` are one object); None where it names none."""
     match = _TITLE.fullmatch(title)
     return None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
 
 
 def _sections(text: str) -> list[_Section]:
-    """The sections in their order; comments and what is no `name=value` are passed over."""
+    """Split the text into sections; comments and lines other than `name=value` are skipped."""
     sections: list[_Section] = []
     for number, line in enumerate(_LINE.finditer(text), start=1):
         written = line[1].removeprefix(_BYTE_ORDER_MARK) if number == 1 else line[1]
@@ -260,7 +222,7 @@ def _read(document: DcfDocument) -> dict[KeyPath, str]:
 
 
 def _parsed(document: DcfDocument) -> dict[KeyPath, str]:
-    """The leaves as configparser sees them."""
+    """Read the leaves with configparser."""
     parser = configparser.RawConfigParser(
         strict=False,
         allow_no_value=True,

@@ -1,6 +1,6 @@
-"""A controller's JSON: where its gains stand, and the same text with other numbers there.
+"""Find the gains in a controller's JSON.
 
-Source: RFC 8259. Stricter than it where readers differ: no key twice, at most MAX_DEPTH lists in lists.
+Source: RFC 8259. Stricter where readers differ: no key twice, at most MAX_DEPTH lists in lists.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import CORRECT_KEY, DottedDocument, KeyPath, Leaves, Scalar, unfit, utf8
+from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
@@ -26,16 +26,16 @@ _SPACE = re.compile(r"[ \t\r\n]*")
 
 
 @dataclass(frozen=True, slots=True)
-class JsonDocument(DottedDocument):
-    """A JSON file as it was read; both our scanner and Python's reader must see the same in it."""
+class JsonDocument(ControllerDocument):
+    """A JSON file as it was read; our scanner and Python's parser must see the same in it."""
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """See `DottedDocument.locate`; a file with a key twice is refused."""
+        """See `ControllerDocument.locate`; a file with a key twice is refused."""
         leaves = _Scan(self.name, self.text).leaves()
         return tuple(self._locate(leaves, key) for key in keys)
 
     def readings(self) -> tuple[Leaves, Leaves]:
-        """Our scanner's and Python's."""
+        """Read with our scanner, and with Python's parser."""
         scanned = _Scan(self.name, self.text).leaves()
         return {path: leaf.text for path, leaf in scanned.items()}, _loaded(self.text, self.name)
 
@@ -65,7 +65,7 @@ class JsonDocument(DottedDocument):
 
 @dataclass(frozen=True, slots=True)
 class _Leaf:
-    """A token of the text that is a value."""
+    """A value in the text."""
 
     kind: str
     text: str
@@ -73,7 +73,7 @@ class _Leaf:
 
 
 def json_document(content: bytes, name: str) -> JsonDocument:
-    """A JSON document from its bytes.
+    """Parse a JSON document.
 
     Raises:
         ControllerUnfit: they are not UTF-8.
@@ -82,7 +82,7 @@ def json_document(content: bytes, name: str) -> JsonDocument:
 
 
 class _Scan:
-    """One way through the text."""
+    """A scan of the text."""
 
     def __init__(self, name: str, text: str) -> None:
         self._name = name
@@ -91,7 +91,7 @@ class _Scan:
         self._found: dict[KeyPath, _Leaf] = {}
 
     def leaves(self) -> dict[KeyPath, _Leaf]:
-        """Every value with its place, and `{}` or `[]` with the size of every object and list.
+        """Return every value with its place, and `{}` or `[]` with the size of every object and list.
 
         Raises:
             ControllerUnfit: this is no JSON, or a key is there twice.
@@ -171,7 +171,7 @@ class _Scan:
 
 
 def _loaded(text: str, name: str) -> dict[KeyPath, str]:
-    """The leaves as Python's own reader sees them; its numbers stay text."""
+    """Read the leaves with Python's parser; numbers stay text."""
     try:
         tree = json.loads(text.removeprefix(_BYTE_ORDER_MARK), parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as error:

@@ -1,18 +1,19 @@
-"""One number in the text of a controller's document, and the same text with other numbers."""
+"""One number in the text of a controller's file, and the base class of all formats.
+
+A format finds the numbers (`locate`) and reads the text with its parsers (`readings`). The rest is the same for every
+format: only the characters of the named numbers are replaced, and the new text is read back and compared.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 from daq.errors import ControllerUnfit
-
-# How a gain is written into a controller file.
-
 
 _EXPONENT = re.compile(r"([eE])[-+]?([0-9]+)$")
 _INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)|0[xX][0-9a-fA-F]+")
@@ -24,7 +25,7 @@ class IntegerStyle:
 
     Attributes:
         bits: of the type.
-        lowest, highest: what is allowed.
+        lowest, highest: limits.
     """
 
     bits: int
@@ -32,7 +33,7 @@ class IntegerStyle:
     highest: int
 
     def read(self, text: str) -> int:
-        """The integer.
+        """Parse an integer.
 
         Raises:
             ValueError: it is none, is ambiguous (a leading zero is octal to CiA 306), or has too many bits.
@@ -47,7 +48,7 @@ class IntegerStyle:
         return value
 
     def spell(self, value: int, like: str) -> str:
-        """As text; in hexadecimal with at least as many digits, and in that case, where `like` is."""
+        """Format an integer; in hexadecimal where `like` is, with at least as many digits and in the same case."""
         if like[:2] not in ("0x", "0X"):
             return str(value)
         digits = f"{value % (1 << self.bits):0{len(like) - 2}x}"
@@ -55,16 +56,16 @@ class IntegerStyle:
 
 
 def spell(value: float, std: float, like: str = "") -> str:
-    """A gain as text: two digits beyond the first digit of σ, at least five significant, no more than a float has.
+    """Format a gain: two digits beyond the first digit of σ, at least five significant, no more than a float has.
 
-    The text has a point always, and its exponent a sign, so that no reader takes it for an integer or for text
-    (YAML 1.1 knows no 1e3).
+    The text always has a point, and its exponent a sign: no reader takes it for an integer or for text (YAML 1.1 has no
+    1e3).
 
     Args:
         value: not zero [unit].
         std: standard deviation [unit].
-        like: how the number that it replaces is written. Its exponent, its plus and at least as many decimals are
-            kept: they are the habit of whoever reads the file.
+        like: text of the number that it replaces. Its exponent, its plus and at least as many decimals are kept, as the
+            file's readers are used to them.
     """
     exponent = _EXPONENT.search(like)
     magnitude = math.floor(math.log10(abs(value)))
@@ -93,12 +94,12 @@ class Scalar:
     """One number in the text.
 
     Attributes:
-        key: where it is, as the cell configuration names it.
+        key: its key in the cell configuration.
         value: the number.
-        text: how it is written.
+        text: the number as it is written.
         start, end: its characters in the text, quotes outside.
         line: from 1.
-        integer: what integers the document allows there, None where any decimal number may stand.
+        integer: style of the integers that are allowed there; None where any decimal number is.
     """
 
     key: str
@@ -110,18 +111,18 @@ class Scalar:
     integer: IntegerStyle | None = None
 
     def read(self, text: str) -> float:
-        """The number that another text would stand for in this place."""
+        """Return the number that another text would mean in this place."""
         return float(text) if self.integer is None else float(self.integer.read(text))
 
     def spell(self, value: float, std: float) -> str:
-        """A number as it is written in this place.
+        """Format a number for this place.
 
         Args:
             value: finite, not zero [unit of the document].
-            std: its standard deviation; what rounding to an integer may cost at most.
+            std: its standard deviation, which bounds the error of rounding to an integer.
 
         Raises:
-            ControllerUnfit: only integers may stand here, and none is near enough or in range.
+            ControllerUnfit: only integers are allowed here, and none is near enough or in range.
         """
         if self.integer is None:
             return spell(value, std, self.text)
@@ -136,7 +137,7 @@ class Scalar:
         if rounded == 0 or 0 < std < abs(rounded - value):
             raise ControllerUnfit(
                 self.key,
-                found=f"{value:.6g} ± {std:.2g}, which the integer {rounded} does not tell",
+                found=f"{value:.6g} ± {std:.2g}, which the integer {rounded} does not represent",
                 expected="a rounding below σ",
                 remedy="this object is too coarse: write the gain to another one, or in a finer unit by its factor in "
                 "`controller.gains`; nothing was written",
@@ -146,11 +147,11 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class RewrittenGain:
-    """A gain as it would stand in a document whose unit may be another.
+    """A gain in a document, whose unit may be another.
 
     Attributes:
         old, new: gain there now, and as it would be read back from the new text [gain unit].
-        spelling: the new number as it would stand in the document; that of now where it is the same number.
+        spelling: the new number in the document; unchanged text where it is the same number.
     """
 
     old: float
@@ -173,79 +174,16 @@ def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) 
     spelling = scalar.spell(factor * value, abs(factor) * std)
     number = scalar.read(spelling)
     if number == scalar.value:
-        spelling = scalar.text  # the same number in the human's own spelling is no change
+        spelling = scalar.text  # the same number in another spelling is no change
     return RewrittenGain(scalar.value / factor, number / factor, spelling)
 
 
-def spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) -> str:
-    """The same text with other numbers in some places, each named by its key."""
-    for scalar in sorted(scalars, key=lambda s: s.start, reverse=True):
-        text = text[: scalar.start] + spelling[scalar.key] + text[scalar.end :]
-    return text
-
-
-def check_leaves(
-    name: str, old: Leaves, new: Leaves, targets: Mapping[KeyPath, str], strip: Callable[[str], str] = str
-) -> None:
-    """Refuse unless a document differs from what it was in the named numbers alone, for one parser.
-
-    Args:
-        name: of the document.
-        old, new: its leaves before and after.
-        targets: the new number, as text, by its path.
-        strip: takes off what a reader of that format overlooks around a number.
-
-    Raises:
-        ControllerUnfit: it differs in more, or in less.
-    """
-    others = [path for path in old.keys() | new.keys() if path not in targets and old.get(path) != new.get(path)]
-    wrong = [path for path, number in targets.items() if strip(new.get(path, "")) != number]
-    if others or wrong:
-        raise ControllerUnfit(
-            name,
-            found=f"another value at {', '.join(sorted('.'.join(path) for path in [*wrong, *others]))}",
-            expected="the new gains and nothing else changed",
-            remedy="nothing was written; write these gains as plain numbers in the file",
-        )
-
-
-def check_text(name: str, text: str, expected: str) -> None:
-    """Refuse a text that is not the one that was worked out: comments, order and spacing are seen here alone.
-
-    Raises:
-        ControllerUnfit: they differ.
-    """
-    if text != expected:
-        at = next(
-            (i for i, (a, b) in enumerate(zip(text, expected, strict=False)) if a != b), min(map(len, (text, expected)))
-        )
-        raise ControllerUnfit(
-            name,
-            found=f"other characters on line {text.count(chr(10), 0, at) + 1} than were meant",
-            expected="the new gains and nothing else changed",
-            remedy="nothing was written; look at a new dry run",
-        )
-
-
-def unfit(
-    name: str, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
-) -> ControllerUnfit:
-    """The error for a place that holds no number that can be changed on its own."""
-    return ControllerUnfit(f"{name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written")
-
-
-CORRECT_KEY = "correct `controller.gains` of the cell configuration"
-
-
-# A controller's file in UTF-8 whose numbers are named by dotted paths, as YAML and JSON have them.
-
-
 @dataclass(frozen=True, slots=True)
-class DottedDocument(ABC):
-    """A file as it was read; a number is named by its dotted path (`drives.J1.gain`, `gains.0`).
+class ControllerDocument(ABC):
+    """A controller's file as it was read.
 
     Attributes:
-        name: what to call it in messages.
+        name: of the file, for messages.
         text: all of it, a byte order mark and the line ends included.
     """
 
@@ -254,57 +192,102 @@ class DottedDocument(ABC):
 
     @property
     def content(self) -> bytes:
-        """The text as it stands in the file."""
+        """The text as bytes of the file."""
         return self.text.encode()
 
     @abstractmethod
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the numbers at some dotted paths, in their order.
+        """Find the numbers of some keys, in their order.
 
         Raises:
-            ControllerUnfit: the file does not parse, or a path leads to no number that can be changed on its own.
+            ControllerUnfit: the file does not parse, or a key leads to no number that can be changed on its own.
         """
 
     @abstractmethod
-    def readings(self) -> tuple[Leaves, Leaves]:
-        """The leaves as two parsers that have nothing in common see them.
+    def readings(self) -> tuple[Leaves, ...]:
+        """Return the leaves as each of the format's parsers sees them; two that have nothing in common, if possible.
 
         Raises:
-            ControllerUnfit: one of them cannot read it.
+            ControllerUnfit: a parser cannot read the text.
         """
+
+    def leaf(self, key: str) -> KeyPath:
+        """Return the path of a key's number among the leaves; here a dotted one (`drives.J1.gain`, `gains.0`)."""
+        return tuple(key.split("."))
+
+    def number(self, leaf: str) -> str:
+        """Return the number in the text of a leaf, without what readers of the format ignore around it."""
+        return leaf
 
     def with_values(self, spelling: Mapping[str, str]) -> Self:
-        """The same text with other numbers at some dotted paths, read back by both parsers.
+        """Replace some numbers in the text, and check the result with `check_against`.
 
         Args:
-            spelling: the new number, as text, by dotted path.
+            spelling: the new number, as text, by its key.
 
         Raises:
-            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
+            ControllerUnfit: as `locate`, or the new text has another change than these.
         """
-        changed = type(self)(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling))
+        changed = replace(self, text=_spliced(self.text, self.locate(tuple(spelling)), spelling))
         changed.check_against(self, spelling)
         return changed
 
     def check_against(self, before: Self, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone, for both parsers.
+        """Refuse unless this file differs from `before` in the named numbers alone, for every parser and as text.
 
         Raises:
             ControllerUnfit: it differs in more, or in less.
         """
-        targets: dict[KeyPath, str] = {tuple(key.split(".")): number for key, number in spelling.items()}
+        targets = {before.leaf(key): number for key, number in spelling.items()}
         for old, new in zip(before.readings(), self.readings(), strict=True):
-            check_leaves(self.name, old, new, targets)
-        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
+            paths = [path for path in old.keys() | new.keys() if path not in targets and old.get(path) != new.get(path)]
+            paths += [path for path, number in targets.items() if self.number(new.get(path, "")) != number]
+            if paths:
+                raise ControllerUnfit(
+                    self.name,
+                    found=f"another value at {', '.join(sorted('.'.join(path) for path in paths))}",
+                    expected="the new gains and nothing else changed",
+                    remedy="nothing was written; write these gains as plain numbers in the file",
+                )
+        # Comments, order and spacing are compared here alone.
+        expected = _spliced(before.text, before.locate(tuple(spelling)), spelling)
+        if self.text != expected:
+            same = next(
+                (i for i, (a, b) in enumerate(zip(self.text, expected, strict=False)) if a != b),
+                min(len(self.text), len(expected)),
+            )
+            raise ControllerUnfit(
+                self.name,
+                found=f"other characters on line {self.text.count(chr(10), 0, same) + 1} than planned",
+                expected="the new gains and nothing else changed",
+                remedy="nothing was written; take a new dry run",
+            )
+
+
+def _spliced(text: str, scalars: Sequence[Scalar], spelling: Mapping[str, str]) -> str:
+    """Replace the numbers in some places, each named by its key."""
+    for scalar in sorted(scalars, key=lambda s: s.start, reverse=True):
+        text = text[: scalar.start] + spelling[scalar.key] + text[scalar.end :]
+    return text
+
+
+CORRECT_KEY = "correct `controller.gains` of the cell configuration"
+
+
+def unfit(
+    name: str, key: str, found: str, remedy: str, expected: str = "one decimal number of its own"
+) -> ControllerUnfit:
+    """Make the error for a place that holds no number that can be changed on its own."""
+    return ControllerUnfit(f"{name}: {key}", found=found, expected=expected, remedy=f"{remedy}; nothing was written")
 
 
 def utf8(content: bytes, name: str, kind: str) -> str:
-    """The text of a file.
+    """Decode a file.
 
     Args:
         content: of the file.
-        name: what to call it in messages.
-        kind: what it should be.
+        name: of the file, for messages.
+        kind: its format.
 
     Raises:
         ControllerUnfit: it is not UTF-8.

@@ -1,23 +1,20 @@
-"""A controller's XML: where its gains stand, and the same bytes with other numbers there.
+"""Find the gains in a controller's XML.
 
 A number is named by a path from the root as it is written, prefixes included: `Robot/Axis[@name='J1']/Gain` is the text
 of an element, `Robot/Axis[2]/@gain` an attribute. It is read as an xs:double: decimal, whatever zeros it begins with
 (`010` is 10). A document type is refused: without one there are no entities of the document's own, and nothing to fetch
-or to unfold.
+or to expand.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import CORRECT_KEY, KeyPath, Scalar, check_leaves, check_text, spliced, unfit
-
-# XML as expat tells it: a tree with the places of its elements in the file, for `xml_document`.
-
+from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit
 
 TEXT = "text()"
 _ENCODING_OF_NONE = "utf-8"
@@ -30,7 +27,7 @@ class Element:
     Attributes:
         label: its name, and its number in the file: a path from the root would grow with the depth.
         start, end: of its start tag's `<`, and of its end tag's.
-        pieces: what stands between its elements: text, comments, instructions, each in its place.
+        pieces: text, comments and instructions between its elements, each in its place.
     """
 
     name: str
@@ -44,7 +41,7 @@ class Element:
 
     @property
     def end(self) -> int:
-        """Of its end tag's `<`; that of its start tag where it is empty."""
+        """Place of its end tag's `<`; that of its start tag where it is empty."""
         return self.ends[0]
 
 
@@ -53,9 +50,9 @@ class ParsedXml:
     """A file as expat sees it.
 
     Attributes:
-        root: its element.
-        around: what has the root, and comments beside it, for pieces.
-        encoding: that it declares.
+        root: its root element.
+        around: parent of the root, with the comments beside it.
+        encoding: as declared.
     """
 
     root: Element
@@ -83,7 +80,7 @@ def parse(content: bytes, name: str) -> ParsedXml:
 
 
 class _Reader:
-    """What expat tells, as a tree; a way without recursion, however deep the file is."""
+    """Build the tree from expat's events, without recursion however deep the file is."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -146,55 +143,37 @@ _ATTRIBUTE = re.compile(r"\s+([^\s=/>]+)\s*=\s*(?:'([^']*)'|\"([^\"]*)\")")
 
 
 @dataclass(frozen=True, slots=True)
-class XmlDocument:
+class XmlDocument(ControllerDocument):
     """An XML file as it was read.
 
     Attributes:
-        name: what to call it in messages.
-        text: all of it, a byte order mark and the line ends included.
-        encoding: that it was read in, and is written in.
+        encoding: of the file.
     """
 
-    name: str
-    text: str
     encoding: str
 
     @property
     def content(self) -> bytes:
-        """The text as it stands in the file."""
+        """The text as bytes of the file."""
         return self.text.encode(self.encoding)
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """Find the numbers at some paths, in their order.
-
-        Raises:
-            ControllerUnfit: the file does not parse, has a document type, or a path leads to no number or to several.
-        """
+        """See `ControllerDocument.locate`; a file with a document type is refused."""
         content = self.content
         root = parse(content, self.name).root
         return tuple(self._locate(content, root, key) for key in keys)
 
-    def with_values(self, spelling: Mapping[str, str]) -> XmlDocument:
-        """The same text with other numbers at some paths, read back and compared.
+    def readings(self) -> tuple[Leaves]:
+        """Read every attribute, piece of text, comment and instruction, and the order of the elements."""
+        return (dict(_leaves(self)),)
 
-        Raises:
-            ControllerUnfit: as `locate`, or the new text does not say what was meant and nothing else.
-        """
-        changed = XmlDocument(self.name, spliced(self.text, self.locate(tuple(spelling)), spelling), self.encoding)
-        changed.check_against(self, spelling)
-        return changed
+    def leaf(self, key: str) -> KeyPath:
+        """Return the path of an element's text, or of an attribute."""
+        return self._find(parse(self.content, self.name).root, key).leaf
 
-    def check_against(self, before: XmlDocument, spelling: Mapping[str, str]) -> None:
-        """Refuse unless this file differs from `before` in the named numbers alone: as text, and as expat reads it.
-
-        Raises:
-            ControllerUnfit: it differs in more, or in less.
-        """
-        root = parse(before.content, self.name).root
-        targets = {self._find(root, key).leaf: number for key, number in spelling.items()}
-        old, new = dict(_leaves(before)), dict(_leaves(self))
-        check_leaves(self.name, old, new, targets, lambda text: text.strip(_SPACE))
-        check_text(self.name, self.text, spliced(before.text, before.locate(tuple(spelling)), spelling))
+    def number(self, leaf: str) -> str:
+        """Return a number without the blanks around it."""
+        return leaf.strip(_SPACE)
 
     def _locate(self, content: bytes, root: Element, key: str) -> Scalar:
         place = self._find(root, key)
@@ -242,7 +221,7 @@ class XmlDocument:
         return _Place(element, attribute)
 
     def _steps(self, key: str) -> tuple[list[_Step], str | None]:
-        """The elements of a path, and its attribute."""
+        """Split a path into its elements and its attribute."""
         steps: list[_Step] = []
         at = 1 if key.startswith("/") else 0
         while (match := _STEP.match(key, at)) is not None:
@@ -287,7 +266,7 @@ class _Place:
 
     @property
     def leaf(self) -> KeyPath:
-        """Its key among the leaves."""
+        """Path among the leaves."""
         return (self.element.label, f"{TEXT}[1]" if self.attribute is None else f"@{self.attribute}")
 
 
@@ -296,7 +275,7 @@ class _Step:
     """One part of a path.
 
     Attributes:
-        written: as it stands in the path.
+        written: as in the path.
         name: of the element.
         having: attributes with their values.
         number: among those, from 1; None where there must be one alone.
@@ -308,7 +287,7 @@ class _Step:
     number: int | None
 
     def choose(self, elements: list[Element]) -> list[Element]:
-        """Those that the step means."""
+        """Select the elements that the step means."""
         meant = [
             element
             for element in elements
@@ -318,7 +297,7 @@ class _Step:
 
 
 def xml_document(content: bytes, name: str) -> XmlDocument:
-    """An XML document from its bytes.
+    """Parse an XML document.
 
     Raises:
         ControllerUnfit: they are no XML, have a document type, or are in an encoding in which ASCII is not one byte a
@@ -342,7 +321,7 @@ def xml_document(content: bytes, name: str) -> XmlDocument:
 
 
 def _leaves(document: XmlDocument) -> Iterator[tuple[KeyPath, str]]:
-    """Every attribute, every piece of text, comment and instruction, and the order of the elements."""
+    """Walk over all leaves of a document."""
     waiting = [parse(document.content, document.name).around]
     while waiting:
         element = waiting.pop()

@@ -1,4 +1,4 @@
-"""A controller's YAML: where its gains stand, and the same text with other numbers there."""
+"""Find the gains in a controller's YAML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from daq.errors import ControllerUnfit
-from daq.writeback.formats.scalar import CORRECT_KEY, DottedDocument, KeyPath, Leaves, Scalar, unfit, utf8
+from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 _OCTAL = re.compile(r"[-+]?0[0-9]+")
@@ -23,25 +23,25 @@ _FLOAT = "tag:yaml.org,2002:float"
 
 
 @dataclass(frozen=True, slots=True)
-class YamlDocument(DottedDocument):
+class YamlDocument(ControllerDocument):
     """A YAML file as it was read.
 
     ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
     """
 
-    # A frozen text has one tree; to make it is what takes the time here.
+    # A frozen text has one tree, and composing it is expensive.
     _composed: list[Node] = field(default_factory=list, init=False, repr=False, compare=False)
     _readings: list[tuple[Leaves, Leaves]] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
-        """See `DottedDocument.locate`."""
+        """See `ControllerDocument.locate`."""
         root = self._root()
         references = Counter[int]()
         _count_references(root, references)
         return tuple(self._locate(root, key, references) for key in keys)
 
     def readings(self) -> tuple[Leaves, Leaves]:
-        """YAML 1.2's and 1.1's."""
+        """Read as YAML 1.2 and as YAML 1.1."""
         if not self._readings:
             self._readings.append((_leaves(self._root()), _leaves(_composed_1_1(self.text, self.name))))
         return self._readings[0]
@@ -67,14 +67,14 @@ class YamlDocument(DottedDocument):
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
-        # An anchor or a tag may stand before the number; an escape within quotes makes its text another than its value.
+        # An anchor or a tag may precede the number; an escape within quotes makes its text another than its value.
         opened = self.text[start - 1 : start] == quote if quote else self._begins(node, start)
         if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
             raise unfit(self.name, key, f"{node.value!r:.60}", "write a plain decimal number")
         if _OCTAL.fullmatch(node.value):
             found = f"{node.value!r:.60}, which is octal to readers of YAML 1.1 and decimal to those of 1.2"
             raise unfit(self.name, key, found, "write it without leading zeros")
-        # Anchor and tag stand before the number. A new gain has a point, and is no integer even where this one is.
+        # Anchor and tag precede the number. A new gain has a point, and is no integer even where this one is.
         tags = [part for part in self.text[node.start_mark.index : start].split() if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
             raise unfit(self.name, key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
@@ -105,7 +105,7 @@ class YamlDocument(DottedDocument):
 
 
 def yaml_document(content: bytes, name: str) -> YamlDocument:
-    """A YAML document from its bytes.
+    """Parse a YAML document.
 
     Raises:
         ControllerUnfit: they are not UTF-8.
@@ -164,7 +164,7 @@ def _count_references(node: Node, references: Counter[int]) -> None:
 
 
 def _leaves(root: Any) -> dict[KeyPath, str]:
-    """Every scalar of a tree by its path, and the size of every list and mapping.
+    """Return every scalar of a tree by its path, and the size of every list and mapping.
 
     The two parsers have unrelated node classes whose parts have the same names. A node that an alias repeats is
     followed once: it is the same text.

@@ -42,7 +42,7 @@ class Gate(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """One closed gate: found, expected, and what to do."""
+    """One failed check: found, expected, and what to do."""
 
     gate: Gate
     subject: str
@@ -85,11 +85,11 @@ class GateContext:
 
 
 def refusal_error(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
-    """Make the error for at least one closed gate; several are listed one a line.
+    """Make the error for at least one failed check; several are listed one a line.
 
     Args:
         target: what was not written.
-        refusals: the closed gates.
+        refusals: the failed checks.
     """
     if len(refusals) == 1:
         only = refusals[0]

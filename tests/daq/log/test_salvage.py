@@ -27,7 +27,7 @@ from daq.log.writer import LogWriter
 from daq.workflow.calibration_file import as_document, decode, encode, save
 from daq.workflow.fit import Reading
 from daq.writeback.gates.gate import Gate, GateContext
-from daq.writeback.gates.table import closed_gates
+from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
 from drivers.stream.sample import CellEvent, EventKind
 from tests.daq.calibrations import demo_calibration
@@ -246,8 +246,8 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     again = decode(encode(partial), "calibration.yaml")
     assert again == partial
     edit, now = Edit(subject="", before=b"", after=b""), datetime(2025, 1, 2, tzinfo=UTC)
-    assert not closed_gates(GateContext(Request(good, now), edit))
-    assert [refusal.gate for refusal in closed_gates(GateContext(Request(again, now), edit))] == [Gate.PARTIAL]
+    assert not check_gates(GateContext(Request(good, now), edit))
+    assert [refusal.gate for refusal in check_gates(GateContext(Request(again, now), edit))] == [Gate.PARTIAL]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
 
 

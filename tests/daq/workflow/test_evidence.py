@@ -29,7 +29,7 @@ from daq.workflow.plan_file import load_plan
 from daq.workflow.record import Clocks, record
 from daq.workflow.safeguards import check_entered_mass
 from daq.writeback.gates.gate import Gate, GateContext
-from daq.writeback.gates.table import closed_gates
+from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
 from ident.calibration import Calibration
 from ident.data.run import Recording, Run
@@ -183,7 +183,7 @@ def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
 def _refused(calibration: Calibration) -> list[tuple[Gate, str]]:
     context = GateContext(Request(calibration, NOW), Edit(subject="", before=b"", after=b""))
     # The runs were generated and not recorded: they have no digests.
-    return [(one.gate, one.subject) for one in closed_gates(context) if one.gate is not Gate.SOURCES]
+    return [(one.gate, one.subject) for one in check_gates(context) if one.gate is not Gate.SOURCES]
 
 
 def test_what_an_effect_reports_is_not_credited_to_the_gains(with_effect: Fit) -> None:

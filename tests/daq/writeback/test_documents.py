@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from daq.config.controller import ControllerFormat
 from daq.errors import ControllerUnfit
 from daq.writeback.formats.dcf_document import DcfDocument
-from daq.writeback.formats.document import MAX_BYTES, ControllerDocument, decode, format_of, read_bytes
+from daq.writeback.formats.document import FORMATS, MAX_BYTES, decode, format_of, read_bytes
 from daq.writeback.formats.json_document import JsonDocument
-from daq.writeback.formats.scalar import rewrite_gain
+from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.formats.xml_document import XmlDocument
 from daq.writeback.formats.yaml_document import YamlDocument
 
@@ -518,8 +518,8 @@ def test_an_integer_keeps_its_style_and_another_unit_its_factor(
 @pytest.mark.parametrize(
     ("key", "gain", "std", "factor", "says"),
     [
-        ("6076", 33.4, 0.1, 1.0, "33.4 ± 0.1, which the integer 33 does not tell"),
-        ("6076", 0.3, 0.5, 1.0, "the integer 0 does not tell"),
+        ("6076", 33.4, 0.1, 1.0, "33.4 ± 0.1, which the integer 33 does not represent"),
+        ("6076", 0.3, 0.5, 1.0, "the integer 0 does not represent"),
         ("6076", -3.0, 0.5, 1.0, "-3 for an integer of 0 to 4294967295"),
         ("2003:01", 0.4001, 1e-3, 1000.0, "0.4"),
         ("2003:01", 0.401, 1e-3, 1000.0, "401 for an integer of -400 to 400"),
@@ -580,6 +580,13 @@ def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) 
 )
 def test_the_name_gives_the_format(name: str, kind: ControllerFormat) -> None:
     assert format_of(name) is kind
+
+
+def test_every_format_has_a_reader_and_suffixes_of_its_own() -> None:
+    assert set(FORMATS) == set(ControllerFormat)
+    suffixes = [suffix for _, of_format in FORMATS.values() for suffix in of_format]
+    assert len(suffixes) == len(set(suffixes))
+    assert all(of_format for _, of_format in FORMATS.values())
 
 
 def test_the_configuration_may_give_the_format_instead() -> None:
