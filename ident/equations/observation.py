@@ -97,6 +97,14 @@ class Observation:
         mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
         return mixed, to_motor @ self.known()
 
+    def motor_columns(self) -> list[FloatArray]:
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, shape (p + 2, r)."""
+        linear, known = self.motor_torque()
+        return [
+            np.concatenate((current[None], columns, rest[None]))
+            for current, columns, rest in zip(self.current, linear, known, strict=True)
+        ]
+
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
@@ -123,7 +131,6 @@ class Observation:
     def system(self) -> System:
         """The same equations reduced to triangles."""
         linear, known = self.linear(), self.known()
-        mixed, known_at_motor = self.motor_torque()
         direction, width = self.drive_train.direction, linear.shape[1]
         joints = []
         for joint, used in enumerate(self.use):
@@ -131,10 +138,7 @@ class Observation:
             rows = np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))
             joints.append(triangle((rows.T,), len(rows)))
         motors, moves = [], []
-        whole = [
-            np.concatenate((current[None], columns, rest[None]))
-            for current, columns, rest in zip(self.current, mixed, known_at_motor, strict=True)
-        ]
+        whole = self.motor_columns()
         for columns, used in zip(whole, self.motor_use, strict=True):
             motors.append(triangle((columns[:, used].T,), width + 2))
         for move in np.unique(self.move):
