@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MIN_MOVES = 8
-"""With fewer, leaving one out in turn says little of the scatter, and folds of moves hold one each."""
+"""With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def ordered(self, order: IntArray) -> Linearisation:
-        """The same rows in another order."""
+        """Reorder the rows."""
         return replace(
             self,
             jacobian=self.jacobian[order],
@@ -148,7 +148,7 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
         scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (m, f).
     """
     hessian = grams.sum(axis=0)
-    # In units in which every unknown is seen equally well: kilograms stand beside kg m².
+    # In units in which every unknown is seen equally well: kilograms are beside kg m².
     unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
     rest = (hessian - grams) * np.outer(unit, unit)
     return -np.stack([_solved(matrix, score * unit) * unit for matrix, score in zip(rest, scores, strict=True)])

@@ -1,4 +1,4 @@
-"""The rows themselves of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for whoever looks into a residual.
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for everything that looks into a residual.
 
 An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a usual length.
 """
@@ -110,7 +110,7 @@ class Observation:
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
     def only(self, rows: BoolArray) -> Observation:
-        """The same observation with other rows left out."""
+        """Keep some of the rows."""
         return replace(
             self,
             current=self.current[:, rows],
@@ -125,11 +125,11 @@ class Observation:
         )
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """The same observation with further columns of W, shape (n, extra, r) [Nm per unit]."""
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
         return replace(self, columns=self.columns + columns, robot=np.concatenate((self.robot, torque), axis=1))
 
     def system(self) -> System:
-        """The same equations reduced to triangles."""
+        """Reduce the rows to triangles."""
         linear, known = self.linear(), self.known()
         direction, width = self.drive_train.direction, linear.shape[1]
         joints = []

@@ -36,7 +36,7 @@ def relative_error(measured_nm: FloatArray, predicted_nm: FloatArray, use: BoolA
 
 
 def of_squares(size: FloatArray, left: FloatArray) -> RelativeError:
-    """The same from ‖Y_j‖² and ‖ρ_j‖² of each joint, both of shape (n,)."""
+    """Relative error from ‖Y_j‖² and ‖ρ_j‖² of each joint, both of shape (n,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         axes = 100.0 * np.sqrt(left / size)
         total = 100.0 * np.sqrt(left.sum() / size.sum())
@@ -93,7 +93,7 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance)[len(self.gains) :])
 
     def predicted_torque(self, observation: Observation) -> FloatArray:
-        """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r): what the model says the joints need."""
+        """W χ + W_uL χ_uL + W_kL χ_kL [Nm], shape (n, r)."""
         return np.asarray(np.einsum("jpr,p->jr", observation.linear(), self.parameters) + observation.known())
 
     def residual_torque(self, observation: Observation) -> FloatArray:
