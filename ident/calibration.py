@@ -69,7 +69,7 @@ class AcceptedEffect:
         error_before_percent, error_after_percent: of the axis, or in total for an effect on all motors, without and
             with the effect, on data that the fit did not use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or
             where these say nothing of it ‖e‖/‖v‖ of the motor that feels it most, on moves left out in turn.
-        ambiguity: families whose held-out score cannot be told from this one's.
+        ambiguity: families whose held-out score does not differ from this one's.
     """
 
     name: str
@@ -92,8 +92,8 @@ class Source:
         partial: it is what was saved of a recording that was never finished, or one with losses; nothing of
             it may reach a controller.
         payload: name of what was mounted; None without load, and in calibrations of earlier versions.
-        mass_kg: of it, as fitted; None where the fit was not told.
-        recording: what the log tells of its making; None in calibrations of earlier versions.
+        mass_kg: of it, as fitted; None where it was not declared.
+        recording: how the log was made; None in calibrations of earlier versions.
     """
 
     name: str
@@ -107,7 +107,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What is kept, shown, compared and written back.
+    """Gains, parameters and effects of a cell, with their errors and sources.
 
     Attributes:
         cell: name of the cell.
@@ -130,7 +130,8 @@ class Calibration:
             to compare.
         recording_configuration_sha256: of what of that configuration a recording depends on; None in calibrations of
             earlier versions.
-        session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where not all told.
+        session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where a run has no
+            clock.
     """
 
     cell: str

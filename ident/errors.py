@@ -4,8 +4,8 @@ IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 ├── TooFewMoves           uncertainty and left-out moves need more of them
-├── RankDeficient         the data cannot tell some unknowns apart
-├── PayloadUnseen         the runs that are said to carry the payload do not differ from the others by its weight
+├── RankDeficient         the data do not distinguish some unknowns
+├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
 ├── NotConverged          the iteration did not reach its optimum
 └── EffectRefused         an effect was asked for that does not exist or does not fit the axis
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 
 class IdentificationError(Exception):
-    """Root of the tree; carries the evidence as attributes and says it in its message."""
+    """Root of the tree; carries the evidence as attributes and in its message."""
 
     def __reduce__(self) -> tuple[object, ...]:
         # The arguments of `__init__` are not the message that `args` holds: without this, no process can hand one of
@@ -48,16 +48,16 @@ class TooFewMoves(IdentificationError):
 
 
 class RankDeficient(IdentificationError):
-    """The data cannot tell some unknowns apart."""
+    """The data do not distinguish some unknowns."""
 
     def __init__(self, reason: str, unknowns: tuple[str, ...]) -> None:
-        super().__init__(f"{reason} (unknowns that cannot be told: {', '.join(unknowns)})")
+        super().__init__(f"{reason} (unknowns that cannot be identified: {', '.join(unknowns)})")
         self.reason = reason
         self.unknowns = unknowns
 
 
 class PayloadUnseen(IdentificationError):
-    """The runs that are said to carry the payload do not differ from the others by its weight."""
+    """The runs declared loaded do not differ from the others by the weight of the payload."""
 
     def __init__(self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = "") -> None:
         super().__init__(

@@ -1,4 +1,4 @@
-"""From a calibration to torques and currents: the identified model at work, without the rows that it was fitted on."""
+"""Predict torques and currents of a motion with a calibration, without the rows that it was fitted to."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
-    """W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) with the effects: what the joints need for a motion.
+    """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
 
     Args:
         calibration: parameters, effects and gains.
@@ -30,8 +30,8 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         joint torque [Nm; N for a prismatic joint] at full rate, shape (k, n).
 
     Raises:
-        ModelError: the calibration speaks of another robot.
-        DataUnfit: it does not know the run's way of mounting the payload.
+        ModelError: the calibration is of another robot.
+        DataUnfit: it does not know how the run's payload is mounted.
         EffectRefused: it holds an effect that does not exist.
     """
     gains = _gains(calibration, model)
@@ -48,9 +48,9 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
 
 
 def predict_current(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
-    """v = (T τ)/g: the current references that the motors need for a motion.
+    """Predict the current references of a motion, v = (T τ)/g.
 
-    Args and errors as of `predict_torque`.
+    Arguments and errors are those of `predict_torque`.
 
     Returns:
         current references [A] at full rate, shape (k, n).
@@ -60,7 +60,7 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
 
 
 def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
-    """Y = V g (eq. 4 through R): joint torque [Nm] from current references [A], both of shape (k, n).
+    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), both of shape (k, n).
 
     Raises:
         ModelError: the calibration has another number of gains.
@@ -160,8 +160,8 @@ def _check_mounting(payload: Payload, identified: dict[str, float], mountings: s
     if both:
         raise DataUnfit(
             run,
-            f"says {', '.join(both)} of mounting {payload.mounting!r} beforehand, and the calibration has identified "
-            "the same: give each way of mounting a name of its own",
+            f"declares {', '.join(both)} of mounting {payload.mounting!r}, and the calibration identified the same: "
+            "give each way of mounting a name of its own",
         )
     foreign = sorted(set(identified) - set(LINK_PARAMETERS))
     if foreign:

@@ -1,4 +1,4 @@
-"""A run with its derivatives: low-passed positions, central differences, and which samples stand still."""
+"""A run with its derivatives: low-passed positions, central differences, and samples at standstill."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Dataset:
         valid: sample may be used.
         move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
         payload: what was mounted, None without load.
-        started_s: when the run began, on a clock that the runs of one session share; None where no one knows.
+        started_s: when the run began, on a clock that the runs of one session share; None without a clock.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Dataset:
 
 
 def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Dataset:
-    """Zero-phase low-pass of the positions, then central differences (paper §2.3).
+    """Filter the positions without phase, then take central differences (paper §2.3).
 
     Args:
         run: a recording of n joints.
@@ -85,10 +85,10 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         :, None
     ]
     moving = np.abs(velocity) >= speed_limit
-    # A motor's speed is told as that of its joint, which need not have its number.
+    # A motor's speed is seen at its joint, which need not have its number.
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
-    # One move holds all joints: without a log of moves, they part where every joint stands still.
+    # One move holds all joints: without a log of moves, they part where every joint is at standstill.
     move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
     move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
     return Dataset(
@@ -136,7 +136,7 @@ def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, condit
 
 
 def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> Dataset:
-    """A motion that nobody has recorded, for `ident.prediction`: joints, speeds and accelerations as they are given.
+    """Make a dataset of a motion that was not recorded, for `ident.prediction`.
 
     Args:
         motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each.

@@ -9,17 +9,17 @@ from numpy.typing import NDArray
 
 from ident.model.bodies import Payload
 
-# How a log came to be: evidence for whoever must say whether a calibration made of it may reach a controller.
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """What a log tells of its making; axes in their order.
+    """How a log was made: evidence for the gates before a controller; axes in their order.
 
     Attributes:
-        recorded_s: Unix time of its first sample [s]; None where it was imported and does not tell.
-        entered_kg: mass of the payload as it was entered at the recording, from the scale; None where nobody did.
-        serials: serial number of each amplifier, None for one that told none.
+        recorded_s: Unix time of its first sample [s]; None where an imported log does not contain it.
+        entered_kg: mass of the payload as it was entered at the recording, from the scale; None without an entry.
+        serials: serial number of each amplifier, None for one that reports none.
         saturated_percent: share of each axis's samples in which a limit acted [%].
         lost_cycles: SYNC cycles that are not in it.
         missing: samples in which each axis did not answer.
@@ -35,26 +35,23 @@ class Recording:
     controller_sha256: str | None
 
 
-FloatArray = NDArray[np.float64]
-
-
 @dataclass(frozen=True, slots=True)
 class Run:
     """One recording of n joints over k samples at a constant rate.
 
     Attributes:
-        name: what a person calls it (the log's stem).
+        name: for messages and reports (the log's stem).
         time_s: time of each sample [s], shape (k,), uniform.
         position_rad: joint positions [rad; m for a prismatic joint], shape (k, n).
         current_a: input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is
             Nm at the joint per that unit], shape (k, n).
         payload: what was mounted, or None without load.
-        move: number of the move that each sample belongs to, shape (k,), or None where no one wrote it down.
+        move: number of the move that each sample belongs to, shape (k,), or None where it was not recorded.
         digest: of the log it was read from (sha256, hex).
         valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
-        started_s: when the run began, on a clock that the runs of one session share [s]; None where no one knows.
-        partial: it is what was saved of a recording that was never finished, or one whose losses somebody accepted.
-        recording: what the log tells of its making; None where the run is from no log.
+        started_s: when the run began, on a clock that the runs of one session share [s]; None without a clock.
+        partial: it is what was saved of a recording that was never finished, or one whose losses were accepted.
+        recording: how the log was made; None where the run is from no log.
     """
 
     name: str

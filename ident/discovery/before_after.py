@@ -24,13 +24,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 
 from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
 from ident.discovery.loop import Evidence, Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
-from ident.equations.linearisation import Folds, cut, linearise
+from ident.equations.linearisation import Folds, cut, left_out_shifts, linearise
 from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate, RelativeError
 
@@ -245,13 +245,6 @@ def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> C
 def _gain_shifts(folds: Folds, estimate: Estimate) -> FloatArray:
     """Shift d_c of the gains when each move is left out, shape (m, n)."""
     count = len(estimate.gains)
-    shifts = np.zeros((folds.problem.moves, count))
     if estimate.gains_fixed:
-        return shifts
-    hessian = folds.move_hessian.sum(axis=0)
-    # A direction that only this move shows keeps its value from the whole data.
-    kept = np.diag(1e-10 * np.diag(hessian))
-    for move, (gram, score) in enumerate(zip(folds.move_hessian, folds.move_score, strict=True)):
-        step = linalg.cho_solve(linalg.cho_factor(hessian - gram + kept, lower=True), score)
-        shifts[move] = -(step * folds.problem.scale)[:count]
-    return shifts
+        return np.zeros((folds.problem.moves, count))
+    return (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]

@@ -1,7 +1,9 @@
-"""The problem around an estimate as a linear one: whitened residuals and their Jacobian, motor by motor.
+"""The problem around an estimate as a linear one, and everything that leaves moves out of it.
 
-e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see estimators/maximum_likelihood.py. The gain
-direction is built from the *predicted* torque, not the measured current, so that the noise does not enter it.
+The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see
+estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
+current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
+time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut`).
 """
 
 from __future__ import annotations
@@ -14,11 +16,14 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from ident.equations.observation import Observation
+from ident.equations.system import System
 from ident.errors import TooFewMoves
-from ident.estimators.estimate import MIN_MOVES
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+MIN_MOVES = 8
+"""With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +60,7 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def ordered(self, order: IntArray) -> Linearisation:
-        """The same rows in another order."""
+        """Reorder the rows."""
         return replace(
             self,
             jacobian=self.jacobian[order],
@@ -87,45 +92,110 @@ class Linearisation:
 def linearise(
     observation: Observation, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
 ) -> Linearisation:
-    """Around given gains [Nm/A], parameters and current noise [A] of each motor."""
-    linear, known = observation.motor_torque()
+    """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
     count = len(gains)
-    gamma = 1.0 / gains
-    jacobian, residual, currents, motors, clusters, sources = [], [], [], [], [], []
-    for motor in range(count):
+    parts, motors, clusters, sources = [], [], [], []
+    for motor, columns in enumerate(observation.motor_columns()):
         used = np.flatnonzero(observation.motor_use[motor])
-        columns = linear[motor][:, used]
-        torque = parameters @ columns + known[motor, used]
-        rows = np.zeros((len(used), count + len(parameters)))
-        # ∂(γ τ)/∂g = −γ² τ; in units of the gain itself, −γ τ.
-        rows[:, motor] = -gamma[motor] * torque / noise[motor]
-        rows[:, count:] = columns.T * (gamma[motor] / noise[motor])
-        jacobian.append(rows)
-        residual.append((observation.current[motor, used] - gamma[motor] * torque) / noise[motor])
-        currents.append(observation.current[motor, used] / noise[motor])
+        parts.append((*motor_jacobian(columns[:, used].T, motor, gains, parameters, noise), columns[0, used]))
         motors.append(np.full(len(used), motor))
         clusters.append(observation.move[used])
         sources.append(used)
-    matrix = np.concatenate(jacobian)
-    free = np.arange(count if gains_fixed else 0, matrix.shape[1])
-    norms = np.linalg.norm(matrix, axis=0)
+    jacobian, residual, current = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    motor_of = np.concatenate(motors)
+    free = np.arange(count if gains_fixed else 0, jacobian.shape[1])
+    norms = np.linalg.norm(jacobian, axis=0)
     unit = np.concatenate((gains, np.divide(1.0, norms[count:], where=norms[count:] > 0, out=np.ones(len(parameters)))))
-    matrix[:, count:] *= unit[count:]
     return Linearisation(
-        jacobian=matrix[:, free],
-        residual=np.concatenate(residual),
-        current=np.concatenate(currents),
-        motor=np.concatenate(motors),
+        jacobian=jacobian[:, free] * unit[free],
+        residual=residual,
+        current=current / noise[motor_of],
+        motor=motor_of,
         cluster=np.unique(np.concatenate(clusters), return_inverse=True)[1].astype(np.int64),
         source=np.concatenate(sources),
-        gamma=gamma,
+        gamma=1.0 / gains,
         noise=noise,
         free=free,
         scale=unit[free],
     )
 
 
-# What the model leaves: by axis, in-sample and on moves that were left out of the fit.
+def motor_jacobian(
+    rows: FloatArray, motor: int, gains: FloatArray, parameters: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """J = ∂(γ_i (T τ)_i/σ_i)/∂(g, χ, χ_uL) and e of one motor's equations, shapes (m, n + p) and (m,).
+
+    Args:
+        rows: [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], or the triangle of these, which has the same JᵀJ and Jᵀe.
+        motor: i.
+        gains, parameters: where to linearise.
+        noise: σ of each motor's current [A].
+    """
+    count = len(gains)
+    torque = rows[:, 1:-1] @ parameters + rows[:, -1]
+    scale = 1.0 / (gains[motor] * noise[motor])
+    jacobian = np.zeros((len(rows), count + len(parameters)))
+    jacobian[:, motor] = -scale / gains[motor] * torque  # ∂(γ τ)/∂g = −γ² τ
+    jacobian[:, count:] = scale * rows[:, 1:-1]
+    return jacobian, rows[:, 0] / noise[motor] - scale * torque
+
+
+def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
+    """Shift of the unknowns when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (m, f).
+
+    Args:
+        grams: G_c = J_cᵀJ_c of each cluster, shape (m, f, f).
+        scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (m, f).
+    """
+    hessian = grams.sum(axis=0)
+    # In units in which every unknown is seen equally well: kilograms are beside kg m².
+    unit = 1.0 / np.sqrt(np.where(np.diag(hessian) > 0.0, np.diag(hessian), 1.0))
+    rest = (hessian - grams) * np.outer(unit, unit)
+    return -np.stack([_solved(matrix, score * unit) * unit for matrix, score in zip(rest, scores, strict=True)])
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(linalg.cho_solve(linalg.cho_factor(matrix, lower=True), right))
+    except linalg.LinAlgError:  # a direction that only the cluster left out has seen
+        return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
+
+
+def jackknife_covariance(
+    system: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray, *, gains_fixed: bool
+) -> FloatArray:
+    """Covariance of (gains, parameters) from leaving out one move at a time, zero for fixed gains.
+
+    The residual of a geared robot is correlated over a move (lag one about 0.67): rows are not independent, moves
+    nearly are (MacKinnon & White 1985; for clusters Bell & McCaffrey 2002, CR3; docs/explanation/uncertainty.md).
+
+    Args:
+        system: of the fit.
+        gains, parameters: the estimate, gains in Nm/A, shapes (n,) and (p,).
+        noise: σ_i of each motor's current [A], shape (n,).
+        gains_fixed: the gains were given.
+
+    Returns:
+        shape (n + p, n + p).
+
+    Raises:
+        TooFewMoves: fewer than MIN_MOVES.
+    """
+    moves, count, size = len(system.moves), len(gains), len(gains) + len(parameters)
+    if moves < MIN_MOVES:
+        raise TooFewMoves(moves, MIN_MOVES)
+    free = slice(count if gains_fixed else 0, size)
+    grams, scores = np.zeros((moves, size, size)), np.zeros((moves, size))
+    for index, move in enumerate(system.moves):
+        for motor, rows in enumerate(move):
+            jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
+            grams[index] += jacobian.T @ jacobian
+            scores[index] += jacobian.T @ residual
+    shifts = left_out_shifts(grams[:, free, free], scores[:, free])
+    centred = shifts - shifts.mean(axis=0)
+    covariance = np.zeros((size, size))
+    covariance[free, free] = (moves - 1) / moves * (centred.T @ centred)
+    return covariance
 
 
 @dataclass(frozen=True, slots=True)

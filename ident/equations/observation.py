@@ -1,4 +1,4 @@
-"""The rows themselves of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for whoever looks into a residual.
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for everything that looks into a residual.
 
 An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a usual length.
 """
@@ -97,12 +97,20 @@ class Observation:
         mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
         return mixed, to_motor @ self.known()
 
+    def motor_columns(self) -> list[FloatArray]:
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, shape (p + 2, r)."""
+        linear, known = self.motor_torque()
+        return [
+            np.concatenate((current[None], columns, rest[None]))
+            for current, columns, rest in zip(self.current, linear, known, strict=True)
+        ]
+
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
     def only(self, rows: BoolArray) -> Observation:
-        """The same observation with other rows left out."""
+        """Keep some of the rows."""
         return replace(
             self,
             current=self.current[:, rows],
@@ -117,13 +125,12 @@ class Observation:
         )
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
-        """The same observation with further columns of W, shape (n, extra, r) [Nm per unit]."""
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
         return replace(self, columns=self.columns + columns, robot=np.concatenate((self.robot, torque), axis=1))
 
     def system(self) -> System:
-        """The same equations reduced to triangles."""
+        """Reduce the rows to triangles."""
         linear, known = self.linear(), self.known()
-        mixed, known_at_motor = self.motor_torque()
         direction, width = self.drive_train.direction, linear.shape[1]
         joints = []
         for joint, used in enumerate(self.use):
@@ -131,10 +138,7 @@ class Observation:
             rows = np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))
             joints.append(triangle((rows.T,), len(rows)))
         motors, moves = [], []
-        whole = [
-            np.concatenate((current[None], columns, rest[None]))
-            for current, columns, rest in zip(self.current, mixed, known_at_motor, strict=True)
-        ]
+        whole = self.motor_columns()
         for columns, used in zip(whole, self.motor_use, strict=True):
             motors.append(triangle((columns[:, used].T,), width + 2))
         for move in np.unique(self.move):

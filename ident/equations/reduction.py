@@ -52,7 +52,7 @@ class Layout:
 
     Attributes:
         joint: for each joint, indices into [V | W_st], ascending.
-        motor: for each motor, indices of W_st; its own current stands before them.
+        motor: for each motor, indices of W_st; its own current comes before them.
     """
 
     joint: tuple[IntArray, ...]

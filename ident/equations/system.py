@@ -61,7 +61,7 @@ class System:
         return any(bool(np.any(factor[:, -1])) for factor in self.joints.factors)
 
     def holding(self, values: Mapping[int, float]) -> System:
-        """The same equations with some parameters given: their columns join W_kL χ_kL.
+        """Give some parameters a value: their columns join W_kL χ_kL.
 
         Args:
             values: by index into ``columns``; zero takes a parameter out of the model (paper §4.2).
@@ -136,7 +136,7 @@ def require_known_payload(system: System) -> None:
 
 
 def require_distinct(system: System, *, gains: bool) -> None:
-    """Refuse rows that cannot tell their unknowns apart.
+    """Refuse rows that do not distinguish their unknowns.
 
     Args:
         system: of the fit.
@@ -155,7 +155,9 @@ def require_distinct(system: System, *, gains: bool) -> None:
     independent = base_parameters(columns, names).independent
     lost = tuple(name for index, name in enumerate(names) if index not in independent)
     if lost:
-        raise RankDeficient("payload and robot cannot be told apart: record the same robot without load too", lost)
+        raise RankDeficient(
+            "the data do not distinguish payload and robot: record the same robot without load too", lost
+        )
     if gains:
         for motor, factor in enumerate(system.motors.factors):
             if system.motors.rows[motor] and not np.any(factor[:, 0]):

@@ -1,4 +1,11 @@
-"""Triangular factors: everything that a linear estimator needs of millions of rows (TSQR)."""
+"""Triangular factors: everything that a linear estimator needs of millions of rows (TSQR).
+
+R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never held whole. R is
+unique up to the sign of its rows, and ‖R x‖ = ‖W x‖ for every x. Each step is Householder's (LAPACK ``tpqrt``, which
+knows that the upper part is a triangle), so R carries a backward error of some ε ‖column‖ in every column, whatever the
+condition number. The Gram matrix is twice as fast and squares the condition number: singular values below √ε ‖W‖ are
+lost in it (docs/evidence has both, measured).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +17,12 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 FloatArray = NDArray[np.float64]
+
+BLOCK_ROWS = 1024
+"""Rows folded in at once: 80 columns of them stay in a core's own cache."""
+
+REFLECTORS = 8
+"""Householder vectors applied together; wider blocks cost more inside themselves than they save on the rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +76,7 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Least squares with unit-norm columns inside: solution, (MᵀM)⁻¹ and singular values of M as given.
 
-    Scaling columns changes no least-squares solution, but spares digits where kilograms stand beside kg m².
+    Scaling columns changes no least-squares solution, but spares digits where kilograms are beside kg m².
     """
     norms = np.linalg.norm(matrix, axis=0)
     norms[norms == 0.0] = 1.0
@@ -76,24 +89,6 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
 def singular_values(matrix: FloatArray) -> FloatArray:
     """In decreasing order."""
     return np.asarray(np.linalg.svd(matrix, compute_uv=False), dtype=np.float64)
-
-
-# The R of a QR factorisation whose rows come piece by piece (TSQR): what is left of millions of rows in one triangle.
-#
-# R of the stack [R_before; new rows] is R of all rows so far, so that the observation matrix is never held whole. Each
-# step is Householder's (LAPACK ``tpqrt``, which knows that the upper part is a triangle), so R carries a backward
-# error
-# of some ε ‖column‖ in every column, whatever the condition number. The Gram matrix is twice as fast and squares the
-# condition number: singular values below √ε ‖W‖ are lost in it (docs/evidence/speed.md has both, measured).
-#
-# R is unique up to the sign of its rows; ‖R x‖ = ‖W x‖ for every x.
-
-
-BLOCK_ROWS = 1024
-"""Rows folded in at once: 80 columns of them stay in a core's own cache."""
-
-REFLECTORS = 8
-"""Householder vectors applied together; wider blocks cost more inside themselves than they save on the rest."""
 
 
 def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Every estimator on the same data, and how much its gains hang on what nobody can know: scaling and filters."""
+"""Compare the estimators, their filters and their scaling, and find the essential parameters (paper §4.2)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,16 @@ from ident.model.model import Model
 FloatArray = NDArray[np.float64]
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
-"""Of both cut-offs: an estimator that is told by data, not by filters, gives the same gains over two octaves."""
+"""Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""
+
+
+RATIO = 20.0
+"""r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """One way from a system to an estimate, with the scaling that it needs said."""
+    """An estimator with its scaling, by name."""
 
     name: str
     run: Callable[[System], Estimate]
@@ -97,7 +101,7 @@ def compare(
         model: the declared model.
         runs: gives the runs of the fit, anew at each call.
         conditioning: the declared filters.
-        progress: told what is being done.
+        progress: called with what is being done.
 
     Raises:
         DataUnfit: the runs cannot be used under the declared filters.
@@ -143,13 +147,6 @@ def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -
     )
 
 
-# Essential parameters: the few base parameters that these data need (paper §4.2).
-
-
-RATIO = 20.0
-"""r_σ; the paper finds 10 to 30 right, depending on the noise."""
-
-
 @dataclass(frozen=True, slots=True)
 class Removal:
     """A base parameter that was taken out, and its relative standard deviation at that step (eq. 11) [%]."""
@@ -160,7 +157,7 @@ class Removal:
 
 @dataclass(frozen=True, slots=True)
 class Essential:
-    """What is left, and what was taken out.
+    """Essential parameters of a system, and the others that were taken out.
 
     Attributes:
         system: without the columns that were taken out.

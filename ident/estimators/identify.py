@@ -23,7 +23,7 @@ from ident.model.model import Column, Model
 FloatArray = NDArray[np.float64]
 
 LARGEST_STD = 0.1
-"""Of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
+"""Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Identification:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Of W: base parameters, then effects."""
+        """Columns of W: base parameters, then effects."""
         return self.system.columns
 
     @property
@@ -69,7 +69,7 @@ def identify(
     method: Method = Method.ML,
     fixed_gains: FloatArray | None = None,
 ) -> Identification:
-    """One global step. Runs are read one after the other and none is kept.
+    """Identify all gains and parameters in one global step; runs are read one after the other and none is kept.
 
     Args:
         model: the declared model.

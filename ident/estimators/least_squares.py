@@ -1,4 +1,4 @@
-"""Ordinary and weighted least squares: IDIM-LS and IDIM-WLS (paper eqs. 7-11, 15, 16)."""
+"""Linear estimators of the paper: IDIM-LS, IDIM-WLS (eqs. 7-11, 15, 16) and IDIM-TLS (eqs. 17-23)."""
 
 from __future__ import annotations
 
@@ -68,11 +68,8 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
     )
 
 
-# Total least squares: the paper's IDIM-TLS (eqs. 17-23).
-
-
 class Scaling(Enum):
-    """TLS is not invariant to scale, so the scale is a choice that is said."""
+    """Scaling before TLS, which is not invariant to it."""
 
     NONE = "none"
     ROWS = "rows weighted per joint"  # the paper, §3.3
@@ -81,7 +78,7 @@ class Scaling(Enum):
 
 
 def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
-    """The right singular vector of W_tot's smallest singular value, scaled so that its last entry is one (eq. 18).
+    """Total least squares: the right singular vector of W_tot's smallest singular value, last entry one (eq. 18).
 
     Args:
         system: of at least one loaded and one unloaded run.

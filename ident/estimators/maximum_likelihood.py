@@ -15,10 +15,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.equations.linearisation import jackknife_covariance
 from ident.equations.system import System, require_known_payload, require_rows
 from ident.equations.triangles import Triangles, solve
 from ident.errors import NotConverged, RankDeficient
-from ident.estimators.estimate import Estimate, jackknife_covariance
+from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.method import Method
 

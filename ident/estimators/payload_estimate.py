@@ -1,4 +1,4 @@
-"""The payload of a run found with given gains: the check of gains that anybody can make with a scale (§4.3)."""
+"""Identify the payload of a run with given gains: a check of the gains with a scale (paper §4.3)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.equations.linearisation import jackknife_covariance
 from ident.equations.reduction import Cluster, Reduction, place_of
 from ident.equations.system import System, require_distinct
 from ident.equations.triangles import solve, triangle
 from ident.errors import DataUnfit, RankDeficient
-from ident.estimators.estimate import jackknife_covariance
 from ident.estimators.least_squares import ls, wls
 from ident.estimators.maximum_likelihood import noise_of
 from ident.model.base import BaseParameters
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PayloadEstimate:
-    """What the classical IDIM-WLS makes of a mounted body.
+    """Inertial parameters of a mounted body by the classical IDIM-WLS.
 
     Attributes:
         names: those of the ten parameters that the run shows, in the order of LINK_PARAMETERS.
@@ -98,7 +98,7 @@ def payload_on_known_robot(robot: FloatArray, loaded: Reduction, gains: FloatArr
 
 
 def as_one_body(reduction: Reduction) -> Reduction:
-    """The same rows with whatever was mounted taken as part of the last link: no payload, no unknowns of its own."""
+    """Take the payload as part of the last link: no unknowns of its own."""
     joints = tuple(triangle(factors, factors[0].shape[1]) for factors in zip(*reduction.joints, strict=True))
     clusters = tuple(replace(cluster, mounting=-1) for cluster in reduction.clusters)
     return replace(reduction, payloads=(), joints=(joints,), clusters=clusters)
@@ -148,7 +148,7 @@ def _weighed(system: System, gains: FloatArray) -> PayloadEstimate:
     (columns,) = system.payload_columns
     names = tuple(LINK_PARAMETERS[index] for index in columns)
     if "m" not in names:
-        raise RankDeficient("these moves do not tell the payload's mass from its other parameters", ("m",))
+        raise RankDeficient("these moves do not distinguish the payload's mass from its other parameters", ("m",))
     estimate = wls(system, gains)
     noise = noise_of(system.motors, 1.0 / gains, estimate.parameters, len(estimate.parameters))
     covariance = jackknife_covariance(system, gains, estimate.parameters, noise, gains_fixed=True)

@@ -1,4 +1,14 @@
-"""A body fixed to the last link: what is known of it, and what is not."""
+"""Bodies: the ten inertial parameters of a link or payload, and the matrix that is positive definite for real ones.
+
+With the inertia tensor I and the first moment h about the link frame's origin, and the mass m, the pseudo-inertia is
+
+    P = [ Σ   h ]        Σ = ½ tr(I)·1 − I = ∫ r rᵀ dm.
+        [ hᵀ  m ],
+
+P ≻ 0 holds for every distribution of positive mass, and only then: m > 0, I about the centre of mass ≻ 0 and the
+triangle inequality of its principal moments together (Wensing, Kim, Slotine: Linear Matrix Inequalities for Physically
+Consistent Inertial Parameter Identification, 2018). P is linear in the ten parameters: a linear matrix inequality.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +17,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-# The ten inertial parameters of a link, in the paper's order; a payload is a link too (paper §2.2).
-
+FloatArray = NDArray[np.float64]
 
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
-"""Inertia about the link frame's origin, first moments, mass."""
+"""Inertia about the link frame's origin, first moments, mass, in the paper's order; a payload is a link too (§2.2)."""
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
-"""Of the same."""
-
-
-FloatArray = NDArray[np.float64]
+_ROWS, _COLUMNS = np.triu_indices(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,22 +47,6 @@ class Payload:
         return np.array([self.known.get(name, 0.0) for name in LINK_PARAMETERS])
 
 
-# The pseudo-inertia matrix of a body: positive definite for every distribution of positive mass, and only then.
-#
-# With the inertia tensor I and the first moment h about the link frame's origin, and the mass m,
-#
-#     P = [ Σ   h ]        Σ = ½ tr(I)·1 − I = ∫ r rᵀ dm,
-#         [ hᵀ  m ],
-#
-# so P ≻ 0 says at once m > 0, I about the centre of mass ≻ 0 and the triangle inequality of its principal moments
-# (Wensing, Kim, Slotine: Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification,
-# 2018).
-# P is linear in the ten parameters: a linear matrix inequality.
-
-
-_ROWS, _COLUMNS = np.triu_indices(3)
-
-
 def pseudo_inertia(link: FloatArray) -> FloatArray:
     """P of a link's parameters in the order of LINK_PARAMETERS, shape (10,) → (4, 4) [kg m², kg m, kg]."""
     inertia = _symmetric(link[:6])
@@ -76,7 +66,7 @@ def link_parameters(pseudo: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A link as a URDF says it.
+    """Mass, centre and inertia of a link, as a URDF declares them.
 
     Attributes:
         mass_kg: of the link.

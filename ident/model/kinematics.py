@@ -1,4 +1,4 @@
-"""Where the links are: poses of all joint frames for many samples at once."""
+"""Motions of the joints, and the poses of all joint frames that follow from them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,22 @@ from ident.model.robot import JointKind, Robot
 FloatArray = NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
+
+    Attributes:
+        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i.
+    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i.
 
     Attributes:
         rotation: shape (n + 1, k, 3, 3).
@@ -56,19 +69,3 @@ def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
     cosine, sine = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
     outer = np.outer(axis, axis)
     return np.asarray(outer + cosine * (np.eye(3) - outer) + sine * skew)
-
-
-# How the joints move: what a regressor needs to know.
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
-
-    Attributes:
-        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
-    """
-
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray

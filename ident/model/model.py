@@ -13,12 +13,16 @@ from ident.model.kinematics import Motion
 from ident.model.regressor import fill_rigid
 from ident.model.robot import JointKind, Robot
 
-# The gears between motors and joints, as one matrix.
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
+"""Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveTrain:
-    """q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
+    """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
 
     Attributes:
         ratio: R, shape (n, n), invertible; row i belongs to motor i.
@@ -36,12 +40,12 @@ class DriveTrain:
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joint that each motor is told by: its own, or that of its largest ratio where it does not drive that."""
+        """The joint that each motor belongs to: its own, or that of its largest ratio where it does not drive that."""
         return tuple(i if row[i] != 0.0 else int(np.argmax(np.abs(row))) for i, row in enumerate(self.ratio))
 
     @property
     def reduction(self) -> FloatArray:
-        """N of each motor, shape (n,): its ratio to the joint that it is told by."""
+        """N of each motor, shape (n,): its ratio to the joint that it belongs to."""
         return np.asarray(self.ratio[np.arange(len(self.ratio)), list(self.joints)], dtype=np.float64)
 
     @property
@@ -58,14 +62,6 @@ class DriveTrain:
     def coupled(self) -> tuple[int, ...]:
         """Motors that turn with more than one joint: their rotor inertia and friction need columns of their own."""
         return tuple(i for i, row in enumerate(self.ratio) if np.count_nonzero(row) > 1)
-
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
-
-DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
-"""Of what acts along a joint, of its speed, and of a rotor's inertia seen there."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,7 @@ def moved_links(robot: Robot) -> tuple[tuple[int, ...], ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """What is constant of a link: X_f below each other, shape (6 f, 6), S, and C with V × S = C V."""
+    """Constants of a link: X_f below each other, shape (6 f, 6), S, and C with V × S = C V."""
 
     parent: int
     movers: tuple[int, ...]

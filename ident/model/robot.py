@@ -140,7 +140,7 @@ class _Frame:
 
 
 def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]:
-    """Return the links, the joints behind each (last name first, to be popped), and the link that is no one's child."""
+    """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
     try:
         robot = fromstring(urdf)
     except ParseError as error:
@@ -227,7 +227,7 @@ def _body(link: Element) -> Body:
 
 
 def _placed(body: Body, at: _Frame) -> Body:
-    """The same body, written in the frame of the joint that moves it."""
+    """Write a body in the frame of the joint that moves it."""
     centre = at.translation_m + at.rotation @ body.centre_m
     return Body(body.mass_kg, centre, at.rotation @ body.inertia_kg_m2 @ at.rotation.T)
 

@@ -185,7 +185,7 @@ def test_the_true_parameters_predict_the_recorded_current(
     ("payload", "words"),
     [
         (Payload("disc", "upside down", {"m": 4.59}), "'upside down', of which the calibration knows nothing.*'a'"),
-        (Payload("disc", "a", {"m": 4.59, "mx": -0.24}), "says mx of mounting 'a' beforehand"),
+        (Payload("disc", "a", {"m": 4.59, "mx": -0.24}), "declares mx of mounting 'a'"),
     ],
 )
 def test_a_payload_that_the_calibration_does_not_know(identified: Evidence, payload: Payload, words: str) -> None:

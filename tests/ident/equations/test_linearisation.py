@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ident.data.run import Run
-from ident.equations.linearisation import linearise
+from ident.equations.linearisation import left_out_shifts, linearise, motor_jacobian
 from tests.ident.recordings import Truth, gathered
 
 
@@ -25,3 +25,35 @@ def test_jacobian_is_the_slope_of_the_residual(truth: Truth, clean_runs: tuple[R
         step[around.free] = scaled * around.scale
         slope = (problem(step) - problem(-step)) / 2.0
         assert slope == pytest.approx(-around.jacobian @ scaled, abs=1e-4 * np.max(np.abs(slope)))
+
+
+def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
+    """By least squares on the rows that are left, in units that differ by a million."""
+    rng = np.random.default_rng(3)
+    jacobian = rng.normal(size=(10, 12, 4)) * np.array([1e-3, 1.0, 30.0, 1e3])
+    residual = rng.normal(size=(10, 12))
+    rows, whole = jacobian.reshape(-1, 4), residual.ravel()
+    estimate = np.linalg.lstsq(rows, whole, rcond=None)[0]
+    around = residual - jacobian @ estimate
+    grams = np.einsum("mri,mrj->mij", jacobian, jacobian)
+    shifts = left_out_shifts(grams, np.einsum("mri,mr->mi", jacobian, around))
+    for cluster, shift in enumerate(shifts):
+        kept = np.arange(10) != cluster
+        without = np.linalg.lstsq(jacobian[kept].reshape(-1, 4), residual[kept].ravel(), rcond=None)[0]
+        assert shift == pytest.approx(without - estimate, rel=1e-6, abs=1e-9 * np.abs(estimate).max())
+
+
+def test_a_direction_that_one_cluster_alone_has_seen_stays() -> None:
+    grams = np.stack([np.diag([1.0, 1.0]), *(np.diag([1.0, 0.0]) for _ in range(3))])
+    scores = np.array([[0.3, 0.0], [-0.1, 0.0], [-0.1, 0.0], [-0.1, 0.0]])
+    assert left_out_shifts(grams, scores) == pytest.approx(-scores / 3.0)
+
+
+def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
+    rng = np.random.default_rng(5)
+    rows, parameters, noise = rng.normal(size=(40, 7)), rng.normal(size=5), rng.uniform(0.1, 1.0, 6)
+    products = []
+    for part in (rows, np.asarray(np.linalg.qr(rows, mode="r"))):
+        jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
+        products.append(np.column_stack((jacobian.T @ jacobian, jacobian.T @ residual)))
+    assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
