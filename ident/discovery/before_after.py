@@ -175,12 +175,7 @@ def account(
 
 
 def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns | None = None) -> Assessment:
-    """Compute the errors and gains of one model.
-
-    Args:
-        evidence: identified by ``ml``.
-        weights_nm_a: of the whole error, shape (n,).
-        left_out: by `left_out_runs`.
+    """Compute the errors and gains of one model, identified by ``ml``.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.

@@ -8,7 +8,7 @@ directions, gains included, and measures what they explain of the residual: in-s
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,10 +73,7 @@ class SearchProblem:
     ) -> tuple[FamilyTrials, ...]:
         """Test families on an axis; families that the model contains already are left out.
 
-        Args:
-            families: effects, each with its settings.
-            axis: index.
-            at_rows: build columns at the rows, which is fast and good for effects that change slowly.
+        Columns built `at_rows` are fast, and good for effects that change slowly.
         """
         torque = self._torque_at_rows if at_rows else self.torque
         placed = [
@@ -166,14 +163,9 @@ def prepare_search(
     estimate: Estimate,
     cache: ColumnCache | None = None,
 ) -> SearchProblem:
-    """Linearise around an estimate, cut into folds, and predict the signals of every run.
+    """Linearise around an estimate by ``ml``, cut into folds, and predict the signals of every run.
 
-    Args:
-        model: the declared model.
-        datasets: the runs of the fit, in the observation's order.
-        observation: their rows, with the columns of effects accepted so far.
-        estimate: by ``ml`` on that observation.
-        cache: kept by the caller from turn to turn; for these datasets alone.
+    The caller may keep a cache from turn to turn, for these datasets alone.
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.
@@ -225,22 +217,9 @@ def _at_rows(run: Signals, data: Dataset, observation: Observation) -> Signals:
     def rows(column: FloatArray) -> FloatArray:
         return decimate_rows(data, observation.conditioning, column)
 
-    time_s = rows(run.time_s)
-    return replace(
-        run,
-        rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])),
-        time_s=time_s,
-        session_s=rows(run.session_s),
-        position_rad=rows(run.position_rad),
-        velocity_rad_s=rows(run.velocity_rad_s),
-        acceleration_rad_s2=rows(run.acceleration_rad_s2),
-        motor_position_rad=rows(run.motor_position_rad),
-        inertia_kg_m2=rows(run.inertia_kg_m2),
-        load_torque_nm=rows(run.load_torque_nm),
-        geared_torque_nm=rows(run.geared_torque_nm),
-        motor_torque_nm=rows(run.motor_torque_nm),
-        current_a=rows(run.current_a),
-    )
+    arrays = {array.name: rows(getattr(run, array.name)) for array in fields(run) if array.name != "rate_hz"}
+    time_s = arrays["time_s"]
+    return Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays)
 
 
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:

@@ -49,11 +49,7 @@ class CurrentError:
         return CurrentError(self.size + other.size, self.left + other.left)
 
     def relative(self, weights_nm_a: FloatArray) -> RelativeError:
-        """ε_i and ε [%]; NaN for a motor without a row.
-
-        Args:
-            weights_nm_a: w, one set of gains for all models that are compared, shape (n,).
-        """
+        """ε_i and ε [%] with weights w, shape (n,); NaN for a motor without a row."""
         return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
 
 
@@ -100,10 +96,6 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
     """Refit everything without each run of the fit in turn, and predict that run.
 
     The only run with the known payload, or the only one without, cannot be left out: it is listed with the reason.
-
-    Args:
-        evidence: identified by ``ml``.
-        weights_nm_a: of the whole error, shape (n,).
     """
     runs: list[LeftOutRun] = []
     errors: list[CurrentError] = []

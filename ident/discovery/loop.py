@@ -192,12 +192,7 @@ def find_effects(
 
 
 def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = ()) -> Evidence:
-    """Build the rows behind an identification.
-
-    Args:
-        found: from the same runs.
-        runs, holdout: runs of the fit, and held-out runs.
-    """
+    """Build the rows behind an identification from its runs and held-out runs."""
     model, conditioning = found.model, found.conditioning
     trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
     unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)

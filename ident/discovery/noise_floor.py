@@ -65,10 +65,6 @@ class NoiseFloor:
 def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tuple[NoiseFloor | None, ...]:
     """Estimate the noise of each motor's current in rows, None where it rested too seldom or too briefly.
 
-    Args:
-        datasets: runs of the fit.
-        conditioning: the filters, and the speed below which a joint stands still.
-
     Raises:
         DataUnfit: a run is too short for the filter.
     """

@@ -112,14 +112,7 @@ def rank_effects(
     gates: Gates | None = None,
     families: tuple[tuple[Effect, ...], ...] = EFFECTS,
 ) -> tuple[Finding, ...]:
-    """Test all families on all axes and return them ranked, the best on held-out moves first.
-
-    Args:
-        search_problem: the residual.
-        rng: of the bootstrap.
-        gates: limits for a candidate.
-        families: the dictionary.
-    """
+    """Test all families on all axes and return them ranked, the best on held-out moves first."""
     tested = [found for axis in range(search_problem.axes) for found in search_problem.test(families, axis)]
     return rank_families(search_problem, tested, rng, gates or Gates())
 
@@ -127,14 +120,7 @@ def rank_effects(
 def rank_families(
     search_problem: SearchProblem, tested: Sequence[FamilyTrials], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
-    """Judge each family by the gates and rank all by held-out moves.
-
-    Args:
-        search_problem: the residual.
-        tested: families; they compete for the largest statistic that noise alone would give.
-        rng: of the bootstrap.
-        gates: limits for a candidate.
-    """
+    """Judge each family by the gates, beside all that are tested with it, and rank them by held-out moves."""
     if not tested:
         return ()
     trials = tuple(trial for family in tested for _, trial in family.members)
@@ -149,10 +135,7 @@ def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozens
     """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
 
     A hinge that begins where the joint never comes is a spring, and is named so.
-
-    Args:
-        findings: ranked.
-        taken: places in the model already, or refused; an effect joins an axis once.
+    An effect joins an axis once: places taken, in the model or refused, are not chosen again.
     """
     passed = [finding for finding in findings if finding.passed and place_of(finding.effect, finding.axis) not in taken]
     if not passed:
@@ -185,11 +168,6 @@ def refine_setting(
 
     The search is over the logarithm. An effect without a positive real setting, or at the end of its family, is
     returned unchanged.
-
-    Args:
-        search_problem: the residual.
-        effect, axis: accepted.
-        families: the dictionary that it came from.
     """
     family = next((members for members in families if effect in members), ())
     for name, value in effect.settings.items():

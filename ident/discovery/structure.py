@@ -43,14 +43,7 @@ TAIL = 0.005
 def find_structure(
     search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
-    """Find variables that the residual of some axes depends on, the best on held-out moves first.
-
-    Args:
-        search_problem: the residual.
-        axes: indices.
-        rng: of the bootstrap.
-        gates: limits for a term.
-    """
+    """Find variables that the residual of some axes depends on, the best on held-out moves first."""
     if search_problem.folds.moves < MIN_MOVES:
         return ()  # a term of many coefficients would fit the few moves
     tested = [

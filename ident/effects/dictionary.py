@@ -17,22 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from ident.effects import electrical, friction, position, timing, transmission
 from ident.effects.effect import Effect
-from ident.effects.electrical import Cogging, Saturation
-from ident.effects.friction import (
-    AsymmetricViscous,
-    Coupling,
-    LoadFriction,
-    NonlinearViscous,
-    PositionFriction,
-    Presliding,
-    Stribeck,
-    WarmUp,
-)
-from ident.effects.position import Compensator, Hinge, Spring
 from ident.effects.signals import Abscissa
-from ident.effects.timing import Lag, TimeSkew
-from ident.effects.transmission import Backlash, Elasticity, InertialCoupling
 from ident.effects.unnamed import Periodic, Smooth
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
@@ -40,24 +27,26 @@ PAIRED = range(2, 13)
 """The higher number of a pair of joints; pairs that a robot does not have are left out of its search."""
 
 EFFECTS: tuple[tuple[Effect, ...], ...] = (
-    tuple(Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
-    tuple(NonlinearViscous(exponent) for exponent in (1 / 3, 0.5, 2.0, 3.0)),
-    (AsymmetricViscous(),),
-    tuple(LoadFriction(speed_exponent) for speed_exponent in (0, 1)),
-    (Spring(),),
-    (PositionFriction(),),
-    tuple(Cogging(order) for order in ORDERS),
-    (Saturation(),),
-    (Lag(),),
-    (TimeSkew(),),
-    tuple(WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)),
-    tuple(Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
-    tuple(Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
-    (Elasticity(),),
-    tuple(Coupling(other, sense) for other in PAIRED for sense in (1, -1)),
-    tuple(InertialCoupling(other) for other in PAIRED),
-    tuple(Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
-    tuple(Compensator(order) for order in (1, 2)),
+    tuple(friction.Stribeck(speed_rad_s) for speed_rad_s in (0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
+    tuple(friction.NonlinearViscous(exponent) for exponent in (1 / 3, 0.5, 2.0, 3.0)),
+    (friction.AsymmetricViscous(),),
+    tuple(friction.LoadFriction(speed_exponent) for speed_exponent in (0, 1)),
+    (position.Spring(),),
+    (friction.PositionFriction(),),
+    tuple(electrical.Cogging(order) for order in ORDERS),
+    (electrical.Saturation(),),
+    (timing.Lag(),),
+    (timing.TimeSkew(),),
+    tuple(
+        friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
+    ),
+    tuple(friction.Presliding(distance_rad) for distance_rad in (0.005, 0.01, 0.02, 0.04, 0.08, 0.16)),
+    tuple(transmission.Backlash(share) for share in (0.02, 0.05, 0.15, 0.4)),
+    (transmission.Elasticity(),),
+    tuple(friction.Coupling(other, sense) for other in PAIRED for sense in (1, -1)),
+    tuple(transmission.InertialCoupling(other) for other in PAIRED),
+    tuple(position.Hinge(start_rad, sense) for start_rad in np.linspace(-2.5, 2.5, 11).tolist() for sense in (1, -1)),
+    tuple(position.Compensator(order) for order in (1, 2)),
 )
 """One family a row, with the values of its searched parameters that the search tries."""
 

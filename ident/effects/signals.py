@@ -101,14 +101,9 @@ class Signals:
 def fitted_signals(
     model: Model, data: Dataset, observation: Observation, estimate: Estimate, session_began_s: float | None = None
 ) -> Signals:
-    """Predict a run's torques with the declared part of an estimate.
+    """Predict a run's torques with the declared part of an estimate; coefficients of effects are left out.
 
-    Args:
-        model: the declared model.
-        data: the run.
-        observation: rows of the fit, which name the base parameters.
-        estimate: gains and parameters; coefficients of effects, behind the base parameters, are left out.
-        session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
+    The observation, rows of the fit, names the base parameters; for `session_began_s` see `declared_signals`.
     """
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
@@ -190,9 +185,7 @@ def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatAr
 def payload_parameters(payload: Payload | None, identified: Mapping[str, float]) -> FloatArray:
     """Return χ_kL and χ_uL of a payload in the order of LINK_PARAMETERS, shape (10,); zeros without payload.
 
-    Args:
-        payload: the mounted payload with its known parameters.
-        identified: unknown parameters by name; those that are not identifiable in the data are missing, and zero.
+    Unknown parameters that are not identifiable in the data are missing in `identified`, and zero.
     """
     values = {} if payload is None else {**payload.known, **identified}
     return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])

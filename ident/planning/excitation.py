@@ -119,24 +119,12 @@ def effective_noise(noise_a: FloatArray, lag_one: float) -> FloatArray:
     return np.asarray(noise_a * np.sqrt((1.0 + lag_one) / (1.0 - lag_one)))
 
 
-def weighted_columns(model: Model, motion: Motion, noise_nm: FloatArray) -> FloatArray:
-    """Standard columns over a motion, rows of a joint divided by its noise, shape (n k, c).
-
-    Args:
-        model: the declared model.
-        motion: k samples.
-        noise_nm: standard deviation expected at each joint [Nm], shape (n,).
-    """
-    columns = model.regressor(motion) / noise_nm[:, None, None]
-    # The dry friction of a joint at rest is undetermined (see the standstill mask).
-    columns *= (motion.velocity_rad_s.T != 0.0)[:, None, :]
-    return np.asarray(columns.transpose(0, 2, 1).reshape(-1, columns.shape[1]))
-
-
 def visible(model: Model, motion: Motion) -> BaseParameters:
     """Return the base parameters that are identifiable from a motion."""
-    columns = weighted_columns(model, motion, np.ones(model.robot.joint_count))
-    triangle = np.asarray(np.linalg.qr(columns, mode="r"))
+    # The dry friction of a joint at rest is undetermined (see the standstill mask).
+    columns = model.regressor(motion) * (motion.velocity_rad_s.T != 0.0)[:, None, :]
+    rows = columns.transpose(0, 2, 1).reshape(-1, columns.shape[1])
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     return base_parameters(triangle, tuple(column.name for column in model.columns))
 
 
@@ -273,12 +261,7 @@ class Design:
 
 
 def nominal_links(robot: Robot, urdf: str) -> tuple[FloatArray, bool]:
-    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them.
-
-    Args:
-        robot: of this URDF.
-        urdf: its text; if no link has a mass, rods of LINK_MASS_KG are assumed.
-    """
+    """Return inertial parameters of the links, shape (n, 10), and whether the URDF contains them; else rods."""
     bodies = read_urdf(urdf).bodies
     if any(body.mass_kg > 0.0 for body in bodies):
         return np.array([body.parameters for body in bodies]), True
@@ -315,11 +298,10 @@ def nominal_payload(robot: Robot, payload: Payload) -> ExpectedPayload:
 
 
 def nominal_torque_limits(model: Model, urdf: str, links: FloatArray, fast_motion: Motion) -> FloatArray:
-    """Return the URDF's effort limits, else TORQUE_RESERVE times the rigid-body torque [Nm or N], shape (n,).
+    """Return the URDF's effort limits [Nm or N], else TORQUE_RESERVE times the rigid-body torque, shape (n,).
 
     Args:
-        model: the declared model.
-        urdf: its text.
+        model, urdf: the declared model and the text of the URDF.
         links: inertial parameters with the payload on the last one, shape (n, 10).
         fast_motion: motion as fast as the limits allow.
     """
@@ -338,13 +320,7 @@ def nominal_parameters(
     velocity_limit: FloatArray,
     acceleration_limit: FloatArray,
 ) -> FloatArray:
-    """Return standard parameters of links and drives, shape (c,).
-
-    Args:
-        model: the declared model.
-        links: shape (n, 10).
-        torque_limit, velocity_limit, acceleration_limit: of the joints, shape (n,).
-    """
+    """Return standard parameters of links, shape (n, 10), and of drives with these limits of the joints, shape (c,)."""
     parameters = np.zeros(len(model.columns))
     for index, link in enumerate(links):
         first = 14 * index

@@ -65,6 +65,12 @@ def test_the_contracts_are_kept() -> None:
         ("ident/data/run.py", "import pinocchio", "ident is not allowed to import pinocchio"),
         ("ident/data/run.py", "import drivers.stream.sample", "ident is not allowed to import drivers"),
         ("ident/model/base.py", "import ident.estimators.estimate", "ident.model is not allowed to import ident.est"),
+        (
+            "ident/effects/effect.py",
+            "import ident.discovery.search",
+            "ident.effects is not allowed to import ident.dis",
+        ),
+        ("ident/drift/chart.py", "import ident.model.model", "ident.drift is not allowed to import ident.model"),
         ("drivers/stream/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
         ("drivers/stream/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
         ("drivers/profiles/profile.py", "import pinocchio", "drivers.profiles is not allowed to import pinocchio"),
