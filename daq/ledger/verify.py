@@ -243,32 +243,6 @@ def calibration_flaws(entries: Sequence[AuditEntry], cell: str, store: HistorySt
             yield f"document of {name}: found another one, expected it {said}"
 
 
-def enter_applied(cell: Cell, store: HistoryStore, event: Event) -> None:
-    """Enter that a calibration was written, and before it what others wrote and could not tell (`catch_up`).
-
-    Args:
-        cell: whose controller it was.
-        store: of its history, which has the calibration.
-        event: the write; where the audit tells of it, it is entered as the audit has it.
-
-    Raises:
-        ValueError: the event names no calibration, or one that the history does not have.
-        AuditUnusable, HistoryUnreadable, OutputFailed: see `catch_up`.
-    """
-    if event.digest is None:
-        raise ValueError("an event without its calibration")
-    caught_up = () if cell.history is None else catch_up(cell, cell.history, store)
-    if not any(event.audit in write.digests for write in caught_up):
-        store.applied(
-            event.digest,
-            at=event.at,
-            who=event.who,
-            target=event.target,
-            audit=event.audit,
-            sha256_after=event.sha256_after,
-        )
-
-
 def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:
     """Where an event is not what the entry of the audit says that it names."""
     named = f"as entry {entry.number} of the audit, which it names"
