@@ -40,7 +40,7 @@ _LOG = logging.getLogger("drivegain")
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What a check of audit log and history found.
+    """Result of checking audit log and history.
 
     Attributes:
         place: of both files.
@@ -220,7 +220,7 @@ def _has(entry: AuditEntry, digest: str, cell: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """What a history has after `rebuild`.
+    """Content of a history after `rebuild`.
 
     Attributes:
         calibrations, writes, acknowledgements: how many.
