@@ -34,16 +34,13 @@ from daq.config.cell_file import load_cell
 from daq.config.policy import ApplyPolicy
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
 from daq.files import sha256
-from daq.ledger.audit import find_write_entry
-from daq.ledger.entry import Event, WriteAction
-from daq.ledger.store import HistoryStore
-from daq.ledger.verify import enter_applied
+from daq.ledger.ledger import Ledger
 from daq.report.proposal import describe, show
 from daq.workflow.calibration_file import decode, read
 from daq.writeback.drive_target import DriveTarget
 from daq.writeback.file_target import FileTarget
 from daq.writeback.gates.gate import Gate
-from daq.writeback.request import Request
+from daq.writeback.request import Edit, Request
 from daq.writeback.target import E, Proposal, Target, Written, apply, propose
 from ident.calibration import Calibration
 
@@ -152,7 +149,7 @@ def apply_to(
         except OSError as error:
             raise OutputFailed.of(edit.place, error) from error
     if yes and not proposal.refusals:
-        record_in_history(declared, lambda store: _enter(store, declared, proposal, written, request, actor, audit))
+        record_in_history(declared, actor, lambda ledger: _enter(ledger, edit, written, request))
     if json:
         print_json(describe(proposal, written, known))
     else:
@@ -161,24 +158,11 @@ def apply_to(
         raise proposal.error
 
 
-def _enter(
-    store: HistoryStore,
-    cell: Cell,
-    proposal: Proposal[E],
-    written: Written | None,
-    request: Request,
-    actor: Applier,
-    audit: Path | None,
-) -> None:
+def _enter(ledger: Ledger, edit: Edit, written: Written | None, request: Request) -> None:
     """Enter the write into the history; also one of an earlier command that was killed before it could."""
-    digest, subject, after = sha256(request.signed), proposal.edit.subject, sha256(proposal.edit.after)
-    store.add(request.calibration, digest=digest, at=request.now)
-    if written is None and store.in_force(subject) == digest:
-        return
-    entry = None if written is None else written.audit_sha256
-    if written is None and audit is not None:
-        entry = find_write_entry(audit, subject, after)
-    enter_applied(cell, store, Event(digest, WriteAction.APPLIED, request.now, str(actor), subject, entry, after))
+    digest, entry = sha256(request.signed), None if written is None else written.audit_sha256
+    ledger.add(request.calibration, digest=digest, at=request.now)
+    ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=sha256(edit.after), entry=entry)
 
 
 def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | None, undo: str, *, yes: bool) -> None:

@@ -230,13 +230,13 @@ def _day(text: str, now: datetime) -> datetime:
             "--since", found=repr(text), expected="a date, 2026-03-02, or a time with its zone", remedy="spell it so"
         )
     if found > now:
-        # Until then every calibration would be left out, and no alarm of the axis told.
+        # Until then every calibration would be left out, and no alarm of the axis shown.
         raise UsageError(
             "--since",
             found=f"{text!r}, which is {found:%Y-%m-%d %H:%M:%S} UTC",
             expected=f"no later than now, {now:%Y-%m-%d %H:%M:%S} UTC",
             remedy="give the day of the change, with its zone where the day here is not that of UTC "
-            "(2026-03-02T00:00+10:00); of a change that is still to come acknowledge the alarm when it is told",
+            "(2026-03-02T00:00+10:00); acknowledge the alarm of a coming change when it is shown",
         )
     return found
 

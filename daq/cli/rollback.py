@@ -140,7 +140,8 @@ def _enter(cell: Cell, written: Written, now: datetime, actor: Applier) -> None:
     edit = written.edit
     record_in_history(
         cell,
-        lambda store: store.rolled_back(
+        actor,
+        lambda ledger: ledger.rolled_back(
             at=now,
             who=str(actor),
             target=edit.subject,

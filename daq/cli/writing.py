@@ -118,13 +118,13 @@ def query_history(cell: Cell, target: str, request: Request, changes: Sequence[G
         return NOTHING
 
 
-def record_in_history(cell: Cell, record: Callable[[HistoryStore], object]) -> None:
+def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], object]) -> None:
     """Enter a write into the cell's history; a history that cannot take it is only warned about."""
     if cell.history is None:
         return
     try:
-        with Ledger(cell, cell.history, login()) as store:
-            record(store)
+        with Ledger(cell, cell.history, str(actor)) as ledger:
+            record(ledger)
     except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
         _LOG.warning("the history does not know of this: %s", error)
 

@@ -19,12 +19,10 @@ from daq.jobs import session as sessions
 from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import JobContext
 from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, WatchedGain
-from daq.ledger.audit import AuditAction, append, find_write_entry
+from daq.ledger.audit import AuditAction, append
 from daq.ledger.audit import read as read_audit
-from daq.ledger.entry import Event, WriteAction
 from daq.ledger.judgement import Known, judge, known_of
 from daq.ledger.ledger import Ledger
-from daq.ledger.verify import enter_applied
 from daq.ledger.watch import alarm_text, watch
 from daq.workflow.calibration_file import read
 from daq.writeback.file_access import resolve_links
@@ -54,9 +52,7 @@ class GainHistory:
     ) -> None:
         self._target = str(resolve_links(controller))
         self._now = now
-        self._who = who
         self._store = Ledger(cell, place, who)
-        self._cell = cell
         self._digest = ""
 
     def __enter__(self) -> Self:
@@ -82,19 +78,9 @@ class GainHistory:
         self._digest = sha256_of(path) or ""
         self._store.add(calibration, digest=self._digest, at=self._now())
 
-    def note_applied(self, audit: Path, sha256_after: str) -> None:
-        """The controller has this session's gains; noted once. Raises as `keep`.
-
-        Args:
-            audit: which tells of the write.
-            sha256_after: of the controller's file with these gains, by which a later way back to it is known.
-        """
-        if self._store.in_force(self._target) != self._digest:
-            audit_digest = find_write_entry(audit, self._target, sha256_after)
-            event = Event(
-                self._digest, WriteAction.APPLIED, self._now(), self._who, self._target, audit_digest, sha256_after
-            )
-            enter_applied(self._cell, self._store, event)
+    def note_applied(self, sha256_after: str) -> None:
+        """Enter, once, that the controller's file has this session's gains and this SHA-256. Raises as `enter`."""
+        self._store.record_applied(self._digest, at=self._now(), target=self._target, sha256_after=sha256_after)
 
     def watched(self) -> tuple[WatchedGain, ...]:
         """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
@@ -170,7 +156,7 @@ def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> 
 def _note(context: JobContext, gain_history: GainHistory, after_sha256: str, journal: Journal) -> None:
     """The history's turn. The controller has its gains, and no trouble of the history's may call that undone."""
     try:
-        gain_history.note_applied(context.target.history.audit, after_sha256)
+        gain_history.note_applied(after_sha256)
     except DaqError as error:
         journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
 

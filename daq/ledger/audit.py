@@ -1,8 +1,8 @@
-"""The audit of a cell: a file to which entries are appended and from which none is ever taken away.
+"""The audit log of a cell: entries are appended and never removed.
 
-One entry a line (JSON), each with the digest of the one before. An entry is on the disk before `append` returns. It is
-written at once and under a lock; a writer that was killed while it wrote leaves an unfinished line at most. That line
-stays: the next entry begins on a line of its own and says what it found.
+One JSON line an entry, each with the digest of the one before. An entry is on the disk before `append` returns, written
+in one piece under a lock. A killed writer leaves at most an unfinished line. That line stays; the next entry begins on
+a line of its own and records its digest.
 """
 
 from __future__ import annotations
@@ -57,21 +57,24 @@ __all__ = [
 ]
 
 _TRIES, _PAUSE_S = 100, 0.05
-"""For the lock: whoever holds it writes one line."""
+"""For the lock, which is held for one line."""
+_LOG = logging.getLogger("drivegain")
+_NOT_WRITTEN = (OSError, AuditUnusable)
+_Done = TypeVar("_Done")
 
 
 def append(
     path: Path, action: AuditAction, *, at: datetime, who: str, subject: str, details: Mapping[str, object]
 ) -> AuditEntry:
-    """Add an entry, durably.
+    """Append an entry durably; a new file is made in an existing folder.
 
     Args:
-        path: of the audit; made where there is none, its folder must exist.
+        path: of the audit log.
         action: what happened.
-        at: when, with its time zone.
+        at: time with its zone.
         who: the person or the job.
-        subject: what it happened to.
-        details: plain JSON without numbers that are not finite.
+        subject: the file, drives or cell that it happened to.
+        details: plain JSON with finite numbers.
 
     Raises:
         AuditUnusable: no regular file, locked for long, or its last line is not what was written.
@@ -101,7 +104,7 @@ def append(
 
 
 def read(path: Path) -> tuple[AuditEntry, ...]:
-    """All entries, oldest first, none where there is no file; whether they are what was written, `verify` says.
+    """Return all entries, oldest first, unverified; none where there is no file.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
@@ -110,11 +113,11 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
-    """Whether the audit is what was written, and what became of writes that were begun and never ended.
+    """Check that the audit log is what was written, and find writes that were begun and never ended.
 
     Args:
-        path: of the audit; without a file there is nothing to object to, unless something was noted elsewhere.
-        heads: `sha256` of entries noted elsewhere: a chain cannot tell by itself that its last lines are missing.
+        path: of the audit log; a missing file is an empty one.
+        heads: `sha256` of entries noted elsewhere. A chain alone cannot show that its last lines are missing.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
@@ -123,12 +126,7 @@ def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
 
 
 def find_write_entry(path: Path, subject: str, sha256_after: str) -> str | None:
-    """SHA-256 of the newest entry about a write of that content, None where none tells of it.
-
-    Args:
-        path: of the audit.
-        subject: what was written, as the audit names it.
-        sha256_after: digest of the content.
+    """Return the SHA-256 of the newest entry about a write of that content to that subject, None without one.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
@@ -139,8 +137,99 @@ def find_write_entry(path: Path, subject: str, sha256_after: str) -> str | None:
     return digests[-1] if digests else None
 
 
+@dataclass(frozen=True, slots=True)
+class AuditRecorder:
+    """Record writes to controllers: that one begins, before anything is replaced, and how it ended.
+
+    Attributes:
+        audit: file of the audit log; None records nothing.
+        who: the person or the job.
+        at: time with its zone.
+    """
+
+    audit: Path | None
+    who: str
+    at: datetime
+
+    def record_write(
+        self,
+        begun: AuditAction,
+        ended: AuditAction,
+        target: Path,
+        before: bytes | None,
+        after: bytes,
+        details: Mapping[str, object],
+        write: Callable[[], _Done],
+    ) -> tuple[_Done, str | None]:
+        """Call `write` between two entries.
+
+        Args:
+            begun, ended: actions of the entry before, and of the one after success.
+            target: the file, with symbolic links followed, or the drives.
+            before, after: content; before is None where the file is gone.
+            details: of the first entry, besides the digests.
+            write: replaces the content.
+
+        Returns:
+            the result of `write`, and the SHA-256 of the last entry, None without an audit log. Kept elsewhere, it
+            reveals an audit log whose end was cut off.
+
+        Raises:
+            AuditUnusable, OSError: the first entry could not be written; the target is unchanged.
+            Exception: from `write`.
+        """
+        if self.audit is None:
+            return write(), None
+        digests = {"sha256_before": None if before is None else sha256(before), "sha256_after": sha256(after)}
+        entry = self._append(self.audit, begun, target, {**digests, **details})
+        try:
+            done = write()
+        except BaseException as error:  # an interrupt ends a write too
+            # An interrupt may come when all is done: the digest shows the content, whatever the error says.
+            found = {"begun": entry.number, "error": _said(error), "sha256_found": digest_now(str(target))}
+            self._end(self.audit, AuditAction.FAILED, target, found)
+            raise
+        end_entry = self._end(self.audit, ended, target, {"begun": entry.number})
+        return done, (end_entry or entry).sha256
+
+    def record_refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
+        """Record a write that gates refused."""
+        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
+        self._refused(target, {"refusals": listed, **details})
+
+    def record_no_change(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
+        """Record that the target had this content already."""
+        if self.audit is not None:
+            self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": sha256(content), **details})
+
+    @contextlib.contextmanager
+    def record_refusal_of(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
+        """Record a refusal that is raised within the context."""
+        try:
+            yield
+        except CalibrationRefused as error:
+            documented = {"gate": "file", "subject": error.subject, "found": error.found}
+            self._refused(target, {"refusals": [documented], **details})
+            raise
+
+    def _refused(self, target: Path, details: Mapping[str, object]) -> None:
+        if self.audit is not None:
+            self._end(self.audit, AuditAction.REFUSED, target, details)
+
+    def _append(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry:
+        return append(audit, action, at=self.at, who=self.who, subject=str(target), details=details)
+
+    def _end(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry | None:
+        try:
+            return self._append(audit, action, target, details)
+        except _NOT_WRITTEN as error:
+            # The write is done, and the first entry has its digests: no reason to call it undone.
+            _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
+            return None
+
+
 def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
-    """The last entry, and unfinished lines after it.
+    """Return the last entry and the unfinished lines after it.
 
     Raises:
         AuditUnusable: the last line is something else.
@@ -153,10 +242,10 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
         if one is not None or not is_fragment(line):
             raise AuditUnusable(
                 str(path),
-                found=f"line {number} that is not what drivegain wrote",
-                expected="an audit, whose entries were never changed",
+                found=f"line {number}, which drivegain did not write",
+                expected="an audit log whose entries were never changed",
                 remedy="if this is another file, correct `history.audit` of the cell file or --audit; if it is the "
-                "audit, look at it with `drivegain history --verify`, then move it away, keep it, and begin another; "
+                "audit log, check it with `drivegain history --verify`, then move it away, keep it, and begin another; "
                 "nothing was written",
             )
         unfinished.append(line)
@@ -227,111 +316,12 @@ def _read_all(descriptor: int) -> bytes:
 
 
 def digest_now(subject: str) -> str | None:
-    """SHA-256 of the file that an entry is about, as it is now; `GONE` without one, None where it cannot be read."""
+    """Return the SHA-256 of a file as it is now, `GONE` without one, None where it cannot be read."""
     path = Path(subject)
     try:
         return sha256_of(path) if path.exists() else GONE
     except OSError:
         return None
-
-
-# A write to a controller, written down: that it begins, before anything is replaced, and how it ended.
-
-
-_LOG = logging.getLogger("drivegain")
-_NOT_WRITTEN = (OSError, AuditUnusable)
-_Done = TypeVar("_Done")
-
-
-@dataclass(frozen=True, slots=True)
-class AuditRecorder:
-    """Where writes are written down, and in whose name.
-
-    Attributes:
-        audit: file; None for a library that keeps none.
-        who: the person or the job.
-        at: when.
-    """
-
-    audit: Path | None
-    who: str
-    at: datetime
-
-    def record_write(
-        self,
-        begun: AuditAction,
-        ended: AuditAction,
-        target: Path,
-        before: bytes | None,
-        after: bytes,
-        details: Mapping[str, object],
-        write: Callable[[], _Done],
-    ) -> tuple[_Done, str | None]:
-        """Replace a file, told before and after.
-
-        Args:
-            begun, ended: what is written down before it, and after it when all went well.
-            target: the file, symbolic links followed.
-            before, after: content; before is None where the file is gone.
-            details: what else is to be known of it.
-            write: replaces it.
-
-        Returns:
-            what `write` returns, and SHA-256 of the audit's last entry about it, None without an audit: whoever keeps
-            it elsewhere notices an audit whose end was cut off.
-
-        Raises:
-            AuditUnusable, OSError: the beginning could not be written down; the file stands as it was.
-            Exception: whatever `write` raises.
-        """
-        if self.audit is None:
-            return write(), None
-        digests = {"sha256_before": None if before is None else sha256(before), "sha256_after": sha256(after)}
-        entry = self._append(self.audit, begun, target, {**digests, **details})
-        try:
-            done = write()
-        except BaseException as error:  # an interrupt ends a write too
-            # An interrupt may come when all is done: the digest says what stands there, whatever the error says.
-            found = {"begun": entry.number, "error": _said(error), "sha256_found": digest_now(str(target))}
-            self._end(self.audit, AuditAction.FAILED, target, found)
-            raise
-        end_entry = self._end(self.audit, ended, target, {"begun": entry.number})
-        return done, (end_entry or entry).sha256
-
-    def record_refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
-        """Somebody asked for a write, and gates were closed."""
-        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
-        self._refused(target, {"refusals": listed, **details})
-
-    def record_no_change(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
-        """Somebody asked for a write of what stands there already."""
-        if self.audit is not None:
-            self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": sha256(content), **details})
-
-    @contextlib.contextmanager
-    def record_refusal_of(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
-        """Around what is asked of a file before it is written; a no is written down."""
-        try:
-            yield
-        except CalibrationRefused as error:
-            documented = {"gate": "file", "subject": error.subject, "found": error.found}
-            self._refused(target, {"refusals": [documented], **details})
-            raise
-
-    def _refused(self, target: Path, details: Mapping[str, object]) -> None:
-        if self.audit is not None:
-            self._end(self.audit, AuditAction.REFUSED, target, details)
-
-    def _append(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry:
-        return append(audit, action, at=self.at, who=self.who, subject=str(target), details=details)
-
-    def _end(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry | None:
-        try:
-            return self._append(audit, action, target, details)
-        except _NOT_WRITTEN as error:
-            # What was done stands, and the beginning with the digests tells of it: no reason to call it undone.
-            _LOG.warning("the audit could not be told that it is %s: %s", action.value, error)
-            return None
 
 
 def _said(error: BaseException) -> str:

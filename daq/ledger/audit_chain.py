@@ -1,4 +1,4 @@
-"""Whether an audit is what was written: edited, removed, moved and added lines, and writes that never ended."""
+"""The chain of an audit log: its lines, and the check that finds edited, removed, moved and added ones."""
 
 from __future__ import annotations
 
@@ -10,18 +10,15 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-# One line of the audit: what was asked of a controller, by whom, and the digest that chains it to the line before.
-
-
 FIRST = "0" * 64
-"""What the first entry follows."""
+"""Previous digest of the first entry."""
 
 _BEGINNING = b'{"action":"'
-"""Of every line: the keys are sorted."""
+"""Begin of every line: the keys are sorted."""
 
 
 class AuditAction(Enum):
-    """What happened."""
+    """Kinds of entries."""
 
     PROPOSED = "proposed"
     REFUSED = "refused"
@@ -31,7 +28,7 @@ class AuditAction(Enum):
     ROLLED_BACK = "rolled back"
     FAILED = "failed"
     NOTHING_TO_DO = "nothing to do"
-    """Somebody asked for a write of what stands there already."""
+    """A write was asked for, and the target had this content already."""
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
     ACKNOWLEDGED = "acknowledged"
@@ -40,7 +37,7 @@ class AuditAction(Enum):
     WRITE_FOUND = "write found"
     """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
     TORN_LINE = "torn line"
-    """The line before is what a writer left that was killed or had no room; details: its length and SHA-256."""
+    """The line before was left by a writer that was killed or had no room; details: its length and SHA-256."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +48,8 @@ class AuditEntry:
         number: from 1, without gaps.
         at: ISO 8601 time with its zone.
         who: the person or the job.
-        action: what happened.
-        subject: what it happened to: for a write, the controller file with symbolic links followed.
+        action: kind of entry.
+        subject: for a write, the controller file with symbolic links followed, or the drives.
         details: plain JSON; see docs/reference/audit-and-history.md.
         previous: `sha256` of the entry before, `FIRST` for the first.
         sha256: of the canonical JSON of all of the above, hexadecimal.
@@ -76,7 +73,7 @@ class AuditEntry:
 def entry(
     number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str
 ) -> AuditEntry:
-    """A new entry with its digest.
+    """Make an entry with its digest.
 
     Raises:
         TypeError, ValueError: the details are no JSON, or have a number that is not finite.
@@ -88,12 +85,12 @@ def entry(
 
 
 def encode(one: AuditEntry) -> bytes:
-    """The line, without its end."""
+    """Return the line without its end."""
     return _canonical({**_content(one), "sha256": one.sha256})
 
 
 def decode(line: bytes) -> AuditEntry | None:
-    """The entry in a line, its digest not yet compared; None where the line is not one that `encode` could write."""
+    """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
     try:
         tree = json.loads(line)
         found = _entry(tree)
@@ -103,9 +100,9 @@ def decode(line: bytes) -> AuditEntry | None:
 
 
 def is_fragment(line: bytes) -> bool:
-    """Whether a line can be the beginning of an entry that a writer did not finish: such a beginning is never JSON.
+    """Whether a line can be the begin of an unfinished entry, which is never JSON.
 
-    Zeros behind it, or alone, are what a power cut leaves. Any other text is somebody else's file.
+    Zeros behind it, or alone, are left by a power cut. Any other text is from another file.
     """
     begun = line.rstrip(b"\0")
     if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
@@ -143,7 +140,7 @@ def _content(one: AuditEntry) -> dict[str, object]:
 
 
 def _canonical(tree: object) -> bytes:
-    """One spelling for one content: sorted keys, no spaces, ASCII, no NaN (which is no JSON)."""
+    """Encode as JSON with one spelling for one content: sorted keys, no spaces, ASCII, no NaN."""
     return json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
@@ -153,12 +150,12 @@ def _digest(content: dict[str, object]) -> str:
 
 _BEGUN = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
 GONE = "gone"
-"""In the place of the digest of a file that is not there."""
+"""Takes the place of a missing file's digest."""
 _ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
 
 
 class Flaw(Enum):
-    """What somebody has done to a line."""
+    """Kinds of changes to a line."""
 
     EDITED = "edited"
     REMOVED = "removed"
@@ -169,12 +166,12 @@ class Flaw(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AuditFlaw:
-    """One place where the audit is not what was written.
+    """One place where the audit log is not what was written.
 
     Attributes:
-        line: in the file, from 1; of what was removed, the line that stands in its place.
-        flaw: what was done there, as far as the chain tells.
-        says: the same in words.
+        line: in the file, from 1; of a removed line, the line that is in its place.
+        flaw: its kind, as far as the chain shows it.
+        says: the same as a sentence.
     """
 
     line: int
@@ -183,17 +180,17 @@ class AuditFlaw:
 
 
 class Content(Enum):
-    """What a controller file held after a write that was begun and not ended."""
+    """Content of a controller file after a write that was begun and not ended."""
 
     BEFORE = "as before the write"
     AFTER = "the new content"
-    OTHER = "neither: somebody has changed or removed it since"
+    OTHER = "neither: it was changed or removed since"
     UNKNOWN = "not known: the file cannot be read, or the entry has no digests"
 
 
 @dataclass(frozen=True, slots=True)
 class OpenWrite:
-    """A write that was begun and whose end nobody wrote down: its writer was killed.
+    """A write without an entry that ends it: its writer was killed.
 
     Attributes:
         begun: the entry.
@@ -206,11 +203,11 @@ class OpenWrite:
 
 @dataclass(frozen=True, slots=True)
 class AuditVerdict:
-    """What an audit can be believed to say.
+    """Result of checking a chain.
 
     Attributes:
         entries: all of them, in the order of the file.
-        flaws: by their lines; empty where the chain holds.
+        flaws: by their lines; empty for an intact chain.
         torn: lines, from 1, that a killed writer left unfinished; they are no flaw.
         open_writes: begun and not ended.
     """
@@ -222,7 +219,7 @@ class AuditVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether every entry is what was written and none is missing, as far as a chain can tell."""
+        """Whether every entry is what was written and none is missing, as far as a chain can show it."""
         return not self.flaws
 
     @property
@@ -232,13 +229,12 @@ class AuditVerdict:
 
 
 def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
-    """Follow the chain.
+    """Check a chain.
 
     Args:
-        content: of the audit.
+        content: of the audit log.
         digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where it cannot be read.
-        heads: digests of entries that somebody noted elsewhere. A chain cannot tell that its last lines are missing;
-            one of these that is not in it does.
+        heads: digests of entries that were noted elsewhere. One that is not in the chain shows that its end is missing.
     """
     chain = _Chain(content)
     for index, one in enumerate(chain.found):
@@ -257,19 +253,19 @@ def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collec
 
 
 def lines_of(content: bytes) -> list[bytes]:
-    """Lines without their ends; the last one may lack its end."""
+    """Split into lines; the last one may lack its end."""
     lines = content.split(b"\n")
     return lines if lines[-1] else lines[:-1]
 
 
 def torn_details(fragments: Sequence[bytes]) -> dict[str, object]:
-    """What the entry after unfinished lines says of them."""
+    """Return the details of the entry after unfinished lines."""
     joined = b"\n".join(fragments)
     return {"torn_bytes": len(joined), "torn_sha256": hashlib.sha256(joined).hexdigest()}
 
 
 class _Chain:
-    """Walks from line to line and knows which entry must come next."""
+    """Walk from line to line, with the entry that must come next."""
 
     def __init__(self, content: bytes) -> None:
         self.lines = lines_of(content)
@@ -281,7 +277,7 @@ class _Chain:
         """Lines that are no entries, since the last one that is."""
         self.number = 1
         self.previous: str | None = FIRST
-        """Digest that the next entry must follow; None where the line before is broken and cannot say."""
+        """Digest that the next entry must follow; None behind a broken line."""
         self.place = 1
         """Line of the entry before."""
 
@@ -295,7 +291,7 @@ class _Chain:
             return
         if one.number < self.number:
             twice = self.numbers[one.number] > 1
-            says = f"entry {one.number} {'is there more than once' if twice else 'stands after a later one'}"
+            says = f"entry {one.number} {'is there more than once' if twice else 'is after a later one'}"
             self._add_flaw(place, Flaw.ADDED if twice else Flaw.MOVED, says)
             return
         if one.number > self.number:
@@ -310,11 +306,11 @@ class _Chain:
         self._settle(None)
 
     def _settle(self, follower: AuditEntry | None) -> None:
-        """Lines that are no entries: left by a killed writer, or made so by somebody."""
+        """Judge lines that are no entries: left by a killed writer, or changed."""
         fragments = [self.lines[index] for index in self.unfinished]
         is_torn = follower is not None and follower.action is AuditAction.TORN_LINE
         if follower is not None and is_torn and follower.details != torn_details(fragments):
-            says = f"entry {follower.number} tells of an unfinished line that is not there as it was"
+            says = f"entry {follower.number} reports an unfinished line that is not there as it was"
             self._add_flaw(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
         elif is_torn or (follower is None and all(map(is_fragment, fragments))):
             self.torn += [index + 1 for index in self.unfinished]
@@ -332,14 +328,14 @@ class _Chain:
             which = f"entry {gone[0]} is" if len(gone) == 1 else f"entries {gone[0]} to {gone[-1]} are"
             self._add_flaw(place, Flaw.REMOVED, f"{which} missing before entry {number}")
         else:
-            self._add_flaw(place, Flaw.MOVED, f"entry {number} stands before entry {missing[0]}")
+            self._add_flaw(place, Flaw.MOVED, f"entry {number} is before entry {missing[0]}")
 
     def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
         self.flaws.append(AuditFlaw(line, flaw, says))
 
 
 def _open_writes(entries: tuple[AuditEntry, ...], digest_now: Callable[[str], str | None]) -> tuple[OpenWrite, ...]:
-    # Anybody can write a chain that holds: what is no number names no entry.
+    # A forged chain can hold: a value that is no number names no entry.
     ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
     return tuple(
         OpenWrite(one, _content_after(one, entries[place + 1 :], digest_now))
@@ -360,6 +356,6 @@ def _content_after(begun: AuditEntry, later: Sequence[AuditEntry], digest_now: C
 
 
 def _digest_before(begun: AuditEntry) -> str | None:
-    """Of the file when the write began, or that there was none; None where the entry does not tell."""
+    """Return the digest of the file when the write began, `GONE` without a file, None for an entry without one."""
     recorded = begun.details.get("sha256_before", 0)
     return GONE if recorded is None else recorded if isinstance(recorded, str) else None

@@ -1,4 +1,4 @@
-"""What the history knows: calibrations, what was done with them, and changes that somebody has explained."""
+"""Rows of a history: calibrations, writes to controllers, and acknowledged changes; and the checks of these rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ident.calibration import Calibration, Gain, Source
 
 
 class WriteAction(Enum):
-    """What was done to a controller."""
+    """Kinds of writes to a controller."""
 
     APPLIED = "applied"
     ROLLED_BACK = "rolled back"
@@ -28,14 +28,14 @@ class Event:
     """A write to a controller.
 
     Attributes:
-        digest: of the calibration whose gains the controller had afterwards; None where that is not known: a
-            rollback to gains that are in no calibration.
-        deed: what was done.
+        digest: of the calibration whose gains the controller had afterwards; None for a rollback to gains of no
+            calibration.
+        action: its kind.
         at: when, UTC.
         who: the person or the job.
-        target: the controller's file.
-        audit: SHA-256 of the entry in the audit that tells of it, None where none was given.
-        sha256_after: of what the target held afterwards, None where none was given.
+        target: the controller's file, or the drives.
+        audit: SHA-256 of its entry in the audit log, None where none was given.
+        sha256_after: of the target's content afterwards, None where none was given.
     """
 
     digest: str | None
@@ -54,7 +54,7 @@ class Entry:
     Attributes:
         digest: SHA-256 of its file.
         created: when it was fitted, UTC; when it was entered where its own time cannot be read.
-        recorded: when the newest log of its fit was recorded, UTC; as `created` where no log tells.
+        recorded: when the newest log of its fit was recorded, UTC; as `created` where no log has a time.
         logs: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings.
         entered: when it was entered, UTC.
         cell: name of the cell.
@@ -90,7 +90,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """A change that somebody has explained; a new baseline begins.
+    """A change that a person has explained; a new baseline begins.
 
     Attributes:
         axis: whose gain changed.
@@ -98,7 +98,7 @@ class Acknowledgement:
         at: when it was acknowledged, UTC.
         who: the person.
         why: what had happened.
-        audit: SHA-256 of the entry in the audit that tells of it.
+        audit: SHA-256 of its entry in the audit log.
     """
 
     axis: str
@@ -110,7 +110,7 @@ class Acknowledgement:
 
 
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
-    """When the newest log of a fit was recorded, UTC; `otherwise` where none tells."""
+    """Return when the newest log of a fit was recorded, UTC; `otherwise` where no log has a time."""
     times_s = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
     try:
         return datetime.fromtimestamp(max(seconds for seconds in times_s if seconds is not None), UTC)
@@ -119,7 +119,7 @@ def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
 
 
 def logs_of(calibration: Calibration, digest: str) -> str:
-    """Digest of the logs of a fit, as a set; that of the calibration itself where it names none."""
+    """Return the digest of the set of logs of a fit; that of the calibration itself without logs."""
     logs = sorted({one.sha256 for one in _fitted(calibration)})
     return hashlib.sha256("\n".join(logs).encode()).hexdigest() if logs else digest
 
@@ -129,7 +129,7 @@ def _fitted(calibration: Calibration) -> list[Source]:
 
 
 def utc(text: str, otherwise: datetime) -> datetime:
-    """A time in ISO 8601 as UTC, one without a zone taken for UTC; `otherwise` where the text is no time."""
+    """Parse an ISO 8601 time as UTC, one without a zone as UTC; `otherwise` where the text is no time."""
     try:
         read = datetime.fromisoformat(text)
         return (read.replace(tzinfo=UTC) if read.tzinfo is None else read).astimezone(UTC)
@@ -138,7 +138,7 @@ def utc(text: str, otherwise: datetime) -> datetime:
 
 
 def iso(at: datetime) -> str:
-    """As the store keeps times: UTC, of one length, so that their order is that of the text.
+    """Format a time for the store: UTC, of one length, so that times sort as text.
 
     Raises:
         ValueError: a time without its zone.
@@ -149,18 +149,15 @@ def iso(at: datetime) -> str:
 
 
 def zoned(text: str) -> datetime:
-    """A time as it was written down.
+    """Parse a time with its zone.
 
     Raises:
-        ValueError: it is none, or has no zone.
+        ValueError: no time, or without a zone.
     """
     found = datetime.fromisoformat(text)
     if found.tzinfo is None:
         raise ValueError(f"{text!r} is a time without its zone")
     return found
-
-
-# Whether the rows of a history are what drivegain wrote, as far as they tell of each other; no key guards them.
 
 
 COLUMNS = (
@@ -180,7 +177,7 @@ GAIN_COLUMNS = ("axis", "value", "std", "unit", "nameplate")
 
 
 def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
-    """What the row of a calibration says, besides digest and document."""
+    """Return the columns of a calibration's row, besides digest and document."""
     holdout, created = calibration.holdout_error_percent, utc(calibration.created, entered)
     values = (
         iso(created),
@@ -199,19 +196,19 @@ def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict
 
 
 def gain_columns_of(calibration: Calibration) -> list[dict[str, object]]:
-    """What the rows of its gains say, in the order of the axes."""
+    """Return the columns of its gains' rows, in the order of the axes."""
     return [{name: getattr(gain, name) for name in GAIN_COLUMNS} for gain in calibration.gains]
 
 
 def calibration_flaws(calibrations: Sequence[tuple[Any, ...]], gains: Sequence[tuple[Any, ...]]) -> Iterator[str]:
-    """Rows of calibrations that are not what their own document says, as sentences.
+    """Report rows of calibrations that contradict their own document, as sentences.
 
     Args:
         calibrations: digest, document, and `COLUMNS` of each.
         gains: digest of the calibration, and `GAIN_COLUMNS` of each.
 
     Raises:
-        ValueError: a time is none.
+        ValueError: a row has no valid time.
     """
     rows_of: dict[str, list[tuple[Any, ...]]] = {}
     for digest, *gain in gains:
@@ -237,20 +234,14 @@ def calibration_flaws(calibrations: Sequence[tuple[Any, ...]], gains: Sequence[t
 
 
 def gap_flaws(table: str, there: set[int], last: int) -> Iterator[str]:
-    """Rows that are missing: they are numbered from 1 without gaps, and none is ever taken away.
-
-    Args:
-        table: its name.
-        there: numbers of its rows.
-        last: number that was given last.
-    """
+    """Report missing rows: `there` are the numbers of a table's rows, which go from 1 to `last` without gaps."""
     missing = list(islice((number for number in range(1, last + 1) if number not in there), 5))
     if missing:
         yield f"{table} {_listed(missing)}: found no such row, expected all from 1 to {last}"
 
 
 def early_flaws(acknowledgements: Iterable[Acknowledgement]) -> Iterator[str]:
-    """Acknowledgements that would silence an axis beforehand."""
+    """Report acknowledgements that would silence an axis beforehand."""
     for noted in acknowledgements:
         if noted.since > noted.at:
             yield (

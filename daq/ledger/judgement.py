@@ -12,23 +12,20 @@ from daq.ledger.watch import dispersions_of
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION, ChangeDecision, decide
 
-# What the history knows of the gains that a controller has now.
-
-
 SAME_SIGMAS = 0.5
-"""A number in the controller's file that is that near to a gain of the history is that gain, rounded for the file."""
+"""A number in the controller's file that is as near to a gain of the history is that gain, rounded for the file."""
 
 
 def stds_in_force(entries: Iterable[Entry], in_force: str | None, gains: Mapping[str, float]) -> dict[str, float]:
-    """σ of gains in a controller, by axis.
+    """Return the σ of the gains in a controller, by axis.
 
-    That of the calibration which the history has as in force, where the number is still that calibration's; else that
-    of the newest one whose number it is, since a write is not always told to the history (a process was killed behind
-    it, a backup was copied back by hand); 0 for a number of no calibration, which somebody entered.
+    It is that of the calibration in force where the number is still that calibration's. Else it is that of the newest
+    calibration with this number: the history lacks a write after a kill, or when a backup was copied back by hand. It
+    is 0 for a number of no calibration, which a person entered.
 
     Args:
         entries: of the history, oldest first.
-        in_force: digest of the calibration that the history has as in force, None where it knows of none.
+        in_force: digest of the calibration that is in force according to the history, None without one.
         gains: in the controller now, by axis.
     """
     stds = dict.fromkeys(gains, 0.0)
@@ -40,20 +37,20 @@ def stds_in_force(entries: Iterable[Entry], in_force: str | None, gains: Mapping
 
 
 def digests_in_force(events: Iterable[Event]) -> frozenset[str]:
-    """Digests of the calibrations whose gains some controller has, as far as a history knows; events oldest first."""
+    """Return the digests of the calibrations in force in any controller; events oldest first."""
     newest = {event.target: event.digest for event in events}
     return frozenset(digest for digest in newest.values() if digest is not None)
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What a history knows that a change is judged by; without one, nothing.
+    """Figures of a history that a change is judged by; empty without a history.
 
     Attributes:
-        stds: σ of the numbers that are in the controller now, by axis [unit of the gain]; one that is not there, or 0,
-            is taken as exact: somebody has entered it, or nothing is known of it.
-        dispersions: how much more the cell's calibrations scatter than their σ says, by axis;
-        `ident.drift.change.DISPERSION` for one that is not there.
+        stds: σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken
+            as exact: a person entered that number, or the history does not have it.
+        dispersions: scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a
+            missing one.
     """
 
     stds: Mapping[str, float] = field(default_factory=dict)
@@ -64,13 +61,13 @@ NOTHING = Known()
 
 
 def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Known:
-    """What a history knows of the gains in a controller.
+    """Return the figures of a history for the gains in a controller.
 
     Args:
         store: of the cell.
         target: the controller's file, or the drives, as events name it.
-        digest: of the calibration that is judged: a number that happens to be near to it is not it, unless it is in
-            force, and it does not tell how calibrations scatter.
+        digest: of the calibration that is judged, which is left out: a number that is near to it is another one unless
+            it is in force, and the scatter is that of the others.
         changes: one an axis.
 
     Raises:
@@ -84,8 +81,8 @@ def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[Ga
 
 
 def judge(changes: Sequence[GainChange], known: Known) -> ChangeDecision:
-    """Whether any of them is more than noise (`ident.drift.change.decide`); what is no number is left to a gate of
-    its own.
+    """Decide whether any change is more than noise (`ident.drift.change.decide`); numbers that are not finite have a
+    gate of their own.
 
     Args:
         changes: one an axis.

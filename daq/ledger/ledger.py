@@ -18,7 +18,7 @@ from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
 from daq.files import fsync_folder
-from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
+from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, find_write_entry, read, verify
 from daq.ledger.entry import Acknowledgement, Event, iso
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import (
@@ -40,7 +40,7 @@ _LOG = logging.getLogger("drivegain")
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What a check of audit log and history found.
+    """Result of checking audit log and history.
 
     Attributes:
         place: of both files.
@@ -86,6 +86,29 @@ class Ledger(HistoryStore):
             self._check_like(calibration)
             self._enter_calibration(calibration, digest, at, at)
         return super().add(calibration, digest=digest, at=at)
+
+    def record_applied(
+        self, digest: str, *, at: datetime, target: str, sha256_after: str, entry: str | None = None
+    ) -> None:
+        """Enter that a controller has the gains of a calibration; before it what other processes could not enter.
+
+        Args:
+            digest: of the calibration, which was added before.
+            at: when, with its zone.
+            target: the controller's file or the drives, as the audit log names it.
+            sha256_after: of the target's content with these gains.
+            entry: SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may have
+                been killed before it entered the write, or entered it.
+
+        Raises:
+            AuditUnusable, HistoryUnreadable, OutputFailed: see `HistoryStore.applied`.
+        """
+        if entry is None:
+            if self.in_force(target) == digest:
+                return
+            entry = find_write_entry(self.place.audit, target, sha256_after)
+        if not any(entry in write.digests for write in self.catch_up()):
+            self.applied(digest, at=at, who=self.who, target=target, audit=entry, sha256_after=sha256_after)
 
     def acknowledge_change(self, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
         """Record that a change of a gain is explained.
@@ -197,7 +220,7 @@ def _has(entry: AuditEntry, digest: str, cell: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """What a history has after `rebuild`.
+    """Content of a history after `rebuild`.
 
     Attributes:
         calibrations, writes, acknowledgements: how many.

@@ -15,7 +15,7 @@ _TABLES = """
 CREATE TABLE calibration (
     digest               TEXT NOT NULL PRIMARY KEY,  -- SHA-256 of calibration.yaml
     created              TEXT NOT NULL,              -- ISO 8601, UTC, as all times here
-    recorded             TEXT NOT NULL,              -- newest log of the fit; as created where no log tells
+    recorded             TEXT NOT NULL,              -- newest log of the fit; as created without one
     logs                 TEXT NOT NULL,              -- SHA-256 of the digests of the fit's logs, sorted
     entered              TEXT NOT NULL,
     cell                 TEXT NOT NULL,
@@ -44,8 +44,8 @@ CREATE TABLE event (
     at     TEXT NOT NULL,
     who    TEXT NOT NULL,
     target TEXT NOT NULL,
-    audit  TEXT,                                     -- SHA-256 of the entry in the audit that tells of it
-    sha256_after TEXT                                -- of what the target held afterwards, NULL where unknown
+    audit  TEXT,                                     -- SHA-256 of its entry in the audit log
+    sha256_after TEXT                                -- of its content afterwards, NULL where unknown
 ) STRICT;
 CREATE TABLE acknowledgement (
     number INTEGER PRIMARY KEY AUTOINCREMENT,

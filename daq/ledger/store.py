@@ -1,8 +1,8 @@
-"""The history of a cell in one SQLite file: every calibration, which were applied, which changes were explained.
+"""The history of a cell in one SQLite file: calibrations, writes to controllers, acknowledged changes.
 
-With SQLite's rollback journal, not its write-ahead log: one file that can be copied, that opens on a medium that cannot
-be written, and on network folders. A writer that is killed leaves a journal, and whoever opens the file next takes the
-unfinished transaction back. Why SQLite at all: docs/decisions/0024.
+It is the index of the audit log (docs/decisions/0031). SQLite's rollback journal, not its write-ahead log, makes it one
+file that can be copied, and that opens on read-only media and network folders. A killed writer leaves a journal, and
+the next process that opens the file undoes the unfinished transaction (docs/decisions/0024).
 """
 
 from __future__ import annotations
@@ -38,9 +38,6 @@ from daq.ledger.entry import (
 from daq.workflow.calibration_file import encode
 from ident.calibration import Calibration, Gain
 
-# An SQLite file that is opened, written and complained about in one way.
-
-
 BUSY_S = 20.0
 """How long to wait for another process' transaction: each is a few rows."""
 
@@ -48,16 +45,16 @@ _NOT_WRITABLE = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTO
 
 
 class Access(Enum):
-    """What is wanted of the file; the value is SQLite's `mode` of a URI."""
+    """Access to the file; the value is SQLite's `mode` of a URI."""
 
     READ = "rw"
-    """Of a file that is there; SQLite opens for reading only what it may not write. Not "ro": that could not take back
-    what a killed writer left unfinished."""
+    """Opens an existing file, read-only where it cannot be written. Not "ro", which could not undo an unfinished
+    transaction."""
     WRITE = "rwc"
 
 
 def connect(path: Path, access: Access) -> sqlite3.Connection:
-    """Open the file, and look at whether it is a history.
+    """Open the file and check that it is a history.
 
     Raises:
         HistoryUnreadable: it is none, of another version, broken, or locked for long.
@@ -81,7 +78,7 @@ def connect(path: Path, access: Access) -> sqlite3.Connection:
 
 @contextlib.contextmanager
 def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
-    """All that is written within is in the file, or nothing; the tables are made where there are none yet.
+    """Write all or nothing; an empty file gets its tables.
 
     Raises:
         HistoryUnreadable, OutputFailed: see `connect`.
@@ -101,7 +98,7 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def translate_sqlite_errors(path: Path, access: Access) -> Iterator[None]:
-    """What SQLite raises, in our words.
+    """Translate the errors of SQLite.
 
     Raises:
         HistoryUnreadable: broken, no SQLite file, locked for long, or not readable.
@@ -208,16 +205,16 @@ class HistoryStore:
         audit: str | None = None,
         sha256_after: str | None = None,
     ) -> None:
-        """A calibration's gains were written.
+        """Enter a write of a calibration's gains.
 
         Args:
             digest: of the calibration, which was entered before.
             at: when, with its zone.
             who: the person or the job.
-            target: the controller's file, as the audit names it.
-            audit: SHA-256 of the entry in the audit that tells of it; `drivegain history --verify` looks for it there,
-                and so notices an audit whose end was cut off.
-            sha256_after: of what the target holds now, by which a rollback to it is recognised.
+            target: the controller's file, as the audit log names it.
+            audit: SHA-256 of its entry in the audit log; by it `drivegain history --verify` notices an audit log
+                whose end was cut off.
+            sha256_after: of the target's content now, by which a rollback to it is recognised.
 
         Raises:
             ValueError: the calibration was never entered, or the time has no zone.
@@ -231,15 +228,15 @@ class HistoryStore:
     def rolled_back(
         self, *, at: datetime, who: str, target: str, sha256_after: str, audit: str | None = None
     ) -> str | None:
-        """A write to `target` was taken back: it holds again what it held before.
+        """Enter that the last write to `target` was undone.
 
         Args:
             at, who, target, audit: as in `applied`.
-            sha256_after: of what the target holds now. What was written with a calibration is recognised by it; what a
-                person has entered in between is in no calibration.
+            sha256_after: of the target's content now. The gains of a calibration are recognised by it; numbers that a
+                person entered in between are in no calibration.
 
         Returns:
-            digest of the calibration whose gains these are, None where the history does not know.
+            digest of the calibration with these gains, None without one.
         """
         with self._writing() as connection:
             same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
@@ -248,7 +245,7 @@ class HistoryStore:
         return digest
 
     def acknowledge(self, noted: Acknowledgement) -> None:
-        """A change of one gain is explained. Raises as `applied`."""
+        """Enter an explained change of a gain. Raises as `applied`."""
         with self._writing() as connection:
             connection.execute(
                 "INSERT INTO acknowledgement (axis, since, at, who, why, audit) VALUES (?, ?, ?, ?, ?, ?)",
@@ -256,12 +253,9 @@ class HistoryStore:
             )
 
     def entries(self) -> tuple[Entry, ...]:
-        """All calibrations, oldest first by when they were fitted."""
+        """Return all calibrations in the order in which they were fitted."""
         events = self.events()
-        rows = self._rows(
-            "SELECT digest, created, recorded, logs, entered, cell, configuration_sha256, method, software,"
-            " error_percent, holdout_percent, rows FROM calibration ORDER BY created, entered, digest"
-        )
+        rows = self._rows(f"SELECT digest, {', '.join(COLUMNS)} FROM calibration ORDER BY created, entered, digest")
         gains: dict[str, list[Gain]] = {}
         for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
             gains.setdefault(digest, []).append(Gain(*gain))
@@ -269,48 +263,48 @@ class HistoryStore:
             return tuple(_entry(row, gains.get(row[0], []), events) for row in rows)
 
     def events(self) -> tuple[Event, ...]:
-        """All writes to controllers, oldest first."""
+        """Return all writes to controllers, oldest first."""
         rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
         with translate_sqlite_errors(self.path, Access.READ):
             return tuple(Event(row[0], WriteAction(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
-        """All of them, oldest first."""
+        """Return all acknowledgements, oldest first."""
         rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
         with translate_sqlite_errors(self.path, Access.READ):
             return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def audited(self) -> frozenset[str]:
-        """SHA-256 of all entries that the audit must have."""
+        """Return the SHA-256 of all entries that the audit log must have."""
         noted = {event.audit for event in self.events()} | {noted.audit for noted in self.acknowledgements()}
         return frozenset(sha256 for sha256 in noted if sha256 is not None)
 
     def in_force(self, target: str | None = None) -> str | None:
-        """Digest of the calibration whose gains a controller has as far as the history knows; None where it does not.
+        """Return the digest of the calibration of a controller's last write, None for numbers of no calibration.
 
         Args:
-            target: the controller's file; None for whichever was written last.
+            target: the controller's file; None for the controller that was written last.
         """
         events = [event for event in self.events() if target in {None, event.target}]
         return events[-1].digest if events else None
 
     def document(self, digest: str) -> bytes | None:
-        """The calibration file of this digest, None where it was never entered."""
+        """Return the calibration file of this digest, None where it was never entered."""
         rows = self._rows("SELECT document FROM calibration WHERE digest = ?", (digest,))
         return str(rows[0][0]).encode() if rows else None
 
     def integrity(self) -> tuple[str, ...]:
-        """What is broken in the file, by itself: what SQLite finds, and rows that contradict each other.
+        """Check the file by itself: SQLite's own check, and rows that contradict each other.
 
-        No key guards the rows: whoever changes all that belongs together is not found.
+        No key guards the rows: consistent changes of all of them are found only by comparison with the audit log.
 
         Returns:
-            sentences, each with what stands there and what was expected; nothing where all is well.
+            sentences with found and expected; none for a sound file.
         """
         found = [str(row[0]) for row in self._rows("PRAGMA integrity_check")]
         found += [f"row of {row[0]} without its {row[2]}" for row in self._rows("PRAGMA foreign_key_check")]
         found = [text for text in found if text != "ok"]
-        if found:  # what a broken file says of itself is no more to be asked
+        if found:  # rows of a broken file prove nothing
             return tuple(found)
         calibrations = self._rows(
             f"SELECT digest, document, {', '.join(COLUMNS)} FROM calibration ORDER BY created, digest"
@@ -324,7 +318,7 @@ class HistoryStore:
             )
 
     def _numbers(self, table: str) -> tuple[set[int], int]:
-        """Of the rows that are there, and the last one that SQLite gave."""
+        """Return the numbers of a table's rows, and the last one that SQLite gave."""
         there = {int(row[0]) for row in self._rows(f"SELECT number FROM {table}")}
         given = self._rows("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,))
         return there, max([*there, *(int(row[0]) for row in given), 0])
@@ -387,20 +381,7 @@ class HistoryStore:
 
 
 def _entry(row: tuple[Any, ...], gains: list[Gain], events: tuple[Event, ...]) -> Entry:
-    digest, created, recorded, logs, entered, cell, configuration, method, software, error, holdout, rows = row
-    return Entry(
-        digest=digest,
-        created=zoned(created),
-        recorded=zoned(recorded),
-        logs=logs,
-        entered=zoned(entered),
-        cell=cell,
-        configuration_sha256=configuration,
-        method=method,
-        software=software,
-        error_percent=error,
-        holdout_percent=holdout,
-        rows=rows,
-        gains=tuple(gains),
-        events=tuple(event for event in events if event.digest == digest),
-    )
+    columns: dict[str, Any] = dict(zip(("digest", *COLUMNS), row, strict=True))
+    columns |= {name: zoned(columns[name]) for name in ("created", "recorded", "entered")}
+    own = tuple(event for event in events if event.digest == columns["digest"])
+    return Entry(**columns, gains=tuple(gains), events=own)

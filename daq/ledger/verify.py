@@ -1,4 +1,4 @@
-"""What the audit tells of the writes to a controller, held against what the history knows of them."""
+"""Comparison of the audit log with the history: the writes, calibrations and acknowledgements of one in the other."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _is_later(entry: AuditEntry, than: AuditEntry) -> bool:
 def unknown_writes(
     writes: Sequence[AuditedWrite], named: Collection[str]
 ) -> tuple[list[AuditedWrite], list[AuditedWrite]]:
-    """Writes that no event names, and those of them behind which there is none of the same target that one names."""
+    """Return the writes that no event names, and those of them without a later named one of the same target."""
     unknown, new = [], []
     following: dict[str, tuple[AuditedWrite, bool]] = {}
     some_known: set[str] = set()
@@ -127,7 +127,7 @@ def unknown_writes(
         target = write.ended.subject
         after, after_known = following.get(target, (None, False))
         known = not write.digests.isdisjoint(named)
-        # Drives that were written once more with the same: whoever knows of that knows what they hold since.
+        # Drives that were written once more with the same: who has that event has their content.
         again = after is not None and after.changed_nothing and after.sha256_after == write.sha256_after
         known = known or (after_known and again and after is not None and after.calibration == write.calibration)
         following[target] = write, known
@@ -243,34 +243,8 @@ def calibration_flaws(entries: Sequence[AuditEntry], cell: str, store: HistorySt
             yield f"document of {name}: found another one, expected it {said}"
 
 
-def enter_applied(cell: Cell, store: HistoryStore, event: Event) -> None:
-    """Enter that a calibration was written, and before it what others wrote and could not tell (`catch_up`).
-
-    Args:
-        cell: whose controller it was.
-        store: of its history, which has the calibration.
-        event: the write; where the audit tells of it, it is entered as the audit has it.
-
-    Raises:
-        ValueError: the event names no calibration, or one that the history does not have.
-        AuditUnusable, HistoryUnreadable, OutputFailed: see `catch_up`.
-    """
-    if event.digest is None:
-        raise ValueError("an event without its calibration")
-    caught_up = () if cell.history is None else catch_up(cell, cell.history, store)
-    if not any(event.audit in write.digests for write in caught_up):
-        store.applied(
-            event.digest,
-            at=event.at,
-            who=event.who,
-            target=event.target,
-            audit=event.audit,
-            sha256_after=event.sha256_after,
-        )
-
-
 def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:
-    """Where an event is not what the entry of the audit says that it names."""
+    """Report where an event contradicts the entry of the audit log that it names, as sentences."""
     named = f"as entry {entry.number} of the audit, which it names"
     begun = next((one for one in entries if one.number == _number(entry)), entry) if entry.action in _ENDS else entry
     action = AuditedWrite(begun, entry).action if is_end(entry) else event.action
@@ -293,10 +267,10 @@ def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) 
 
 
 def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> bool:
-    """Whether somebody else may have entered the write later: its writer was killed, or it is a job's.
+    """Whether an earlier version may have entered the write later, in another name: the writer was killed.
 
-    Such an event names the entry of the begin, and another entry of the audit tells of whoever entered it: `nothing to
-    do` of the same time, or the job around it.
+    Such an event names the entry of the begin, and another entry has the name and time of the process that entered it:
+    `nothing to do` of the same time, or the job around it. This version appends `write found` instead.
     """
     if is_end(entry) or event.action is not WriteAction.APPLIED:
         return False
@@ -316,9 +290,10 @@ def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) ->
 
 
 def acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
+    """Report where an acknowledgement contradicts its entry of the audit log, as sentences."""
     named = f"as entry {entry.number} of the audit, which it names"
     if entry.action is not AuditAction.ACKNOWLEDGED:
-        yield f"found an entry of the audit ({entry.number}) that tells of {entry.action.value}, expected acknowledged"
+        yield f"found entry {entry.number} of the audit, {entry.action.value}, expected an entry acknowledged"
         return
     since = utc(_text(entry, "since") or "", _NEVER)
     pairs: tuple[tuple[str, object, object], ...] = (
@@ -334,13 +309,13 @@ def acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator
 
 
 def at_of(entry: AuditEntry) -> datetime | None:
-    """When an entry was written, UTC; None where what stands there is no time."""
+    """Return when an entry was written, UTC; None where its time is none."""
     found = utc(entry.at, _NEVER)
     return None if found == _NEVER else found
 
 
 def _text(entry: AuditEntry, key: str) -> str | None:
-    """Anybody can write a chain that holds: what is no text says nothing."""
+    """Return a text; None for anything else, as a forged chain can hold."""
     found = entry.details.get(key)
     return found if isinstance(found, str) else None
 
@@ -351,6 +326,7 @@ def _number(entry: AuditEntry) -> int:
 
 
 def calibration_of(begun: AuditEntry) -> str | None:
+    """Return the SHA-256 of the calibration of an entry, None without one."""
     recorded = begun.details.get("calibration")
     found = recorded.get("sha256") if isinstance(recorded, dict) else None
     return found if isinstance(found, str) else None

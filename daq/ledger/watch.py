@@ -1,4 +1,4 @@
-"""The gains of a history as series, each with its chart: what changed, and whether that is more than noise."""
+"""The gains of a history as series with their charts, and their alarms as sentences for a technician."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Stretch:
 
     Attributes:
         began: index of the first of them in the points of its series.
-        drift: what became of the gain within.
+        drift: of the gain within.
     """
 
     began: int
@@ -54,9 +54,8 @@ class Series:
 
     Attributes:
         axis, unit: of the gain.
-        dispersion: how much more repeated calibrations scatter than σ says; it is in every σ that is told here.
-        points: oldest recording first, one for the same logs; calibrations that held the gain fixed are left out, they
-            know nothing of it.
+        dispersion: scatter of repeated calibrations over their σ; it is in every σ of this series.
+        points: oldest recording first, one for the same logs, without calibrations that held the gain fixed.
         stretches: between changes that were explained, oldest first.
         watching: whether the last of them goes on; not where no calibration came since the last explanation.
         acknowledged: changes that were explained, oldest first.
@@ -130,15 +129,15 @@ def watch(
 
 
 def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, float]:
-    """How much more a cell's calibrations scatter than their σ says, by axis, in the order of `axes`.
+    """Return the scatter of a cell's calibrations over their σ, by axis, in the order of `axes`.
 
-    Of the calibrations that identified an axis, one for the same logs (`of_each_recording`). Axes that the same
-    recordings identified are told together (`ident.drift.change.dispersions`), also where a gain of one of them was
-    held fixed when these were fitted again; an axis that was identified from others is told by itself.
+    It is estimated from the calibrations that identified an axis, one for the same logs (`of_each_recording`), together
+    for axes that the same recordings identified (`ident.drift.change.dispersions`), also where a gain of one of them
+    was held fixed when these were fitted again.
 
     Args:
         entries: of one cell.
-        axes: names; without an entry that identified it, an axis has what is said before there is a history.
+        axes: names.
 
     Returns:
         at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
@@ -158,7 +157,7 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
 
 
 def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
-    """Calibrations that identified the gain of an axis, with it."""
+    """Return the calibrations that identified the gain of an axis, with it."""
     known = {
         entry.digest: gain
         for entry in entries
@@ -170,13 +169,10 @@ def _known(entries: Sequence[Entry], axis: str) -> list[tuple[Entry, Gain]]:
 
 
 def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
-    """One calibration for the same logs, in the order in which the logs were recorded.
+    """Return one calibration for the same logs, in the order in which the logs were recorded.
 
-    What is watched is the robot: the same logs fitted again tell nothing new of it, and logs of last year tell of last
-    year, whenever they were fitted. Of several fits the newest counts that was applied, else the newest.
-
-    Args:
-        entries: of one cell.
+    The robot is watched: the same logs fitted again show nothing new of it, and logs of last year show last year,
+    whenever they were fitted. Of several fits the newest applied one counts, else the newest.
     """
     chosen: dict[str, Entry] = {}
     for entry in sorted(entries, key=lambda one: (one.applied, one.created, one.entered)):
@@ -212,11 +208,7 @@ def _change(before: Gain, after: Gain, dispersion: float) -> Change:
     return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
 
 
-# Alarms as sentences for a technician: what changed, since when, how sure, and what it may be.
-#
-# Questions, not verdicts: a gain tells that the torque for a current is another one, not why.
-
-
+# Questions, not verdicts: a gain shows that the torque for a current has changed, not why.
 _LESS = (
     "less torque for the same current: magnets warmer than usual or demagnetised, a gear that turns harder under load, "
     "or an amplifier that was exchanged or scales its current otherwise? Worn teeth alone do not change a ratio; they "
@@ -259,7 +251,7 @@ def alarm_text(series: Series) -> str | None:
 
 
 def pattern_of(all_series: Sequence[Series]) -> Pattern:
-    """What the changes of all axes look like together; axes without a calibration since their baseline say nothing."""
+    """Return the pattern of the changes of all axes, without axes that have no calibration since their baseline."""
     known = [(s, s.drift) for s in all_series if s.drift is not None and s.drift.change_sigmas != 0]
     changes = [drift.change_percent for _, drift in known]
     stds = [drift.change_percent / drift.change_sigmas for _, drift in known]
@@ -267,7 +259,7 @@ def pattern_of(all_series: Sequence[Series]) -> Pattern:
 
 
 def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
-    """What the alarms may come from; nothing where there are none."""
+    """Return possible causes of the alarms as questions; none without an alarm."""
     alarmed = [s.drift for s in all_series if s.alarmed and s.drift is not None]
     rose = [drift.change_percent > 0 for drift in alarmed]
     match pattern_of(all_series):

@@ -136,9 +136,6 @@ def _save(figure: Figure, path: Path) -> None:
     replace_file(path, drawn.getvalue())
 
 
-# The history as rows of numbers: one a gain of a calibration, for spreadsheets and for --json.
-
-
 COLUMNS = (
     "axis",
     "recorded",
@@ -171,7 +168,7 @@ COLUMNS = (
 
 
 def rows(series: Series) -> list[dict[str, Any]]:
-    """One row a point, by COLUMNS; None where there is nothing to tell."""
+    """Return one row a point, by COLUMNS; None for a missing value."""
     return [_row(series, index) for index in range(len(series.points))]
 
 

@@ -55,7 +55,7 @@ def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str
 
 
 def say_alarms(all_series: Sequence[Series], console: Console) -> None:
-    """What changed, and what it may come from."""
+    """Print what changed, and possible causes."""
     alarms = [words for series in all_series if (words := alarm_text(series)) is not None]
     console.print("No alarm." if not alarms else "")
     for words in alarms:
@@ -246,19 +246,15 @@ def _largest(points: Sequence[Point]) -> str:
     return f"{printable(point.gain.axis)} {percent:+.1f} % {sigmas:.1f} σ"
 
 
-# What was done with each calibration, in words, and which one's gains the controller has now.
-
-
 _WORDS = {WriteAction.APPLIED: "applied", WriteAction.ROLLED_BACK: "restored"}
-"""Of an event after which a controller had the gains of a calibration."""
+"""Words for an event after which a controller had the gains of a calibration."""
 
 
 def in_force(cell: Cell, store: HistoryStore) -> str | None:
-    """Digest of the calibration whose gains this cell's own controller has.
+    """Return the digest of the calibration whose gains this cell's own controller has.
 
-    The controller's file is asked, not the history alone: somebody may have edited it, or copied a backup back by hand,
-    and what was written to another file (`apply --to`) is not in this controller. What stands in drives is asked of
-    nobody here: there, what the history says counts.
+    The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
+    (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts.
 
     Returns:
         None where the file has other numbers than every calibration, or cannot be read.
@@ -283,7 +279,7 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
-    """What was done with each calibration, by its digest.
+    """Return the writes of each calibration in words, by its digest.
 
     Args:
         entries: the calibrations.

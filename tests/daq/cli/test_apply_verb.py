@@ -24,7 +24,7 @@ from daq.ledger.audit import AuditAction, read, verify
 from daq.ledger.judgement import Known
 from daq.ledger.store import HistoryStore
 from daq.report.proposal import significant
-from daq.workflow.calibration_file import decode, save
+from daq.workflow.calibration_file import decode, encode, save
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
@@ -117,7 +117,8 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
     assert main(undo) == ExitCode.OK
     assert "Restored" in capsys.readouterr().out
     assert bench.controller.read_bytes() == before
-    there, back = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED], [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    there = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
     assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
     assert read(bench.audit)[2].who == f"Ada (login {login()})"
     with HistoryStore(bench.cell.with_name("cell.history.sqlite")) as store:
@@ -127,7 +128,8 @@ def test_the_command_shows_writes_and_rolls_back(bench: Bench, capsys: pytest.Ca
 def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
     before = bench.controller.read_bytes()
     assert bench.apply("--yes") == ExitCode.OK
-    begun, applied = read(bench.audit)
+    begun, applied, entered = read(bench.audit)
+    assert entered.details["document"] == encode(decode(bench.calibration.read_bytes(), "")).decode()
     assert (begun.action, begun.who, begun.subject) == (
         AuditAction.APPLY_BEGUN,
         login(),
@@ -226,7 +228,7 @@ def test_no_one_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Pa
     assert bench.apply("--yes") == ExitCode.OK
     assert bench.rollback("--audit", str(other)) == ExitCode.USAGE
     assert not other.exists()
-    assert bench.actions() == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED]
+    assert bench.actions() == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
 
 
 @pytest.mark.parametrize("spoil", ["an end cut off", "one line cut", "emptied", "deleted"])
@@ -552,7 +554,7 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     assert bench.rollback() == ExitCode.OK
     assert bench.controller.is_symlink()
     assert target.read_bytes() == before
-    assert {entry.subject for entry in read(bench.audit)} == {str(target)}
+    assert {entry.subject for entry in read(bench.audit)} == {str(target), "history of demo"}
     place = load_cell(bench.cell).history
     assert place is not None
     with HistoryStore(place.store) as store:

@@ -72,11 +72,13 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     assert "The drives have saved." in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     assert cell.history is not None
+    entered = AuditAction.CALIBRATION_ENTERED
     assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
-        (action, "Kim (login kim)", "drives of cell demo")
+        (action, "Kim (login kim)", "history of demo" if action is entered else "drives of cell demo")
         for action in (
             AuditAction.APPLY_BEGUN,
             AuditAction.APPLIED,
+            entered,
             AuditAction.ROLLBACK_BEGUN,
             AuditAction.ROLLED_BACK,
         )
@@ -94,7 +96,7 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
         assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
         assert store.in_force() is None
         # The two entries that tell how the writes ended.
-        assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::2]}
+        assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
     _back(cell)
     with HistoryStore(cell.history.store) as store:
         assert store.in_force() == hashlib.sha256(encode(demo_calibration())).hexdigest()

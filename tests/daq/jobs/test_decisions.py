@@ -35,7 +35,11 @@ def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_sh
     ended = rig.job()
     assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
     assert rig.controller.read_bytes() == before
-    assert [entry.action for entry in rig.audit][1:] == [AuditAction.PROPOSED, AuditAction.RECALIBRATION_ENDED]
+    assert [entry.action for entry in rig.audit][1:] == [
+        AuditAction.CALIBRATION_ENTERED,
+        AuditAction.PROPOSED,
+        AuditAction.RECALIBRATION_ENDED,
+    ]
     assert "+    gain: -9." in (rig.session.folder / "proposal.diff").read_text()
     *_, command = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
     assert main(command.split()[1:]) == ExitCode.OK
@@ -64,8 +68,9 @@ def test_a_closed_gate_refuses_and_the_next_job_records_anew(tmp_path: Path, mad
         assert rig.sessions[-1].state.exit_code == ExitCode.CALIBRATION_REFUSED
     assert rig.controller.read_bytes() == before
     actions = [entry.action for entry in rig.audit]
-    assert actions[:3] == [
+    assert actions[:4] == [
         AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.CALIBRATION_ENTERED,
         AuditAction.REFUSED,
         AuditAction.RECALIBRATION_ENDED,
     ]

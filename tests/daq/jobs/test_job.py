@@ -36,6 +36,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     actions = [entry.action for entry in rig.audit]
     assert actions == [
         AuditAction.RECALIBRATION_BEGUN,
+        AuditAction.CALIBRATION_ENTERED,
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
         AuditAction.RECALIBRATION_ENDED,
@@ -90,7 +91,7 @@ def test_nothing_is_due_while_the_last_good_calibration_is_young(tmp_path: Path,
         rig.clock.go_on(hours=hours)
         assert rig.job().outcome is Outcome.NOT_DUE
     assert len(rig.sessions) == 1
-    assert len(rig.audit) == 4
+    assert len(rig.audit) == 5
     rig.clock.go_on(hours=2)
     # The same logs again: what is found is what the controller has.
     assert rig.job().outcome is Outcome.UNCHANGED

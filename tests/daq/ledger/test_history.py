@@ -671,7 +671,7 @@ def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsy
         ("acknowledgement SET why = 'x'", "found why 'x', expected 'gearbox changed'"),
         ("acknowledgement SET since = '2026-01-01T00:00:00.000000+00:00'", "found since '2026-01-01T00:00:00"),
         ("acknowledgement SET at = '2026-03-01T00:00:00.000000+00:00'", "found time '2026-03-01T00:00:00"),
-        ("acknowledgement SET audit = (SELECT audit FROM event)", "tells of applied, expected acknowledged"),
+        ("acknowledgement SET audit = (SELECT audit FROM event)", "applied, expected an entry acknowledged"),
         ("gain SET value = value * 1.01 WHERE axis = 'J4'", "gain of J4 in calibration"),
     ],
 )
