@@ -1,4 +1,4 @@
-"""Where the configurations that drivegain ships are: in the wheel, or in a checkout."""
+"""The installation and the user: shipped configurations, version, login."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from daq.errors import ConfigurationMissing
 
 
 def shipped_configurations() -> Path:
-    """The folder with cells/, drives/, robots/, controllers/, imports/ and simulation/.
+    """Return the folder with cells/, drives/, robots/, controllers/, imports/ and simulation/.
 
     Raises:
-        ConfigurationMissing: neither the wheel's copy nor a checkout's is there.
+        ConfigurationMissing: it is neither in the wheel nor in a checkout.
     """
     package = Path(__file__).resolve().parent
     candidates = (package / "_configs", package.parent / "configs")
@@ -29,25 +29,18 @@ def shipped_configurations() -> Path:
     )
 
 
-# Which software this is.
-
-
 def software() -> str:
-    """Name and version, as logs and calibrations keep it."""
+    """Return name and version for logs and calibrations."""
     try:
         return f"drivegain {version('drivegain')}"
     except PackageNotFoundError:
         return "drivegain (not installed)"
 
 
-# Who runs this program, as the operating system knows them.
-
-
 def login() -> str:
-    """Name of the user whose process this is, or the number of one without a name.
+    """Return the name of the user of this process, or the number of a user without a name.
 
-    Not what LOGNAME or USER say, which `getpass.getuser` asks first: a name that anybody may choose makes no second
-    person.
+    LOGNAME and USER, which `getpass.getuser` prefers, are ignored: with them one person could pass for two.
     """
     number = os.getuid()
     try:

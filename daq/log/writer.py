@@ -258,7 +258,7 @@ class LogWriter:
         )
 
     def _open(self) -> None:
-        # Data CRCs protect attachments and metadata too, which stand outside chunks.
+        # Data CRCs protect attachments and metadata too, which are outside chunks.
         self._mcap = Writer(
             self._stream,
             chunk_size=CHUNK_BYTES,

@@ -1,6 +1,6 @@
 """Compare a drive profile with the maker's electronic data sheet (EDS or DCF, CiA 306).
 
-No verb needs data sheets. They are for whoever writes a profile, and for the tests of the shipped ones.
+No verb needs data sheets. They serve the author of a profile, and the tests of the shipped profiles.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ _OWNER, _USER, _GROUP, _MASK, _OTHERS, _NO_ONE = 0x01, 0x02, 0x04, 0x10, 0x20, 0
 
 
 def _access_list(user: int) -> bytes:
-    """As Linux keeps it (version 2): the owner and one more user may read and write, nobody else."""
+    """As Linux keeps it (version 2): the owner and one more user may read and write, no one else."""
     entries = (
         (_OWNER, READ | WRITE, _NO_ONE),
         (_USER, READ | WRITE, user),
@@ -40,7 +40,7 @@ def _set(path: Path, name: str, value: bytes) -> None:
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Of a controller, with an access list and a note."""
+    """A controller file with an access list and a note."""
     path = tmp_path / "demo.yaml"
     path.write_bytes(b"old")
     path.chmod(0o600)

@@ -316,7 +316,7 @@ STEP_A = {
     Dialect.AX2000: tuple(peak / 3280 for peak in (8, 8, 8, 6, 6, 6)),
     Dialect.CIA402: tuple(rated / 1000 for rated in (2, 2, 2, 1.5, 1.5, 1.5)),
 }
-"""Of the amplifiers of the demo cell: 2 and 1.5 A rated, 8 and 6 A peak."""
+"""Ampere per unit of the demo cell: 2 and 1.5 A rated, 8 and 6 A peak."""
 MAKES = {
     Dialect.EPOS4: "maxon-epos4",
     Dialect.COPLEY: "copley",
@@ -347,7 +347,7 @@ def recorded(checkout: Path, folder: Path, patch: pytest.MonkeyPatch, dialect: D
     text = text.replace("period_us: 1000", "period_us: 2000").replace("channel: demo", f"channel: {folder.name}")
     for peak_a in (8, 6):
         (drives / f"{make}-{peak_a}.yaml").write_text(text_of(make, peak_a))
-    # Two sizes of amplifier, as a person would enter them for a make that does not tell its peak current.
+    # Two sizes of amplifier, as a person would enter them for a make that does not report its peak current.
     first, second = text[: text.index("- name: J4")], text[text.index("- name: J4") :]
     cell_file = folder / "cell.yaml"
     cell_file.write_text(

@@ -1,4 +1,4 @@
-"""A log that is invalid because frames were lost: refused, unless somebody says in so many words to use it."""
+"""A log that is invalid because of lost frames is refused unless --accept-losses is given."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class Bench:
 
     @property
     def left(self) -> list[str]:
-        """What is in the folder of the log."""
+        """List the folder of the log."""
         return sorted(path.name for path in self.out.parent.iterdir())
 
 

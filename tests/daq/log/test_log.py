@@ -1,4 +1,4 @@
-"""What goes into a log comes out of it, and any MCAP reader can read it."""
+"""Whatever is sent into a log is read back unchanged, also by any other MCAP reader."""
 
 from __future__ import annotations
 
@@ -181,11 +181,11 @@ def test_a_file_that_appeared_meanwhile_is_not_replaced(
             for sample in samples([[number] for number in range(5)]):
                 log.write(sample)
             log.conclude(True)
-            path.write_bytes(b"somebody else's")
+            path.write_bytes(b"another program's")
 
     with pytest.raises(UsageError, match=r"a\.mcap\.part") as raised:
         record()
-    assert path.read_bytes() == b"somebody else's"
+    assert path.read_bytes() == b"another program's"
     assert "which was not there" in raised.value.found
     path.unlink()
     (tmp_path / "a.mcap.part").rename(path)
@@ -224,7 +224,7 @@ def test_a_log_without_samples_is_incomplete(tmp_path: Path) -> None:
 
 
 def test_samples_have_chunks_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What makes a chunk one `frombuffer`."""
+    """A constant layout, so that a chunk is one `frombuffer`."""
     monkeypatch.setattr("daq.log.reader.BLOCK_SAMPLES", 1)  # a block a chunk
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, 0, "")]
     file = RecordFile(write(tmp_path / "a.mcap", content(2), samples([[k, k] for k in range(900)]), events))

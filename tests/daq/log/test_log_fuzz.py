@@ -1,4 +1,4 @@
-"""Files that nobody wrote: whatever stands in them, a reader gives a log of the same numbers or a named error.
+"""Foreign and damaged files: a reader returns a log of the same numbers or raises a named error.
 
 Three kinds of attack: damage to a genuine log, records made up with right checksums, and genuine chunks with made-up
 messages inside. Bounded in time by the number of examples; derandomised, so that a failure is one tomorrow too.

@@ -1,4 +1,4 @@
-"""What a killed recorder leaves behind is saved, labelled, and never written to a controller."""
+"""The rest of a killed recording is salvaged, marked partial, and never written to a controller."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MOVES = [CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"m
 
 @pytest.fixture
 def part(tmp_path: Path, checkout: Path) -> Path:
-    """What is left of a recording of 700 samples that failed: all of it, as the writer saw the error coming."""
+    """Return the `.part` of a recording of 700 samples that failed: all of it, because the writer caught the error."""
     return _broken_off(tmp_path / "run.mcap", checkout)
 
 
@@ -155,7 +155,7 @@ def test_a_whole_log_needs_no_salvage(tmp_path: Path, checkout: Path) -> None:
 
 
 def test_a_recorder_that_died_before_it_gave_the_log_its_name(tmp_path: Path, checkout: Path) -> None:
-    """Its own verdict is kept; that the log is partial is kept too, because nobody knows why it died."""
+    """Its own verdict is kept; that the log is partial is kept too, because the reason of its death is unknown."""
     part = tmp_path / "run.mcap.part"
     write(tmp_path / "whole.mcap", demo_content(checkout), ROWS, verdict=(False, "3 late answers")).rename(part)
     assert read_log(part).partial
