@@ -12,7 +12,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 FloatArray = NDArray[np.float64]
 
@@ -91,6 +90,8 @@ def _butterworth(order: int, cutoff: float) -> list[tuple[tuple[float, ...], tup
 
 def _filtered(sections: list[tuple[tuple[float, ...], tuple[float, ...]]], values: FloatArray) -> FloatArray:
     """Run the sections over values that were constant before their first sample, shape (c, k)."""
+    from scipy.linalg import lapack  # noqa: PLC0415 - a cell file holds filter settings, and reading it needs no LAPACK
+
     start = values[:, :1]
     out = values - start
     band = np.ones((3, out.shape[1]), order="F")
