@@ -1,6 +1,6 @@
 """Drive CiA 402 amplifiers over CANopen: find them, stream their samples, move them.
 
-Everything that a program needs is here; importing `drivers` loads no module before a name is used.
+Everything that a program needs is here; importing `drivers` loads no module before a name is used::
 
     axes = [drivers.Axis("J1", node_id=1), drivers.Axis("J2", node_id=2)]
     with drivers.open_cell("socketcan:can0", axes) as cell:

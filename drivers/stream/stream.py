@@ -43,8 +43,8 @@ class SyncStream:
         on_event: receives EMCY, NMT and CiA 402 changes and losses before the sample of their cycle is returned.
         max_missing_cycles: tolerated number of incomplete cycles in a row; they are counted, and marked in the samples.
 
-    Raises (by ``next``):
-        SampleLost: more incomplete cycles in a row than tolerated.
+    Raises:
+        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than tolerated.
         DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends no heartbeat for two
             of its periods, an active limit, stale data, or a PDO of wrong length twice in a row.
         BusBusy: another master sends SYNC, NMT commands or set-points of an axis.
