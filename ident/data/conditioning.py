@@ -144,8 +144,11 @@ class Decimator:
         taps = np.zeros(blocks * factor)
         taps[: len(self.taps)] = self.taps
         length = (count + blocks - 1) * factor
-        flat = np.zeros((int(np.prod(shape[:-1])), length))
-        flat[:, : min(length, shape[-1])] = columns.reshape(-1, shape[-1])[:, :length]
+        flat = columns.reshape(-1, shape[-1])
+        if shape[-1] != length:
+            padded = np.zeros((len(flat), length))
+            padded[:, : min(length, shape[-1])] = flat[:, :length]
+            flat = padded
         weighted = flat.reshape(-1, factor) @ taps.reshape(blocks, factor).T
         weighted = weighted.reshape(len(flat), count + blocks - 1, blocks)
         out = np.zeros((len(flat), count))

@@ -61,11 +61,14 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
 
 
 def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]:
-    """Pieces of a run's samples, each with the whole windows of up to so many rows."""
-    rows = filter_.rows(samples)
+    """Cut a run's samples into pieces with the whole windows of up to so many rows.
+
+    A piece ends with a whole block of the decimator, where the run does not end before: it is then filtered in place.
+    """
+    rows, blocks = filter_.rows(samples), -(-len(filter_.taps) // filter_.factor)
     for first in range(0, rows, chunk_rows):
         last = min(first + chunk_rows, rows) - 1
-        yield slice(first * filter_.factor, last * filter_.factor + 2 * filter_.half + 1)
+        yield slice(first * filter_.factor, min((last + blocks) * filter_.factor, samples))
 
 
 @dataclass(frozen=True, slots=True)
