@@ -1,4 +1,4 @@
-"""Before and after: one metric for every error, and a change of a gain that is told from noise."""
+"""Before and after: one metric for every error, and changes of gains that are distinguished from noise."""
 
 from __future__ import annotations
 
@@ -48,16 +48,19 @@ def after(start: Evidence) -> Evidence:
 
 
 @pytest.fixture(scope="module")
-def told(start: Evidence, after: Evidence) -> Account:
+def compared(start: Evidence, after: Evidence) -> Account:
     limits = np.zeros(6)
     steps = (Step((), (), limits, None, after), Step((), (), limits, None, after))
     return account(start, steps)
 
 
-def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, told: Account) -> None:
+def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compared: Account) -> None:
     """From the definition: e_i = v_i − (T τ)_i/g_i over the motor's rows, motor by motor, and weighed by the gains."""
     estimate = start.estimate
-    for rows, error in ((start.training, told.total.before.in_sample), (start.holdout, told.total.before.holdout)):
+    for rows, error in (
+        (start.training, compared.total.before.in_sample),
+        (start.holdout, compared.total.before.holdout),
+    ):
         assert rows is not None
         assert error is not None
         torque = np.linalg.solve(rows.drive_train.direction.T, estimate.predicted_torque(rows))
@@ -72,9 +75,9 @@ def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, told: A
         assert error.total == pytest.approx(100.0 * weighed)
 
 
-def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, told: Account) -> None:
+def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, compared: Account) -> None:
     """Motors 1 to 4 drive their joints alone: ‖e‖/‖v‖ is ‖ρ‖/‖Y‖ there."""
-    assert told.total.before.in_sample.axes[:4] == pytest.approx(start.training_error.axes[:4], rel=1e-6)
+    assert compared.total.before.in_sample.axes[:4] == pytest.approx(start.training_error.axes[:4], rel=1e-6)
 
 
 def test_parts_of_the_data_add_up(start: Evidence) -> None:
@@ -96,8 +99,8 @@ def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> N
     assert np.all(error_left_out(folds).left > error_left_out(seen).left)
 
 
-def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(told: Account) -> None:
-    before, after = told.total.before, told.total.after
+def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(compared: Account) -> None:
+    before, after = compared.total.before, compared.total.after
     pairs = (
         (before.in_sample, after.in_sample),
         (before.cross_validated, after.cross_validated),
@@ -109,14 +112,14 @@ def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(told: Account) 
         assert second.axes[2] < 0.8 * first.axes[2]
         assert second.axes[0] == pytest.approx(first.axes[0], rel=0.02)
         assert second.total < first.total
-    assert told.total.added == (SPRING,)
-    assert told.total.removed == ()
+    assert compared.total.added == (SPRING,)
+    assert compared.total.removed == ()
 
 
-def test_a_turn_that_adds_nothing_has_no_before_and_after(told: Account) -> None:
-    first, last = told.turns
+def test_a_turn_that_adds_nothing_has_no_before_and_after(compared: Account) -> None:
+    first, last = compared.turns
     assert last is None
-    assert first == told.total
+    assert first == compared.total
 
 
 def test_what_is_taken_out_again_is_reported(start: Evidence, after: Evidence) -> None:
@@ -134,8 +137,8 @@ def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, a
     assert again.effects == ()
 
 
-def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, told: Account) -> None:
-    for motor, gain in enumerate(told.total.gains):
+def test_gains_carry_their_own_sigma(start: Evidence, after: Evidence, compared: Account) -> None:
+    for motor, gain in enumerate(compared.total.gains):
         assert (gain.before, gain.before_std) == (start.estimate.gains[motor], start.estimate.gains_std[motor])
         assert (gain.after, gain.after_std) == (after.estimate.gains[motor], after.estimate.gains_std[motor])
         assert gain.change_percent == pytest.approx(100.0 * (gain.after - gain.before) / gain.before)

@@ -1,4 +1,4 @@
-"""Statistical honesty: folds do not leak, the same seed says the same, and noise alone gets no name."""
+"""Statistical honesty: folds do not leak, a seed fixes the result, and noise alone gets no name."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
 
 
 def _shows_its_own(folds: Folds, other: Folds) -> float:
-    """What a change of three in all that fold 0 measured did to its own left-out residual: three, if it has no say."""
+    """Effect on the held-out residual of fold 0 of a change of three in all its rows: three, if it has no influence."""
     own = _fold_of_rows(folds) == 0
     return float(np.mean((other.residual - folds.residual)[own]))
 
@@ -53,7 +53,7 @@ def _changed(problem: Linearisation, folds: Folds) -> Linearisation:
     return replace(problem, residual=problem.residual + 3.0 * np.isin(problem.cluster, first))
 
 
-def test_a_left_out_fold_has_no_say_in_its_own_prediction(problem: Linearisation) -> None:
+def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearisation) -> None:
     folds = cut(problem)
     fold = _fold_of_rows(folds)
     parts = [set(folds.problem.cluster[fold == number]) for number in range(folds.count)]
@@ -158,7 +158,7 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
 
 
 def _noise_trial(rng: np.random.Generator, moves: int, columns: int, rows: int = 8) -> Trial:
-    """A candidate on noise alone, in moves of different loudness: what the bootstrap has to survive."""
+    """A candidate on noise alone, in moves of different loudness."""
     x = rng.normal(size=(moves, rows, columns)) * rng.uniform(0.5, 2.0, size=(moves, 1, 1))
     e = rng.normal(size=(moves, rows)) + 0.7 * rng.normal(size=(moves, 1))
     gram = np.einsum("mra,mrb->mab", x, x)

@@ -1,4 +1,4 @@
-"""The noise floor: a known noise comes back, whatever the axis does while it rests, and nothing is told of nothing."""
+"""Noise floor: a known noise is recovered, whatever the axis does at rest; without data there is no floor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 NOISE_A = np.array([0.3, 0.1, 0.05, 0.2, 0.4, 0.02])
 DEVIATIONS = 4.0
-"""Of the estimate itself, told by its own std_percent: one of a run's six motors is outside by chance in 2600 runs."""
+"""Limit in σ of the estimate itself, by its std_percent: one of six motors is outside by chance in 2600 runs."""
 
 
 def _resting(truth: Truth, runs: int = 3) -> tuple[Dataset, ...]:
@@ -77,7 +77,7 @@ def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dat
     drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
     relative = np.array([[floor.noise_a for floor in floors] for floors in drawn]) / _expected_a(resting[0])
     reported = np.mean([floor.std_percent for floor in drawn[0]]) / 100.0
-    # 120 estimates: their mean is known to told/√120, their scatter to 1/√240 of itself; three of those.
+    # 120 estimates: their mean is known to std_percent/√120, their scatter to 1/√240 of itself; three of those.
     assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
     assert relative.std() == pytest.approx(reported, rel=0.25)
 

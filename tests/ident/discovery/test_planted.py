@@ -42,8 +42,8 @@ GATES = Gates(draws=199)
 
 
 @dataclass(frozen=True)
-class True1:
-    """What really acts on a run, from the truth alone; arrays of all axes, shape (n, k), and the axis in question."""
+class TrueSignals:
+    """True signals of a run; arrays of all axes, shape (n, k), and the axis in question."""
 
     axis: int
     positions: FloatArray
@@ -60,27 +60,27 @@ class True1:
 
     @property
     def position(self) -> FloatArray:
-        """Of the axis."""
+        """Position of the axis."""
         return np.asarray(self.positions[self.axis])
 
     @property
     def velocity(self) -> FloatArray:
-        """Of the axis."""
+        """Velocity of the axis."""
         return np.asarray(self.velocities[self.axis])
 
     @property
     def load(self) -> FloatArray:
-        """Of the axis."""
+        """Load of the axis."""
         return np.asarray(self.loads[self.axis])
 
     @property
     def motor_torque(self) -> FloatArray:
-        """Of the axis."""
+        """Motor torque of the axis."""
         return np.asarray(self.motor_torques[self.axis])
 
     @property
     def motor_angle(self) -> FloatArray:
-        """Of the axis."""
+        """Motor angle of the axis."""
         return np.asarray(self.motor_angles[self.axis])
 
     def accelerated(self, of_time: FloatArray) -> FloatArray:
@@ -99,11 +99,11 @@ class Planted:
 
     family: str
     axis: int
-    torque: Callable[[True1], FloatArray]
+    torque: Callable[[TrueSignals], FloatArray]
     expected: tuple[float, ...]
 
 
-def _bristle(t: True1, distance_rad: float) -> FloatArray:
+def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
     """z of Dahl's model, sample by sample: dz = (1 − z s) dq/η with the exact solution over one step."""
     z, out = 0.0, np.empty_like(t.velocity)
     for k, step in enumerate(t.velocity / t.rate_hz):
@@ -113,7 +113,7 @@ def _bristle(t: True1, distance_rad: float) -> FloatArray:
     return np.asarray(out)
 
 
-def _pushed(t: True1, half_gap_rad: float) -> FloatArray:
+def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
     """Torque of all joints for the joint behind a gap, which follows its motor from flank to flank."""
     through = t.load + t.frictions[t.axis]
     width = 0.15 * np.sqrt(np.mean(through**2))
@@ -121,25 +121,25 @@ def _pushed(t: True1, half_gap_rad: float) -> FloatArray:
     return np.asarray(-half_gap_rad * t.pull() * t.accelerated(flank))
 
 
-def _between(t: True1, other: int, along: FloatArray) -> FloatArray:
+def _between(t: TrueSignals, other: int, along: FloatArray) -> FloatArray:
     """The same friction on two joints."""
     torque = np.zeros_like(t.positions)
     torque[[t.axis, other]] = along
     return torque
 
 
-def _rubbing(t: True1, other: int) -> FloatArray:
+def _rubbing(t: TrueSignals, other: int) -> FloatArray:
     both = t.velocities[t.axis] + t.velocities[other]
     return _between(t, other, 2.0 * np.sign(both) + 0.8 * both)
 
 
-def _inertial(t: True1, other: int) -> FloatArray:
+def _inertial(t: TrueSignals, other: int) -> FloatArray:
     torque = np.zeros_like(t.positions)
     torque[t.axis], torque[other] = 0.25 * t.accelerations[other], 0.25 * t.accelerations[t.axis]
     return torque
 
 
-def _cold(t: True1, clock_s: FloatArray, constant_s: float) -> FloatArray:
+def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
     return np.asarray(np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * np.sign(t.velocity) + 2.0 * t.velocity))
 
 
@@ -183,17 +183,17 @@ def small_session(small_truth: Truth, small_runs: tuple[Run, ...]) -> Evidence:
 
 @pytest.fixture(scope="module")
 def cache() -> ColumnCache:
-    """Of the one motion that all cases share."""
+    """Columns of the one motion that all cases share."""
     return {}
 
 
 @pytest.fixture(scope="module")
 def small_cache() -> ColumnCache:
-    """Of the small arm's."""
+    """The same for the small arm."""
     return {}
 
 
-def _true(truth: Truth, data: Dataset, axis: int) -> True1:
+def _true(truth: Truth, data: Dataset, axis: int) -> TrueSignals:
     names = [column.name for column in truth.model.columns]
     parameters = truth.parameters.copy()
     if data.payload is not None:
@@ -214,7 +214,7 @@ def _true(truth: Truth, data: Dataset, axis: int) -> True1:
         )
         return np.asarray(moved - at_rest)
 
-    return True1(
+    return TrueSignals(
         axis=axis,
         positions=motion.position_rad.T,
         velocities=motion.velocity_rad_s.T,

@@ -1,4 +1,4 @@
-"""What has no name: found as a smooth or periodic term on the right axis and variable, and silence with its size."""
+"""Structure without a name: found as a smooth or periodic term on the right axis and variable; detection limits."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def _agree(found: Trial | None, expected: Trial) -> None:
 @given(seed=st.integers(0, 2**32 - 1), widths=st.lists(st.integers(1, 4), min_size=1, max_size=3))
 @settings(max_examples=15, deadline=None)
 def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
-    """Of candidates of one and of several columns side by side, on all motors or on one alone."""
+    """Candidates of one and of several columns side by side, on all motors or on one alone."""
     rng = np.random.default_rng(seed)
     folds = cut(_problem(rng))
     problem = folds.problem

@@ -160,7 +160,7 @@ def test_a_quarter_of_the_differences_may_be_of_any_size() -> None:
 
 
 def test_scatter_is_known_better_than_by_the_median() -> None:
-    """Of a thousand differences the prior hardly draws; the median is worth little more than a third of them."""
+    """A thousand differences outweigh the prior; the median is worth little more than a third of them."""
     rng = np.random.default_rng(11)
     values, stds = draw(rng, (300, 1, 1001), 1.5)
     away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
@@ -207,7 +207,7 @@ def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
 
 @pytest.mark.parametrize(("count", "newest"), [(15, 1), (16, 2), (17, 3), (18, 3)])
 def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int) -> None:
-    """What lies before the onset is no part of what came after it."""
+    """Calibrations before the onset are no part of the change after it."""
     values = np.r_[np.full(14, 10.0), np.full(count - 14, 9.4)]
     found = cusum(values, np.full(count, 0.04))
     assert found.alarmed

@@ -1,4 +1,4 @@
-"""Every effect claims a property of its columns; here is the one test that tries to refute them all."""
+"""Every effect declares a property of its columns; one test tries to refute them all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ JOINTS, SAMPLES = 13, 400
 
 
 def random_signals(seed: int) -> Signals:
-    """Of eleven joints that no mechanics binds together."""
+    """Signals of thirteen joints without mechanics between them."""
     rng = np.random.default_rng(seed)
     position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
     torque = np.cumsum(motor, axis=1)

@@ -1,4 +1,4 @@
-"""What effects are made of: clocks, inertia and torques, against the truth and the mechanics library."""
+"""Signals: clocks, inertia and torques, against the truth and the mechanics library."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(small_truth: 
 
 
 def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, data: Dataset) -> None:
-    """Of links and payload; drawn between postures, so it follows to a hundredth."""
+    """Mass matrix of links and payload; interpolated between postures, so it follows to a hundredth."""
     parameters = _without(small_truth, "Ia", "fv", "fs", "off")
     still = np.zeros_like(data.position_rad)
     rng = np.random.default_rng(1)
@@ -84,7 +84,7 @@ def test_inertia_is_torque_per_acceleration_at_every_sample(small_truth: Truth, 
 def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
     small: Evidence, small_truth: Truth, data: Dataset
 ) -> None:
-    """Ia of joints 1 and 2 cannot be told from their links; that of joint 3 is a parameter of its own."""
+    """Ia of joints 1 and 2 cannot be distinguished from their links; that of joint 3 is a parameter of its own."""
     found = fitted_signals(small.model, data, small.training, small.estimate).inertia_kg_m2
     true = _made(small_truth, data).inertia_kg_m2
     rotors = np.array([0.03, 0.03, 0.0])
@@ -113,7 +113,7 @@ def test_without_a_clock_the_session_is_the_run(small_truth: Truth, data: Datase
 
 
 def test_one_run_without_a_clock_leaves_all_without(small_truth: Truth, data: Dataset) -> None:
-    """Else the runs that know would stand a clock's reading, not a session, away from those that do not."""
+    """Else runs with a clock would be a clock's reading, not a session, away from those without."""
     runs = [replace(data, started_s=1.7e9), replace(data, started_s=None)]
     made = _made(small_truth, runs[0], session_began_s(runs))
     assert np.array_equal(made.session_s, made.time_s)
