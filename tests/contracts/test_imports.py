@@ -77,6 +77,9 @@ def test_the_contracts_are_kept() -> None:
         ("daq/errors.py", "import canopen", "daq is not allowed to import canopen"),
         ("daq/workflow/fit.py", "import daq.simulation.simulation_file", "daq.workflow is not allowed to import daq"),
         ("daq/log/reader.py", "import drivers.simulation.spec", "daq.log is not allowed to import drivers.simulation"),
+        ("daq/files.py", "import daq.config.cell", "daq.files is not allowed to import daq.config"),
+        ("daq/config/drive.py", "import daq.log.metadata", "daq.config is not allowed to import daq.log"),
+        ("daq/log/reader.py", "import daq.workflow.fit", "daq.log is not allowed to import daq.workflow"),
         # Also by way of a module that nobody has named.
         ("drivers/errors.py", "import drivers.simulation.spec", "daq.writeback is not allowed to import drivers.sim"),
     ],
