@@ -141,12 +141,8 @@ def _enter(cell: Cell, written: Written, now: datetime, actor: Applier) -> None:
     record_in_history(
         cell,
         actor,
-        lambda ledger: ledger.rolled_back(
-            at=now,
-            who=str(actor),
-            target=edit.subject,
-            sha256_after=sha256(edit.after),
-            audit=written.audit_sha256,
+        lambda ledger: ledger.record_rolled_back(
+            at=now, target=edit.subject, sha256_after=sha256(edit.after), entry=written.audit_sha256
         ),
     )
 

@@ -110,6 +110,11 @@ class Ledger(HistoryStore):
         if not any(entry in write.digests for write in self.catch_up()):
             self.applied(digest, at=at, who=self.who, target=target, audit=entry, sha256_after=sha256_after)
 
+    def record_rolled_back(self, *, at: datetime, target: str, sha256_after: str, entry: str | None) -> None:
+        """Enter that the last write to a target was undone. Args and errors as in `record_applied`."""
+        if not any(entry in write.digests for write in self.catch_up()):
+            self.rolled_back(at=at, who=self.who, target=target, sha256_after=sha256_after, audit=entry)
+
     def acknowledge_change(self, axis: str, *, since: datetime, at: datetime, who: str, why: str) -> None:
         """Record that a change of a gain is explained.
 

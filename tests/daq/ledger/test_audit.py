@@ -256,7 +256,7 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(tmp_path: Path, spo
     first, last = _lines(path)
     path.write_bytes(first + b"\n" + spoil(last) + b"\n")
     spoiled = path.read_bytes()
-    with pytest.raises(AuditUnusable, match="line 2 that is not"):
+    with pytest.raises(AuditUnusable, match="line 2, which drivegain did not write"):
         _filled(path, 1)
     assert exit_code(AuditUnusable) == 3
     assert path.read_bytes() == spoiled

@@ -180,6 +180,28 @@ def test_a_process_killed_before_the_index_is_repaired_by_the_next(
     assert bench.verify() == 0
 
 
+def test_a_rollback_enters_the_killed_write_before_it(bench: Bench) -> None:
+    with bench.ledger() as ledger:
+        digest = enter(ledger, calibration_of(0))
+    bench.append_write(digest, 0)
+    details = {"sha256_before": digest[::-1], "sha256_after": "0" * 64}
+    begun = append(
+        bench.place.audit, AuditAction.ROLLBACK_BEGUN, at=BEGIN, who="anna", subject=bench.controller, details=details
+    )
+    ended = append(
+        bench.place.audit,
+        AuditAction.ROLLED_BACK,
+        at=BEGIN,
+        who="anna",
+        subject=bench.controller,
+        details={"begun": begun.number},
+    )
+    with bench.ledger() as ledger:
+        ledger.record_rolled_back(at=BEGIN, target=bench.controller, sha256_after="0" * 64, entry=ended.sha256)
+        assert [event.action for event in ledger.events()] == [WriteAction.APPLIED, WriteAction.ROLLED_BACK]
+    assert bench.verify() == 0
+
+
 def test_a_late_write_is_put_in_its_place(bench: Bench) -> None:
     with bench.ledger() as ledger:
         one, two = (enter(ledger, calibration_of(week)) for week in range(2))
