@@ -15,8 +15,9 @@ import can
 
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.link import SYNC_COB_ID, Link
-from drivers.canopen.pdo import Direction, feedback_entries, layout, pack, records
+from drivers.canopen.pdo import feedback_entries
 from drivers.profiles.profile import Axis, ObjectEntry
+from drivers.stream.answers import slots_of
 from drivers.stream.sample import CellEvent
 from drivers.stream.split_bus import SplitAddress
 
@@ -84,11 +85,7 @@ class _AxisWatch:
     def __init__(self, axis: Axis) -> None:
         self.node_id = axis.node_id
         self.entries = feedback_entries(axis)
-        pdos = pack(self.entries)
-        self.slots = {
-            record.cob_id: (layout(pdo), tuple(self.entries.index(entry) for entry in pdo))
-            for pdo, record in zip(pdos, records(Direction.TPDO, axis.node_id, pdos), strict=True)
-        }
+        self.slots = slots_of((axis,))  # of one axis alone: columns are indices of its entries
         self.values: list[int | None] = [None] * len(self.entries)
         self.seen: set[int] = set()
         self.followed = False
@@ -98,11 +95,11 @@ class _AxisWatch:
         self.due_ns = 0
 
     def hear(self, cob_id: int, data: bytes) -> None:
-        form, places = self.slots[cob_id]
-        if len(data) != form.size:
+        slot = self.slots[cob_id]
+        if len(data) != slot.length:
             return  # another master's mapping: not ours to interpret
-        for place, value in zip(places, form.unpack(data), strict=True):
-            self.values[place] = value
+        for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
+            self.values[column] = value
         self.seen.add(cob_id)
         self.readings += self.seen == self.slots.keys()
 
