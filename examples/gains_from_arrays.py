@@ -26,7 +26,7 @@ DISC = ident.Payload("disc", mounting="flange", known={"m": 4.59})  # weighed; i
 
 
 def record(model: ident.Model, name: str, payload: ident.Payload | None, seed: int) -> ident.Run:
-    """Stand-in for your recording: positions [rad] and current references [A], shape (n_samples, n_axes), at 500 Hz."""
+    """Simulate a recording of yours: positions [rad] and current references [A], shape (n_samples, n_axes), 500 Hz."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, 40.0, 0.002)
     speed, phase = rng.uniform(0.5, 4.0, (3, 5)), rng.uniform(0.0, 6.3, (3, 5))

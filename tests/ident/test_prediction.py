@@ -71,7 +71,7 @@ def _of(identification: Evidence) -> Calibration:
 
 
 def _largest_difference(identification: Evidence) -> float:
-    """Of the two predictions on the decimated rows, relative to the largest torque."""
+    """Largest difference of the two predictions on the decimated rows, relative to the largest torque."""
     calibration = _of(identification)
     expected = identification.estimate.predicted_torque(identification.training)
     rows = [

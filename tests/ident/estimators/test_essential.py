@@ -23,7 +23,7 @@ ESTIMATORS = (wls, tls, ml)
 
 @pytest.fixture(scope="module")
 def system(truth: Truth, noisy_runs: tuple[Run, ...]) -> System:
-    """Of noisy runs."""
+    """System of noisy runs."""
     return identify(truth.model, noisy_runs, CONDITIONING).system
 
 

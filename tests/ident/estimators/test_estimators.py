@@ -154,7 +154,7 @@ def test_more_runs_of_one_mounting_share_its_unknowns(truth: Truth, noisy_runs: 
 def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
     truth: Truth, clean_runs: tuple[Run, ...]
 ) -> None:
-    """Joint 6 stands while joint 5 moves: no row of the coupled motors is free of an undetermined dry friction."""
+    """Joint 6 rests while joint 5 moves: no row of the coupled motors is free of an undetermined dry friction."""
     system = identify(truth.model, clean_runs, CONDITIONING, method=Method.WLS).system
     apart = replace(
         system,

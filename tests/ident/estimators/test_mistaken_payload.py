@@ -43,7 +43,7 @@ def test_forgotten_in_a_run_declared_loaded(truth: Truth, noisy_runs: tuple[Run,
 
 
 def test_exchanged_roles_turn_every_sign(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    """They are no contradiction: the robot is taken to be lighter by the payload. Only the nameplate's signs tell."""
+    """They are no contradiction: the robot is taken to be lighter by the payload. The nameplate's signs show it."""
     exchanged = tuple(replace(run, payload=None if run.payload else MOUNTED) for run in noisy_runs)
     assert identify(truth.model, exchanged, CONDITIONING).estimate.gains == pytest.approx(-GAINS, rel=0.05)
 

@@ -104,7 +104,7 @@ def test_a_mass_is_found_with_its_uncertainty(truth: Truth, mixed: tuple[Run, ..
 
 
 def test_the_claimed_sigma_covers_the_scatter(truth: Truth) -> None:
-    """Over repetitions the mass scatters as much as each of them says; twelve tell it within a factor of two."""
+    """Over repetitions the mass scatters as much as each of them says; twelve show it within a factor of two."""
     rng = np.random.default_rng(7)
     bare = _reduced(truth, record(truth, "bare", rng, noise_a=0.3))
     runs = [record(truth, f"loaded{index}", rng, MOUNTED, noise_a=0.3) for index in range(12)]

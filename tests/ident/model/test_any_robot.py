@@ -26,7 +26,7 @@ from tests.ident.recordings import positions
 FloatArray = NDArray[np.float64]
 Gravity = tuple[float, float, float]
 
-STANDING: Gravity = (0.0, 0.0, -9.81)
+UPRIGHT: Gravity = (0.0, 0.0, -9.81)
 LEANING: Gravity = (5.6, -3.2, 7.4)
 RATE_HZ = 250.0
 SCREW = 2.0 * np.pi / 0.02
@@ -80,13 +80,13 @@ KINDS = (
         np.array([0.7, 0.45, 0.25, 3.0, 1.8]),
     ),
 )
-CASES = [(kind, gravity) for kind in KINDS for gravity in (STANDING, LEANING)]
+CASES = [(kind, gravity) for kind in KINDS for gravity in (UPRIGHT, LEANING)]
 
 
 def _name(value: object) -> str:
     if isinstance(value, Kind):
         return value.urdf.removesuffix(".urdf")
-    return "standing" if value == STANDING else "leaning"
+    return "upright" if value == UPRIGHT else "leaning"
 
 
 @cache
@@ -161,12 +161,12 @@ def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None
 @settings(deadline=None, max_examples=3)
 @given(data=st.data())
 def test_permuting_the_motors_permutes_the_gains_and_nothing_else(kind: Kind, data: st.DataObject) -> None:
-    """Of motors: g/N, the torque of the motor for a unit of current. N is that of the joint of the motor's number."""
-    model, _, _ = _truth(kind.urdf, STANDING)
+    """Motor constants g/N, motor torque for a unit of current. N is that of the joint of the motor's number."""
+    model, _, _ = _truth(kind.urdf, UPRIGHT)
     rng = np.random.default_rng(9)
     runs = tuple(
         replace(run, current_a=run.current_a * (1 + 0.02 * rng.standard_normal(run.current_a.shape)))
-        for run in _runs(kind.urdf, STANDING)
+        for run in _runs(kind.urdf, UPRIGHT)
     )
     order = np.array(data.draw(st.permutations(range(len(kind.gains)))))
     train = DriveTrain(kind.ratio[order])
@@ -188,9 +188,9 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(kind: Kind, da
 
 @pytest.mark.parametrize("kind", KINDS, ids=_name)
 def test_the_mounting_must_be_declared(kind: Kind) -> None:
-    """Data of a leaning robot, fitted as a standing one: the residual shows it."""
+    """Data of a leaning robot, fitted as an upright one: the residual shows it."""
     leaning, _, _ = _truth(kind.urdf, LEANING)
-    standing, _, _ = _truth(kind.urdf, STANDING)
+    standing, _, _ = _truth(kind.urdf, UPRIGHT)
     bare = _runs(kind.urdf, LEANING)[:1]
     right, wrong = (
         identify(model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains).training_error.total
@@ -202,7 +202,7 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
 
 
 def test_prismatic_joints_have_newton_for_their_friction() -> None:
-    model, _, _ = _truth("gantry.urdf", STANDING)
+    model, _, _ = _truth("gantry.urdf", UPRIGHT)
     units = {column.name: column.unit for column in model.columns}
     assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == ("kg", "N/(m/s)", "N", "N")
     assert (units["Ia4"], units["fv4"], units["fs4"], units["off4"]) == ("kg m²", "Nm/(rad/s)", "Nm", "Nm")

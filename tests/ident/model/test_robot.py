@@ -1,4 +1,4 @@
-"""What a URDF must be for its joints to be a robot's, and that it is read as Pinocchio reads it."""
+"""Requirements on a URDF for its joints to be a robot's, and that it is read as Pinocchio reads it."""
 
 from __future__ import annotations
 
