@@ -83,7 +83,7 @@ def test_a_shipped_profile_is_whole_and_every_fact_has_a_source(name: str) -> No
         "save",
     }  # fmt: skip
     assert profile.save_semantics
-    # A fact said to stand in a data sheet is one that the tests below look up.
+    # A fact with a data sheet as its basis is one that the tests below look up.
     assert (name in SHEETS) is any(fact.basis is Basis.EDS for fact in profile.facts)
 
 
