@@ -19,8 +19,8 @@ read a log                          `read_log` (raw counts), `load_run` (SI unit
 logs to a `Calibration`              `fit_logs`; in steps: `fit`, `close_loop`, `calibration_of`, `Fit`
 keep a calibration                  `save_calibration`, `load_calibration`
 test it on other logs               `validate`, `Validation`
-write it to the controller          `FileTarget`, `DriveTarget`, `propose`, `Request`, `Proposal`, `apply`,
-                                    `Written`, `rollback`
+where the gains are written         `FileTarget`, `DriveTarget`
+write them, and undo it             `Request`, `propose`, `Proposal`, `apply`, `Written`, `rollback`
 errors                              `DaqError` and its subclasses (daq/errors.py)
 ==================================  ==============================================================================
 
