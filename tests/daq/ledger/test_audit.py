@@ -1,4 +1,4 @@
-"""The audit: whatever is done to its lines is found, what a killed writer leaves is told, nothing is taken away."""
+"""The audit: whatever is done to its lines is found, what a killed writer leaves is reported, nothing is removed."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_one_changed_byte_is_found_at_its_line(line: int, data: st.DataObject) -
         assert verdict.flaws[0].flaw is Flaw.EDITED
         assert len(verdict.flaws) == 1
     else:
-        # An unfinished last line may be a killed writer's: told, and no entry of what it was.
+        # An unfinished last line may be a killed writer's: reported, and no longer an entry.
         assert verdict.broken == 6 or verdict.torn == (6,)
 
 
@@ -150,7 +150,7 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
     with _folder() as folder:
         entries = _filled(folder / "a")
     was = entries[place]
-    forged = entry(was.number, was.at, "somebody else", was.action, was.subject, was.details, was.previous)
+    forged = entry(was.number, was.at, "another person", was.action, was.subject, was.details, was.previous)
     verdict = _judge([encode(forged if one is was else one) for one in entries])
     assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(place + 1, Flaw.EDITED)]
     # Put between two others, it is one entry of that number too many.
@@ -190,7 +190,7 @@ def test_what_killed_writers_leave_stays_and_is_reported(cuts: list[float], data
         verdict = verify(path)
         assert verdict.holds
         assert [one.number for one in verdict.entries] == list(range(1, len(verdict.entries) + 1))
-        # A fragment that somebody removes, or changes, after it was told of is missed.
+        # A fragment that is removed or changed after it was reported is missed.
         lines = _lines(path)
         for torn in verdict.torn:
             assert not _judge(lines[: torn - 1] + lines[torn:]).holds
@@ -373,7 +373,7 @@ def test_a_lock_that_is_never_given_back_is_reported(tmp_path: Path, monkeypatch
 
 
 def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
-    """An entry that tells of an unfinished line, and none is there: it was taken away."""
+    """An entry reports an unfinished line, and none is there: it was removed."""
     _filled(tmp_path / "a", 1)
     with (tmp_path / "a").open("ab") as stream:
         stream.write(b'{"action":')
@@ -386,7 +386,7 @@ def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
 def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
     (one,) = _filled(tmp_path / "a", 1)
     assert one.holds
-    assert not replace(one, who="somebody else").holds
+    assert not replace(one, who="another person").holds
 
 
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])

@@ -191,7 +191,7 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(cell: Path, capsys: py
 
 
 def test_an_alarm_that_has_passed_has_no_date(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """5 % on one day, the fourth: its row keeps the alarm, and what is told of the gain is as of any other."""
+    """5 % on one day, the fourth: its row keeps the alarm, and the rest of the gain is as of any other."""
     _filled(cell, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
     series = _series(cell)[3]
     assert series.alarm_at(3) is not None
@@ -281,9 +281,9 @@ def test_old_logs_fitted_today_report_their_own_time(cell: Path) -> None:
     assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
 
 
-@pytest.mark.parametrize("told", [None, float("nan"), 1e300])
-def test_a_log_without_its_time_has_that_of_the_fit(told: float | None) -> None:
-    assert recorded_at(with_recordings(calibration_of(3), recorded_s=told), BEGIN) == BEGIN
+@pytest.mark.parametrize("recorded_s", [None, float("nan"), 1e300])
+def test_a_log_without_its_time_has_that_of_the_fit(recorded_s: float | None) -> None:
+    assert recorded_at(with_recordings(calibration_of(3), recorded_s=recorded_s), BEGIN) == BEGIN
 
 
 def test_a_gain_that_was_held_fixed_knows_nothing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -385,7 +385,7 @@ def test_a_change_that_is_explained_begins_a_new_baseline(cell: Path, capsys: py
     assert not series.alarmed
     assert series.began == 25
     assert [stretch.began for stretch in series.stretches] == [0, 25]
-    assert series.alarm_at(24) is not None  # what was told stays told
+    assert series.alarm_at(24) is not None  # a shown alarm stays
     assert not any(other.acknowledged for other in _series(cell) if other.axis != "J4")
     (entry,) = read(_place(cell).audit)
     assert entry.action is AuditAction.ACKNOWLEDGED
@@ -533,7 +533,7 @@ def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.Ca
 
 
 def test_an_audit_without_the_end_of_a_session_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A session keeps the digest of the entry that tells of its end."""
+    """A session keeps the digest of the entry that ends it."""
     cell.write_text(cell.read_text() + RECALIBRATION)
     declared = load_cell(cell)
     assert declared.recalibration is not None
@@ -575,7 +575,7 @@ def test_a_broken_history_is_reported(cell: Path, capsys: pytest.CaptureFixture[
 
 
 def _write_down(cell: Path, digest: str, *, back: bool = False, at: datetime = BEGIN) -> AuditEntry:
-    """A write to the cell's controller as the audit tells of it; the history is not told. Its end."""
+    """A write to the cell's controller in the audit, not in the history; the entry that ends it."""
     controller, audit = load_cell(cell).controller_path, _place(cell).audit
     begun, ended = AuditAction.APPLY_BEGUN, AuditAction.APPLIED
     if back:
@@ -764,27 +764,27 @@ def test_in_force_is_what_the_cell_s_own_controller_has(cell: Path, capsys: pyte
         with HistoryStore(_place(cell).store) as store:
             store.applied(digest, at=BEGIN, who="anna", target=target)
 
-    def told() -> str | None:
+    def found_in_force() -> str | None:
         return str(found) if (found := _json(capsys, str(cell))["in_force"]) else None
 
     applied(first, own)
     applied(second, "/another/controller.yaml")
-    assert told() == first
+    assert found_in_force() == first
     applied(third, own)
-    assert told() == first  # whatever the history says: the backup was copied back by hand
+    assert found_in_force() == first  # whatever the history says: the backup was copied back by hand
     _put(cell, third)
-    assert told() == third
+    assert found_in_force() == third
     edited = Path(own).read_text().replace("loop:", "lopp:")
     Path(own).write_text(edited + "# K.\n")
-    assert told() == third  # the gains are the same
+    assert found_in_force() == third  # the gains are the same
     capsys.readouterr()
     assert main(["history", str(cell)]) == 0
     assert " ".join(capsys.readouterr().out.split()).count("in force") == 1
     _put(cell, third)
     Path(own).write_text(re.sub("gain: -9[.0-9]*", "gain: -9.5", Path(own).read_text()))
-    assert told() is None
+    assert found_in_force() is None
     Path(own).unlink()
-    assert told() is None
+    assert found_in_force() is None
 
 
 def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:

@@ -294,7 +294,7 @@ def test_a_foreign_file_is_refused_and_left_alone(tmp_path: Path, content: bytes
     path = tmp_path / "h"
     if content is None:
         with closing(sqlite3.connect(path)) as other:
-            other.execute("CREATE TABLE somebody (else_ INTEGER)")
+            other.execute("CREATE TABLE another (else_ INTEGER)")
             other.commit()
     else:
         path.write_bytes(content)
