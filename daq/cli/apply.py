@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -29,20 +29,15 @@ from daq.cli.writing import (
     saving_of,
     saving_text,
 )
-from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
-from daq.config.policy import ApplyPolicy
 from daq.errors import CalibrationRefused, OutputFailed, UsageError
-from daq.files import sha256
-from daq.ledger.ledger import Ledger
-from daq.report.proposal import describe, show
-from daq.workflow.calibration_file import decode, read
-from daq.writeback.drive_target import DriveTarget
-from daq.writeback.file_target import FileTarget
-from daq.writeback.gates.gate import Gate
-from daq.writeback.request import Edit, Request
-from daq.writeback.target import E, Proposal, Target, Written, apply, propose
-from ident.calibration import Calibration
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.config.policy import ApplyPolicy
+    from daq.ledger.ledger import Ledger
+    from daq.writeback.request import Edit, Request
+    from daq.writeback.target import E, Proposal, Target, Written
+    from ident.calibration import Calibration
 
 
 def apply_verb(
@@ -80,6 +75,11 @@ def apply_verb(
 
     The bounds of the gates are in the cell's `policy: {apply: ...}`; see docs/reference/gates.md.
     """
+    from daq.config.cell_file import load_cell
+    from daq.workflow.calibration_file import decode, read
+    from daq.writeback.file_target import FileTarget
+    from daq.writeback.request import Request
+
     declared, actor = load_cell(cell), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
@@ -132,6 +132,9 @@ def apply_to(
         yes: write.
         json: print a document instead of text.
     """
+    from daq.report.proposal import describe, show
+    from daq.writeback.target import apply, propose
+
     written: Written | None = None
     with opening as target:
         proposal = propose(target, request)
@@ -160,12 +163,17 @@ def apply_to(
 
 def _enter(ledger: Ledger, edit: Edit, written: Written | None, request: Request) -> None:
     """Enter the write into the history; also one of an earlier command that was killed before it could."""
+    from daq.files import sha256
+
     digest, entry = sha256(request.signed), None if written is None else written.audit_sha256
     ledger.add(request.calibration, digest=digest, at=request.now)
     ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=sha256(edit.after), entry=entry)
 
 
 def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | None, undo: str, *, yes: bool) -> None:
+    from daq.writeback.drive_target import DriveTarget
+    from daq.writeback.gates.gate import Gate
+
     console = Console(soft_wrap=True, highlight=False, markup=False)
     edit, target = proposal.edit, proposal.target
     if proposal.refusals:

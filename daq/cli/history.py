@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -14,28 +14,14 @@ from rich.console import Console
 from daq.cli.terminal import say_written
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.cli.writing import applier
-from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
-from daq.config.policy import HistoryPlace
 from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, OutputFailed, UsageError
-from daq.files import replace_file
-from daq.jobs.session import sessions
-from daq.ledger.entry import utc
-from daq.ledger.ledger import Ledger, Verification, audit_error, rebuild
-from daq.ledger.watch import Series, watch
-from daq.report.history import COLUMNS, csv_text, plot_history
-from daq.report.history_view import (
-    describe,
-    describe_actions,
-    describe_verification,
-    in_force,
-    say_verification,
-    show,
-    show_axis,
-)
 from daq.report.text import printable
-from daq.workflow.calibration_file import decode, read
-from daq.writeback.file_access import resolve_links
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.config.policy import HistoryPlace
+    from daq.ledger.ledger import Ledger, Verification
+    from daq.ledger.watch import Series
 
 _SHOWN = 5
 """Sentences of a kind in an error; --json has all."""
@@ -77,6 +63,20 @@ def history_verb(
     calibration far off. What it may come from is asked, not claimed. docs/evidence/drift.md says how often an alarm is
     false.
     """
+    from daq.config.cell_file import load_cell
+    from daq.ledger.ledger import Ledger
+    from daq.ledger.watch import watch
+    from daq.report.history_view import (
+        describe,
+        describe_actions,
+        describe_verification,
+        in_force,
+        say_verification,
+        show,
+        show_axis,
+    )
+    from daq.writeback.file_access import resolve_links
+
     declared = load_cell(cell)
     place = _place(declared, cell)
     picture = None if plot is None else _picture(plot)
@@ -125,6 +125,8 @@ def history_verb(
 
 def _session_heads(cell: Cell) -> list[str]:
     """SHA-256 of the entries that end the sessions of scheduled recalibrations."""
+    from daq.jobs.session import sessions
+
     past = () if cell.recalibration is None else sessions(cell.recalibration.folder, cell.name)
     return [session.state.audit_sha256 for session in past if session.state.audit_sha256 is not None]
 
@@ -136,6 +138,8 @@ def _require(checked: Verification) -> None:
         DataError: the audit log is not what was written, with the first line that is not and all flaws.
         HistoryUnreadable: the history is broken, contradicts the audit log, or lacks a write.
     """
+    from daq.ledger.ledger import audit_error
+
     if not checked.verdict.holds:
         raise audit_error(checked.place, checked.verdict)
     store, unknown = str(checked.place.store), [f"no event of {one}" for one in checked.unknown]
@@ -171,6 +175,8 @@ def _first(sentences: Sequence[str]) -> str:
 
 
 def _rebuild(cell: Cell, place: HistoryPlace, who: str, now: datetime) -> None:
+    from daq.ledger.ledger import rebuild
+
     done = rebuild(cell, place, who=who, at=now, heads=_session_heads(cell))
     console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
     console.print(
@@ -190,6 +196,8 @@ def _place(cell: Cell, file: Path) -> HistoryPlace:
 
 
 def _add(ledger: Ledger, file: Path, now: datetime) -> None:
+    from daq.workflow.calibration_file import decode, read
+
     content = read(file)
     calibration = decode(content, str(file))
     if calibration.cell != ledger.cell.name:
@@ -223,6 +231,8 @@ def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | N
 
 
 def _day(text: str, now: datetime) -> datetime:
+    from daq.ledger.entry import utc
+
     never = datetime.min.replace(tzinfo=UTC)
     found = utc(text, never)
     if found == never:
@@ -266,6 +276,8 @@ def _picture(path: Path) -> Path:
 
 
 def _check_csv(path: Path | None) -> None:
+    from daq.report.history import COLUMNS
+
     if path is not None:
         _require_replaceable(path, ",".join(COLUMNS[:3]).encode())
 
@@ -282,6 +294,9 @@ def _require_replaceable(path: Path, begins: bytes) -> None:
 
 
 def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
+    from daq.files import replace_file
+    from daq.report.history import csv_text, plot_history
+
     drawn = [series for series in chosen if series.points]
     if picture is not None and not drawn:
         raise UsageError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -24,21 +24,12 @@ from daq.cli.writing import (
     saving_of,
     saving_text,
 )
-from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
-from daq.files import sha256
-from daq.report.proposal import (
-    describe_drive_rollback,
-    describe_file_rollback,
-    show_drive_rollback,
-    show_file_rollback,
-)
-from daq.writeback import target
-from daq.writeback.drive_record import record_folder
-from daq.writeback.file_target import FileTarget
-from daq.writeback.target import Written
-from drivers.canopen.parameters import Saving
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.writeback.target import Written
+    from drivers.canopen.parameters import Saving
 
 
 def rollback(
@@ -62,6 +53,11 @@ def rollback(
     give it with --audit, or the rollback is not in an audit. Drives are shown first and written with --yes: their
     values are in no file that could be reviewed.
     """
+    from daq.config.cell_file import load_cell
+    from daq.report.proposal import describe_file_rollback, show_file_rollback
+    from daq.writeback import target
+    from daq.writeback.file_target import FileTarget
+
     declared = None if cell is None else load_cell(cell)
     if declared is not None and audit is not None:
         raise UsageError(
@@ -113,6 +109,10 @@ def rollback_drives(
         yes: write.
         json: print a document instead of text.
     """
+    from daq.report.proposal import describe_drive_rollback, show_drive_rollback
+    from daq.writeback import target
+    from daq.writeback.drive_record import record_folder
+
     written: Written | None = None
     console = Console(soft_wrap=True, highlight=False, markup=False)
     with drives_on_the_bus(declared, saving) as drives:
@@ -137,6 +137,8 @@ def rollback_drives(
 
 
 def _enter(cell: Cell, written: Written, now: datetime, actor: Applier) -> None:
+    from daq.files import sha256
+
     edit = written.edit
     record_in_history(
         cell,

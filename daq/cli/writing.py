@@ -8,24 +8,21 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from daq.cli.terminal import interruptible
-from daq.config.bus import cell_address, drive_axes
-from daq.config.cell import Cell
 from daq.environment import login
 from daq.errors import AuditUnusable, DaqError, ExitCode, UsageError
-from daq.files import sha256
-from daq.ledger.judgement import NOTHING, Known, known_of
-from daq.ledger.ledger import Ledger
-from daq.ledger.store import HistoryStore
-from daq.workflow.safeguards import bus_lock
-from daq.writeback.drive_target import DriveTarget
-from daq.writeback.request import GainChange, Request
-from drivers.canopen.network import CanopenNetwork
-from drivers.canopen.parameters import Saving
+
+if TYPE_CHECKING:
+    from daq.config.cell import Cell
+    from daq.ledger.judgement import Known
+    from daq.ledger.ledger import Ledger
+    from daq.writeback.drive_target import DriveTarget
+    from daq.writeback.request import GainChange, Request
+    from drivers.canopen.parameters import Saving
 
 _LOG = logging.getLogger("drivegain")
 
@@ -108,6 +105,10 @@ def _is_same(audit: Path, other: Path) -> bool:
 
 def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
     """Return the figures of the cell's history that a change is judged by; none where it cannot be read."""
+    from daq.files import sha256
+    from daq.ledger.judgement import NOTHING, known_of
+    from daq.ledger.store import HistoryStore
+
     if cell.history is None:
         return NOTHING
     try:
@@ -120,6 +121,8 @@ def query_history(cell: Cell, target: str, request: Request, changes: Sequence[G
 
 def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], object]) -> None:
     """Enter a write into the cell's history; a history that cannot take it is only warned about."""
+    from daq.ledger.ledger import Ledger
+
     if cell.history is None:
         return
     try:
@@ -147,6 +150,8 @@ def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
     Raises:
         UsageError: both.
     """
+    from drivers.canopen.parameters import Saving
+
     if ram_only and save_unknown:
         raise UsageError(
             "--ram-only --save-unknown",
@@ -160,6 +165,11 @@ def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
 @contextmanager
 def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
     """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
+    from daq.config.bus import cell_address, drive_axes
+    from daq.workflow.safeguards import bus_lock
+    from daq.writeback.drive_target import DriveTarget
+    from drivers.canopen.network import CanopenNetwork
+
     address, axes = cell_address(declared), drive_axes(declared)
     try:
         with (
@@ -176,6 +186,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
 
 def saving_text(saving: Saving) -> str:
     """Say whether the gains are saved."""
+    from drivers.canopen.parameters import Saving
+
     if saving is Saving.RAM:
         return "The drives have NOT saved: the gains are lost when they lose power."
     return "The drives have saved."

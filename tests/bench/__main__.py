@@ -1,4 +1,5 @@
-"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, reading logs, and a fleet.
+"""`make bench`: speed and memory against figaroh, growth to 4 million samples, a whole fit, start-up,
+reading logs, and a fleet.
 
 Prints ratios and writes out/bench.json; asserts nothing, because no clock of this machine is a property of the code.
 Each job runs in a child process of its own, and this one stays small: Linux counts what a parent holds to the peak of
@@ -22,6 +23,8 @@ import numpy as np
 
 from tests.bench.fleet import summary_text as fleet_text
 from tests.bench.log_reading import summary_text
+from tests.bench.start_up import start_up
+from tests.bench.start_up import summary_text as start_up_text
 
 OUT = Path("out/bench")
 RESULT = Path("out/bench.json")
@@ -35,7 +38,7 @@ ENVIRONMENT = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREA
 
 
 def main() -> int:
-    """All five, one after the other."""
+    """Run all six, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=3, help="of the comparison with figaroh; the median counts")
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="samples, of the growth")
@@ -46,6 +49,8 @@ def main() -> int:
     comparison = _comparison(arguments.repeats)
     growth = _growth(tuple(size for size in SIZES if size <= arguments.largest))
     whole_fit = _whole_fit(arguments.repeats)
+    start = start_up(OUT, OUT / f"{LOGS[0]}.mcap", arguments.repeats, ENVIRONMENT)
+    _print_line(f"\n{start_up_text(start)}")
     log_reading = _log_reading(arguments.hour)
     fleet = _fleet(arguments.cells, arguments.repeats)
     result = {
@@ -54,6 +59,7 @@ def main() -> int:
         "comparison": comparison,
         "growth": growth,
         "fit": whole_fit,
+        "start_up": start,
         "log_reading": log_reading,
         "fleet": fleet,
     }

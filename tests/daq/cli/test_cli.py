@@ -64,7 +64,7 @@ def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> Non
     assert "Did you mean 'record'?" in " ".join(capsys.readouterr().err.split())
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["init", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"]])
 def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) -> None:
     heavy = ("matplotlib", "pinocchio", "numba", "scipy", "canopen")
     code = (

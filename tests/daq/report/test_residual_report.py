@@ -186,7 +186,7 @@ def test_the_page_says_the_outcome_first(closed: Closed) -> None:
         f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
     )
     assert page.texts.index(first) < page.texts.index("Before and after")
-    assert "These data cannot tell it from: load-friction on J2." in page.text
+    assert "These data cannot distinguish it from: load-friction on J2." in page.text
     assert "1.2 Nm on J2" in page.text
     for error in (reported.before.in_sample, reported.after.cross_validated, reported.after.holdout):
         assert f"{error.total:.2f}" in page.texts

@@ -170,7 +170,7 @@ def test_an_impossible_calibration_is_projected_and_reported(
     assert all(joint["friction"] >= 0.0 and joint["mass_kg"] > 0.0 for joint in report["joints"])
     assert _export(file, "--cell", cell, "--out", tmp_path / "r.urdf") == 0
     text = capsys.readouterr().out
-    assert "No robot has exactly the identified parameters" in text
+    assert "No physical robot has exactly the identified parameters" in text
     assert "fs5 by" in text
 
 

@@ -1,0 +1,70 @@
+"""Start-up: help, `scan`, `info` and `history` load no library that they do not use."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daq.config.cell_file import load_cell
+from daq.errors import ExitCode
+from daq.ledger.store import HistoryStore
+from tests.daq.histories import fill
+from tests.daq.logs import DISC, demo_content, samples, write
+
+UNUSED = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
+"""Libraries that only identification, simulation and pictures use."""
+
+HELP = """
+import contextlib, io
+from daq.cli.app import VERBS, main
+from daq.cli.verb import VerbGroup
+for listed in VERBS:
+    verb = listed.load()
+    for kind in ((), *((kind.name,) for kind in (verb.kinds if isinstance(verb, VerbGroup) else ()))):
+        with contextlib.redirect_stdout(io.StringIO()) as shown:
+            assert main([verb.name, *kind, "--help"]) == 0, verb.name
+        assert "Usage" in shown.getvalue()
+"""
+
+
+def _loaded(code: str, names: tuple[str, ...], checkout: Path) -> list[str]:
+    """Return those of the modules that a process has loaded after running some code."""
+    last = f"import sys; print(*(name for name in {names!r} if name in sys.modules), file=sys.stderr)"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{last}"], capture_output=True, text=True, cwd=checkout, check=True
+    )
+    return done.stderr.splitlines()[-1].split()
+
+
+def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
+    assert _loaded(HELP, (*UNUSED, "scipy", "numpy", "can", "canopen", "mcap"), checkout) == []
+
+
+@pytest.mark.parametrize("verb", ["scan", "info", "history"])
+def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Path, tmp_path: Path) -> None:
+    code = "from daq.cli.app import main\n"
+    if verb == "scan":
+        # No node answers on this bus: the table is printed, and then the error.
+        command, expected = ["scan", "configs/cells/demo.yaml", "--wait", "0.05"], ExitCode.DEVICE_FAULT
+    elif verb == "info":
+        log = write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(50)]))
+        command, expected = ["info", str(log)], ExitCode.OK
+    else:
+        command, expected = ["history", str(_cell_with_history(checkout, tmp_path))], ExitCode.OK
+    code += f"assert main({command!r}) == {int(expected)}\n"
+    assert _loaded(code, UNUSED, checkout) == []
+
+
+def _cell_with_history(checkout: Path, folder: Path) -> Path:
+    kept = shutil.ignore_patterns("*.jsonl", "*.sqlite*")
+    shutil.copytree(checkout / "configs", folder / "configs", ignore=kept)
+    cell = folder / "configs" / "cells" / "demo.yaml"
+    place = load_cell(cell).history
+    assert place is not None
+    with HistoryStore(place.store) as store:
+        fill(store, 12, lambda _week: (1.0,) * 6)
+    return cell
