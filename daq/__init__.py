@@ -1,6 +1,6 @@
 """Calibrate the drive gains of a robot cell: from recorded logs to the numbers in the controller.
 
-Everything that a program needs is here; importing `daq` loads no module before a name is used.
+Everything that a program needs is here; importing `daq` loads no module before a name is used::
 
     import daq
 
@@ -16,11 +16,11 @@ Everything that a program needs is here; importing `daq` loads no module before 
 ==================================  ==============================================================================
 describe a cell                     `load_cell`, `Cell`
 read a log                          `read_log` (raw counts), `load_run` (SI units); `Log`, `LossyLogs`
-logs to a `Calibration`             `fit_logs`; in steps: `fit`, `close_loop`, `calibration_of`, `Fit`
+logs to a `Calibration`              `fit_logs`; in steps: `fit`, `close_loop`, `calibration_of`, `Fit`
 keep a calibration                  `save_calibration`, `load_calibration`
 test it on other logs               `validate`, `Validation`
-write it to the controller          `FileTarget` or `DriveTarget`; `Request`, `propose`, `Proposal`, `apply`,
-                                    `rollback`, `Written`
+write it to the controller          `FileTarget`, `DriveTarget`, `propose`, `Request`, `Proposal`, `apply`,
+                                    `Written`, `rollback`
 errors                              `DaqError` and its subclasses (daq/errors.py)
 ==================================  ==============================================================================
 
