@@ -1,4 +1,4 @@
-"""What a job says while it runs: one line an event, for a person, a program or the system's journal.
+"""Journal of a job: one line an event, as text, as JSON, or for the system's journal.
 
 Under systemd a line is JSON behind ``<N>``, its priority (sd-daemon(3)). That is chosen before the journal's own
 protocol because it is one write to the stream that we were given: no socket that may be full or absent, no limit of a
@@ -90,12 +90,12 @@ class Journal:
 
 
 def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
-    """What the reader of a stream takes.
+    """Choose the form for a stream.
 
     Args:
         stream: standard error.
         environment: of this process; systemd names device and inode of the stream that it reads in JOURNAL_STREAM
-            (systemd.exec(5)), so that one which was redirected since is told from it.
+            (systemd.exec(5)), so that a stream that was redirected since is recognised.
     """
     if stream.isatty():
         return Form.TEXT

@@ -73,7 +73,7 @@ def report_failure(context: JobContext, folder: Path, error: BaseException) -> N
         notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(WHILE)]
         _report(context, session, outcome, code, "; ".join((problem, *notes)), problem)
     except (DaqError, OSError, StopIteration) as second:
-        error.add_note(f"kept: the session's end could not be written down: {second}")
+        error.add_note(f"kept: the end of the session could not be recorded: {second}")
 
 
 def audit_entry(context: JobContext, action: AuditAction, session: Session, details: dict[str, object]) -> AuditEntry:
@@ -342,7 +342,7 @@ def file_stem(cell: str) -> str:
 def _set_session_gauges(gauge: _Gauges, state: SessionState, cell: str) -> None:
     lost = gauge("lost_cycles", "Cycles that are not in any recording of a run.", "run")
     missing = gauge("missing_answers", "Answers of drives that never came, of all recordings of a run.", "run")
-    attempts = gauge("recordings", "Of a run, until its recorder stood for it.", "run")
+    attempts = gauge("recordings", "Recordings of a run until a valid one.", "run")
     for run in state.runs:
         lost.labels(cell, run.name).set(run.lost_cycles)
         missing.labels(cell, run.name).set(sum(run.missing))

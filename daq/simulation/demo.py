@@ -51,7 +51,7 @@ RUNS = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What may be chosen of a demonstration.
+    """Settings of a demonstration.
 
     Attributes:
         out: folder that it fills; files of an earlier demonstration in it are replaced.

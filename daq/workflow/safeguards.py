@@ -1,7 +1,7 @@
 """One mover a bus: a lock that every recording and every job takes before it says anything to the drives.
 
 The locks are those of flock(2) on files in a folder of the system: they end with their process, however it ends. They
-keep out other programs of drivegain on this computer; somebody else's master is heard on the bus itself (BusBusy).
+keep out other programs of drivegain on this computer; a foreign master is detected on the bus itself (BusBusy).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
 
 
 def lock_name(bus: Bus) -> str:
-    """Of a bus's lock file: by its interface and channel, and of a hub by its host's address and its port."""
+    """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
     parts = [bus.interface, bus.channel]
     if bus.interface == "socketcand":
         parts += [_address(bus), str(bus.port)]
@@ -66,7 +66,7 @@ def lock_name(bus: Bus) -> str:
 
 
 def _address(bus: Bus) -> str:
-    """One for all names of a host; its name where nobody knows an address, since then nobody reaches it either."""
+    """One for all names of a host; its name where it has no address, since it is unreachable then."""
     try:
         found = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
@@ -198,7 +198,7 @@ class DiskRoom:
 
     Args:
         log: to be written.
-        free: tells the room.
+        free: free bytes of a folder's disk.
     """
 
     def __init__(self, log: Path, free: FreeBytes = free_bytes) -> None:
@@ -303,7 +303,7 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
     Args:
         cell: with the tolerance.
         payload: that is mounted, with the mass of the cell file.
-        entered_kg: from the scale; None where nobody entered one.
+        entered_kg: from the scale; None where none was entered.
 
     Raises:
         UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.
