@@ -21,9 +21,6 @@ from daq.log.metadata import READBACK
 from daq.log.reader import LogHead, LogReader
 from ident.calibration import Calibration, Gain
 
-# Where the logs of a fleet lie: a folder, or an object store by its address (s3://…, through fsspec).
-
-
 ENDING = ".mcap"
 PIECE_BYTES = 2**20
 
@@ -117,7 +114,7 @@ def _listed_local(folder: Path) -> list[StoredLog]:
         raise LogMissing(
             str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
         )
-    # Absolute: a worker may stand elsewhere. What is no file is not left out: it may stand for a log of a cell.
+    # Absolute: a worker may run elsewhere. What is no file is not left out: it may stand for a log of a cell.
     return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
 
 
@@ -316,9 +313,6 @@ def _unfinished_head(path: Path) -> LogHead:
     reader = LogReader(path)
     next(reader.until_damage(), None)
     return reader.head
-
-
-# What a table tells of a calibration: small enough to be sent, kept and read back for thousands of cells.
 
 
 @dataclass(frozen=True, slots=True)

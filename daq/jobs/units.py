@@ -100,7 +100,7 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
     return (
         f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
         f"{systemctl} daemon-reload",
-        f"{systemctl} start {service}    # once, while somebody watches the cell",
+        f"{systemctl} start {service}    # once, with an operator at the cell",
         f"{systemctl} enable --now {timer.name}",
         f"{systemctl} list-timers {timer.name}",
         f"{journal} -u {service} -o cat",
@@ -133,10 +133,10 @@ Description=drivegain: scheduled recalibration of cell {_plain(cell.name)}
 Type=oneshot
 ExecStart={command}
 {owner}WorkingDirectory={_plain(str(wanted.cell_file.parent))}
-# 10: a change was found and waits for a person. 11 to 14 (interlock, bus, time, held) fail the unit on purpose:
-# OnFailure= may tell somebody.
+# 10: a change was found and waits for an operator. 11 to 14 (interlock, bus, time, held) fail the unit on purpose:
+# OnFailure= may report it.
 SuccessExitStatus={ExitCode.PROPOSED.value}
-# Never again by itself: whoever stands at the cell decides.
+# No automatic restart: an operator decides.
 Restart=no
 # The job bounds its own time (max_duration_min) and stops the axes; this is behind that bound.
 TimeoutStartSec={seconds}

@@ -416,12 +416,6 @@ def _holdout_error(error: RelativeError | None, placed: PlacedEffect) -> float |
     return figure if np.isfinite(figure) else None
 
 
-# How well a fit has seen each gain, by what, and which moves would show it better.
-
-
-FloatArray = NDArray[np.float64]
-
-
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """Judge every gain of a fit with free gains; the logs are read again.
 

@@ -1,7 +1,8 @@
-"""One mover a bus: a lock that every recording and every job takes before it says anything to the drives.
+"""Safeguards of a recording: bus lock, disk space, plausible currents, the payload's mass, deferred garbage collection.
 
-The locks are those of flock(2) on files in a folder of the system: they end with their process, however it ends. They
-keep out other programs of drivegain on this computer; a foreign master is detected on the bus itself (BusBusy).
+Every recording and every job takes the lock of its bus before it sends anything to the drives. It is the lock of
+flock(2) on a file in a folder of the system, and ends with its process. It excludes other programs of drivegain on this
+computer; a foreign master is detected on the bus itself (BusBusy).
 """
 
 from __future__ import annotations
@@ -155,9 +156,6 @@ def _is_at(descriptor: int, path: Path) -> bool:
     return False
 
 
-# Room on the disk for a recording: asked before anything moves, watched while it runs.
-
-
 FreeBytes = Callable[[Path], int]
 """Room left for this user on the disk of a folder [bytes]."""
 
@@ -250,9 +248,6 @@ def _megabytes(number: int) -> str:
     return f"{number / 1e6:.1f} MB"
 
 
-# Whether the ampere that the drives tell can be true of the motors of the cell; asked before anything is recorded.
-
-
 def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
     """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
 
@@ -278,9 +273,6 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
     note = actual_current_note(cell)
     grouped = tuple(f"{', '.join(names)}: {warning}" for warning, names in axes_by_warning.items())
     return grouped if note is None else (note, *grouped)
-
-
-# The payload's mass, entered twice: once in the cell file, once from the scale. All gains are in proportion to it.
 
 
 _ROUNDING_KG = 1e-9
@@ -325,9 +317,6 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
             expected=f"{declared_kg:g} kg within {within_kg:g} kg, as in the cell file",
             remedy="weigh it again and correct the wrong one of the two: all gains are in proportion to this mass",
         )
-
-
-# Python's search for garbage, kept short while SYNC must go out in time.
 
 
 NEVER = 2**31 - 1
