@@ -69,9 +69,9 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     from daq.cli.terminal import interruptible
     from daq.config.cell_file import load_cell
     from daq.environment import login
-    from daq.jobs.conclusion import document, text
+    from daq.jobs.context import Tools
     from daq.jobs.job import preview, recalibrate
-    from daq.jobs.tools import Tools
+    from daq.jobs.reporting import document, text
     from daq.report.residual_page import save_report
     from daq.report.text import printable
 
@@ -123,7 +123,7 @@ def install_units(
     from daq.cli.terminal import writing
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
-    from daq.jobs.preflight import section_of, target_of
+    from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
 
     declared = load_cell(cell)

@@ -1,4 +1,4 @@
-"""The task of a fleet: the logs of one cell become a calibration, or the reason why not."""
+"""Fit one cell of a fleet, in any process: a calibration, or the reason for a failure; and the cache of results."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ SEED = 0
 
 
 class Loop(Enum):
-    """Whether effects that the model lacks are looked for."""
+    """Whether missing effects are detected and added."""
 
     OPEN = "open"
     CLOSED = "closed"
@@ -71,7 +71,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """What a worker sends back: small, whatever the logs weigh.
+    """Result of a worker; small, whatever the size of the logs.
 
     Attributes:
         summary: of the calibration.
@@ -86,7 +86,7 @@ class Fitted:
 
 @dataclass(frozen=True, slots=True)
 class Unfitted:
-    """What a worker sends back of a cell that cannot be fitted.
+    """Result of a worker for a cell that cannot be fitted.
 
     Attributes:
         failure: why not.
@@ -128,32 +128,32 @@ def fit_cell(
 
 
 def _check_name(log: StoredLog) -> None:
-    """A calibration names its logs: a name that is no text has no place in it."""
+    """Check that the name of a log is text, since the calibration holds it."""
     try:
         log.name.encode()
     except UnicodeEncodeError as error:
         raise LogUnreadable(
             log.address,
             found="bytes in its name that are no UTF-8",
-            expected="a name that a calibration can tell",
+            expected="a name that a calibration can hold",
             remedy="rename it",
         ) from error
 
 
 def _check_unchanged(cell: CellLogs) -> None:
-    """A log that somebody copies anew meanwhile: what was read of it is not what the calibration would stand for."""
+    """Check that no log was replaced while it was read."""
     for seen in (*cell.fit, *cell.holdout):
         if fingerprint(seen.log) != seen.fingerprint:
             raise LogsDiffer(
                 seen.log.address,
-                found="another content than when the logs were looked through",
-                expected="logs that nobody writes while they are fitted",
+                found="another content than at the survey of the logs",
+                expected="logs that do not change while they are fitted",
                 remedy="start it again",
             )
 
 
 def _content(calibration: Calibration, name: str) -> bytes:
-    """Of the file, spelt and read back here: it takes a tenth of the time of a fit, and who collects them is alone."""
+    """Content of the file, encoded and verified in the worker: that takes a tenth of the time of a fit."""
     content = encode(calibration)
     if as_document(decode(content, name)) != as_document(calibration):
         raise CalibrationUnreadable(
@@ -163,19 +163,16 @@ def _content(calibration: Calibration, name: str) -> bytes:
 
 
 def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = None) -> Failure:
-    """An error as the table tells it.
+    """Convert an error to a row of the table.
 
     Args:
-        error: of ours, or one that nobody expected.
-        paths: of copies, which nobody has seen: they are called by what they are copies of.
+        error: expected or not.
+        paths: temporary copies; the text names the logs instead.
     """
     text = str(error) or type(error).__name__
     for path, log in (paths or {}).items():
         text = text.replace(str(path), log.address)
     return Failure(type(error).__name__, text, int(exit_code(type(error)) or ExitCode.UNEXPECTED))
-
-
-# The folder of a fleet's calibrations: what stands there and is of the same logs needs no second fit.
 
 
 STATE_VERSION = 1
@@ -195,23 +192,23 @@ class CalibrationCache:
     loop: Loop
 
     def file(self, cell: CellLogs) -> Path:
-        """Of a cell's calibration: its name, as far as a file may have it, and the beginning of the digest."""
+        """Calibration file of a cell: its name in safe characters, and the first digits of its digest."""
         name = re.sub(r"[^\w.-]", "_", cell.cell)[:40]
         return self.folder / f"{name}-{cell.configuration_sha256[:12]}.yaml"
 
     def cached(self, cell: CellLogs) -> tuple[Summary, float] | None:
-        """What is told of the calibration of these logs, and the seconds that it took; None where it is not there.
+        """Summary of the cached calibration of these logs, and the seconds that it took; None where there is none.
 
-        The file itself is not parsed: it is the one that was written, by its digest.
+        The file itself is not parsed: its digest identifies it.
 
         Raises:
-            UsageError: there is something that no calibration, or no note beside it, can replace.
+            UsageError: a file is in the way that must not be replaced.
         """
         file = self.file(cell)
         for path in (file, _state(file)):
             _check_replaceable(path)
         try:
-            # No pipe is waited for, and no file of somebody else fills the memory: neither is ours.
+            # Read without waiting for a pipe, and no more than a calibration can have.
             state = json.loads(read_regular(_state(file), MAX_BYTES))
             found = hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest()
             if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != (
@@ -222,10 +219,10 @@ class CalibrationCache:
                 return None
             return summary_from(state["summary"]), float(state["seconds"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            return None  # whatever it is, it is made anew
+            return None  # unreadable: made anew
 
     def store(self, cell: CellLogs, fitted: Fitted) -> Path:
-        """Put a calibration there; a kill at any point leaves what stands whole, or what is made anew.
+        """Store a calibration; after a kill at any point, the cache is whole or the entry is made anew.
 
         Raises:
             OutputFailed: the file system refuses.
@@ -279,7 +276,7 @@ def _check_replaceable(path: Path) -> None:
     try:
         mode = path.stat().st_mode
     except OSError:
-        return  # there is nothing, or who writes it will be told
+        return  # nothing there, or the write will fail with a message
     if stat.S_ISDIR(mode):
         found = "a folder"
     elif path.is_symlink() and not stat.S_ISREG(mode):

@@ -1,4 +1,4 @@
-"""From a place full of logs to a row a cell, with at most as many cells in work as there are workers."""
+"""Fit the cells of a fleet in parallel, and report a row for each."""
 
 from __future__ import annotations
 
@@ -16,22 +16,20 @@ from daq.jobs.cell_fit import CalibrationCache, Failure, Fitted, Loop, Unfitted,
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, Summary, UnknownLog, by_cell, survey
 from daq.jobs.workers import WorkerPool
 
-# One line of a fleet's table: a cell with what came of it, or with what stood in the way.
-
 
 @dataclass(frozen=True, slots=True)
 class FleetRow:
-    """What is told of one cell.
+    """Result of one cell: a summary, or the failure.
 
     Attributes:
-        cell: its name; that of the log where the log does not tell whose it is.
-        configuration_sha256: of its configuration; empty where nobody knows it.
+        cell: its name; that of the log where the cell is unknown.
+        configuration_sha256: of its configuration; empty where it is unknown.
         fit, holdout: names of the logs.
-        result: what came of it, or why nothing did.
+        result: summary of the calibration, or the failure.
         seconds: that it took.
         configurations: in how many different ones the cell's logs were made; each has a row.
         file: of the calibration, where it is kept.
-        kept: it stood already, and its logs are the same.
+        kept: it was cached, and its logs are unchanged.
     """
 
     cell: str
@@ -54,7 +52,7 @@ SURVEYED = 16
 """Logs whose heads one task reads: a cell's logs lie together, and share a configuration that is read once."""
 
 LOOK_S = 30.0
-"""After so long without a result somebody looks whether the workers are still there; a cell may well take longer."""
+"""Time without a result after which the workers are checked; a cell may well take longer."""
 
 ProgressCallback = Callable[[int, int, str], None]
 """Done, total, and a remark."""
@@ -70,23 +68,23 @@ def fit_fleet(
     now: Callable[[], datetime],
     report_progress: ProgressCallback = lambda _done, _total, _remark: None,
 ) -> tuple[FleetRow, ...]:
-    """Fit every cell of which there are logs; what is wrong with one is told in its row.
+    """Fit every cell that has logs; the failure of one is in its row.
 
     Args:
         logs: of all cells.
-        crew: who does it.
-        loop: whether to look for effects.
-        shelf: where calibrations are kept, None for nowhere.
+        pool: workers.
+        loop: whether missing effects are added.
+        cache: of calibrations, None for none.
         now: time of day, for the calibrations.
         report_progress: of progress, by cells; while heads are read, by logs.
 
     Returns:
-        the rows, by cell and configuration; logs that do not tell whose they are come last.
+        the rows, by cell and configuration; logs of unknown cells come last.
 
     Raises:
-        UsageError: the workers have gone; what was fitted stays on the shelf.
-        UsageError: something on the shelf is in the way of a calibration; no cell was fitted.
-        OutputFailed: a calibration could not be kept.
+        UsageError: the workers are gone; finished calibrations are cached.
+        UsageError: a file in the cache folder must not be replaced; no cell was fitted.
+        OutputFailed: a calibration could not be stored.
     """
     cells, unknown = _surveyed(logs, pool, report_progress)
     configurations = Counter(cell.cell for cell in cells)
@@ -114,27 +112,27 @@ def fit_fleet(
 def each(
     submit: Callable[[Work], Future[Made]], work: Iterable[Work], pool: WorkerPool
 ) -> Iterator[tuple[Work, Made | BaseException]]:
-    """Have some work done, in the order in which it is finished.
+    """Run work in a pool, and yield the results as they finish.
 
-    No more is handed over than there are workers, so that neither tasks nor results pile up anywhere.
+    No more is submitted than there are workers, so that neither tasks nor results pile up.
 
     Args:
-        submit: hands a piece over to the crew.
+        submit: submits a piece to the pool.
         work: in pieces.
-        crew: who does it.
+        pool: workers.
 
     Yields:
-        each piece with what came of it, or with what it raised.
+        each piece with its result or its exception.
 
     Raises:
-        UsageError: the workers have gone.
+        UsageError: the workers are gone.
     """
     waiting = iter(work)
     running = {submit(piece): piece for piece in islice(waiting, pool.workers)}
     absent = 0
     while running:
         done, _ = wait(running, LOOK_S, return_when=FIRST_COMPLETED)
-        # A worker that died may be on its way back: only who is missed twice has gone.
+        # A worker that died may be restarting: it is gone when it is missing twice.
         absent = absent + 1 if not done and not pool.present() else 0
         if absent > 1:
             raise _gone("no workers any more")
@@ -170,7 +168,7 @@ def _surveyed(
     portions = [logs[first : first + SURVEYED] for first in range(0, len(logs), SURVEYED)]
     seen: list[SeenLog] = []
     unknown: list[UnknownLog] = []
-    looked_at = 0
+    surveyed = 0
 
     def submit(portion: tuple[StoredLog, ...]) -> Future[tuple[SeenLog | UnknownLog, ...]]:
         return pool.executor.submit(survey, portion)
@@ -181,8 +179,8 @@ def _surveyed(
         else:
             seen += [log for log in found if isinstance(log, SeenLog)]
             unknown += [log for log in found if isinstance(log, UnknownLog)]
-        looked_at += len(portion)
-        report_progress(looked_at, len(logs), "heads of logs")
+        surveyed += len(portion)
+        report_progress(surveyed, len(logs), "heads of logs")
     return by_cell(seen), sorted(unknown, key=lambda log: log.log.name)
 
 

@@ -1,4 +1,4 @@
-"""Which cell each log is of, by its head alone, and what a fit makes of the logs of one cell."""
+"""Survey the logs of a fleet: the cell of each log, read from its head alone, and the summary of a calibration."""
 
 from __future__ import annotations
 
@@ -20,9 +20,6 @@ from daq.files import open_regular
 from daq.log.metadata import READBACK
 from daq.log.reader import LogHead, LogReader
 from ident.calibration import Calibration, Gain
-
-# Where the logs of a fleet lie: a folder, or an object store by its address (s3://…, through fsspec).
-
 
 ENDING = ".mcap"
 PIECE_BYTES = 2**20
@@ -99,7 +96,7 @@ def beginning(log: StoredLog, size: int, folder: Path) -> Path:
 
 
 def fingerprint(log: StoredLog) -> str:
-    """What changes when the log does: the digest of a file, what the store tells of an object.
+    """Fingerprint of a log: the digest of a file, or the store's data about an object.
 
     Raises:
         LogMissing: it cannot be read, or is no regular file.
@@ -117,7 +114,7 @@ def _listed_local(folder: Path) -> list[StoredLog]:
         raise LogMissing(
             str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
         )
-    # Absolute: a worker may stand elsewhere. What is no file is not left out: it may stand for a log of a cell.
+    # Absolute: a worker may run elsewhere. What is no file is not left out: it may stand for a log of a cell.
     return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
 
 
@@ -132,7 +129,7 @@ def _listed_remote(place: str) -> list[StoredLog]:
 
 
 def _regular(path: Path) -> Path:
-    """A log in a folder, looked at before anybody opens it: a pipe or a device would never end."""
+    """Check that a log is a regular file before it is opened: a pipe or a device would never end."""
     if path.is_symlink() and not path.exists():
         found = f"a link to {path.readlink()}, which leads nowhere"
         raise _no_log(path, found, "mount or copy what it leads to, or move the link away")
@@ -189,7 +186,7 @@ HEAD_BYTES = 4 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class SeenLog:
-    """A log and whose it is.
+    """A log and its cell.
 
     Attributes:
         log: by name.
@@ -210,7 +207,7 @@ class SeenLog:
 
 @dataclass(frozen=True, slots=True)
 class UnknownLog:
-    """A log that does not tell whose it is.
+    """A log whose cell is unknown.
 
     Attributes:
         log: by name.
@@ -238,7 +235,7 @@ class CellLogs:
 
 
 def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
-    """Look at the heads of some logs; what is wrong with one is told in its place."""
+    """Read the heads of some logs; errors take the place of their log."""
     known: dict[str, tuple[str, str]] = {}
     return tuple(_seen(log, known) for log in logs)
 
@@ -318,12 +315,9 @@ def _unfinished_head(path: Path) -> LogHead:
     return reader.head
 
 
-# What a table tells of a calibration: small enough to be sent, kept and read back for thousands of cells.
-
-
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Of one calibration.
+    """Summary of one calibration, small enough to be sent.
 
     Attributes:
         gains: one an axis.
@@ -346,7 +340,7 @@ class Summary:
 
 
 def summary_of(calibration: Calibration) -> Summary:
-    """What the table tells of it."""
+    """Summarise a calibration for the table."""
     unseen = calibration.holdout_error_percent
     return Summary(
         gains=calibration.gains,
@@ -358,12 +352,12 @@ def summary_of(calibration: Calibration) -> Summary:
 
 
 def summary_document(summary: Summary) -> dict[str, Any]:
-    """As lists, mappings and numbers."""
+    """Convert a summary to lists, mappings and numbers."""
     return asdict(summary)
 
 
 def summary_from(document: dict[str, Any]) -> Summary:
-    """What `summary_document` made, through JSON.
+    """Read back the output of `summary_document`.
 
     Raises:
         KeyError, TypeError, ValueError: it is something else.

@@ -1,4 +1,4 @@
-"""Whether the cell lets the robot move: its interlock, asked anew before every motion."""
+"""Interlock, mount command, drive check and time limit of a job: everything that may hold a motion back."""
 
 from __future__ import annotations
 
@@ -23,9 +23,6 @@ from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
 from drivers.profiles.cia402 import POWERLESS, State, decode
-
-# Programs of the cell's own: the interlock's and the mount's.
-
 
 MAX_OUTPUT_CHARACTERS = 400
 """Characters of what a program said that are shown."""
@@ -118,12 +115,12 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 NOTHING = "none"
-"""What the mount command is told where a run is without load."""
+"""Argument of the mount command for a run without load."""
 _LOOK_BYTES = 4096
 
 
 def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetime], folder: Path) -> None:
-    """Go on only where the interlock says so; a program that cannot run and a file that cannot be read say no.
+    """Check that the interlock releases the robot; a program that fails and a file that is unreadable do not.
 
     Args:
         interlock: of the cell.
@@ -132,7 +129,7 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
         folder: in which the command runs.
 
     Raises:
-        NotReleased: it does not let the robot move.
+        NotReleased: it does not release the robot.
     """
     if interlock.command is not None:
         ended = run(interlock.command, (), folder)
@@ -143,7 +140,7 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
 
 
 def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
-    """Have the payload of a run mounted, or none; asked before every run, also where nothing changes.
+    """Run the mount command for the payload of a run; before every run, also where nothing changes.
 
     Raises:
         JobHeld: the command did not end with 0, in its time.
@@ -179,7 +176,7 @@ def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
     if says != file.says:
         raise _held(subject, repr(says[:80]), expected)
     age_s = asked.timestamp() - found.st_mtime
-    # One from the future is of another clock: how old it is, nobody knows.
+    # A time in the future is of another clock: the age is unknown.
     if not -file.max_age_s <= age_s <= file.max_age_s:
         raise _held(subject, f"an age of {age_s:.0f} s", expected)
 
@@ -193,12 +190,9 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
     )
 
 
-# A look at the drives before a job moves anything: who they are, no fault, and nobody else's power on them.
-
-
 FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)
-"""Without power in the motor, and with nobody's wish for it."""
+"""Without power in the motor, and without a request for it."""
 
 LEFT_BEHIND = (
     " (so a recorder that was killed leaves a drive to which no SYNC comes any more: `drivegain record` takes it over, "
@@ -207,11 +201,11 @@ LEFT_BEHIND = (
 
 
 def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
-    """Read identity and state of every drive; nothing is changed and nothing moves.
+    """Check identity and state of every drive; nothing is changed and nothing moves.
 
     Args:
         cell: its file.
-        undisturbed: keeps signals from the closing of the network.
+        block_signals: keeps signals away while the network is closed.
 
     Raises:
         DriveFault: one has a fault; to reset it is a person's decision.
@@ -230,21 +224,18 @@ def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
                 raise StateRefused(axis, "no power before a job begins", f"{state}{left}", statusword)
 
 
-# A bound on the time of a whole job, which also ends a motion: by the alarm that the system keeps for each process.
-
-
 AGAIN_S = 1.0
 """After an alarm that came while the axes were being stopped for another reason."""
 
 
 @contextmanager
 def time_bound(minutes: float) -> Iterator[SignalBlocker]:
-    """Raise where the block is, once the time is up; what is yielded keeps the alarm from disturbing a stop.
+    """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
 
-    In another thread than the main one there is no alarm: Python handles no signals there.
+    There is no alarm outside the main thread, where Python handles no signals.
 
     Args:
-        minutes: of the block [min].
+        minutes: limit [min].
 
     Raises:
         TimeBoundReached: in the block.
@@ -262,7 +253,7 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
             "the job",
             found=f"more than {minutes:g} min since it began",
             expected="its end within max_duration_min",
-            remedy="the axes were told to stop; the next job goes on where this one ended; raise max_duration_min, or "
+            remedy="the axes were commanded to stop; the next job resumes the session; raise max_duration_min, or "
             "see what takes so long in its log",
         )
 

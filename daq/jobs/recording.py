@@ -1,4 +1,4 @@
-"""The recordings of a session: their plans, the warm-up before them, and what is left of those that were cut short."""
+"""Record the runs of a session and fit them: plans, warm-up, recordings, calibration, report."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import math
 import uuid
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 from daq.config.cell import Cell
-from daq.config.controller import Controller
-from daq.config.policy import HistoryPlace
 from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import (
     CalibrationMissing,
@@ -26,11 +24,10 @@ from daq.errors import (
     RunInvalid,
 )
 from daq.files import sha256_of
-from daq.jobs import session as sessions
+from daq.jobs.context import JobContext
 from daq.jobs.interlock import mount, require_release
 from daq.jobs.journal import Journal, Level
-from daq.jobs.session import CALIBRATION, REPORT, Basis, Fitted, Outcome, RecordedRun, Session, save
-from daq.jobs.tools import Tools
+from daq.jobs.session import CALIBRATION, REPORT, Basis, Fitted, Outcome, RecordedRun, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
@@ -40,7 +37,6 @@ from daq.workflow.calibration_file import save as save_calibration
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
-from drivers.canopen.network import SignalBlocker
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 from ident.model.bodies import Payload
@@ -48,93 +44,57 @@ from ident.model.bodies import Payload
 WARM_UP = "warm-up"
 
 
-@dataclass(frozen=True, slots=True)
-class GainTarget:
-    """The controller whose file a job writes, and where it is written down.
-
-    Attributes:
-        controller: as the cell file has it.
-        file: of it, absolute.
-        history: of the cell.
-    """
-
-    controller: Controller
-    file: Path
-    history: HistoryPlace
-
-
-@dataclass(frozen=True, slots=True)
-class JobContext:
-    """What every step of a job needs.
-
-    Attributes:
-        file, cell, section: the cell file, what it says, and its `recalibration`.
-        target: what the gains found are compared with, and where they go.
-        tools: the functions of other rooms.
-        who: the job, by a name that a person recognises.
-        undisturbed: keeps signals from the stop of the axes.
-    """
-
-    file: Path
-    cell: Cell
-    section: Recalibration
-    target: GainTarget
-    tools: Tools
-    who: str
-    block_signals: SignalBlocker
-
-
 def log_of(session: Session, name: str) -> Path:
-    """Where the log of a run is."""
+    """Log file of a run."""
     return session.folder / f"{name}.mcap"
 
 
 def basis_of(cell: Cell, section: Recalibration) -> Basis:
-    """What a session of this cell rests on now; a plan that is not there is another one."""
+    """Current basis of a session of this cell; a missing plan counts as another one."""
     plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
     return Basis(cell.name, cell.digest, hashlib.sha256(" ".join(plans).encode()).hexdigest())
 
 
 def verified_runs(session: Session) -> Session:
-    """The session without the runs whose logs are not what its state says."""
+    """Drop the runs whose logs do not match the digests in the state."""
     runs = tuple(run for run in session.state.runs if sha256_of(log_of(session, run.name)) == run.sha256)
     return replace(session, state=session.state.with_(runs=runs))
 
 
-def record_runs(context: JobContext, session: Session, journal: Journal) -> Session:
-    """Make all recordings that the session does not have yet; its state is written after each of them.
+def record_runs(context: JobContext, session: Session) -> Session:
+    """Make the recordings that the session lacks; its state is written after each of them.
 
     Raises:
-        JobHeld, NotReleased: before a run; what was recorded until then stands.
-        RunInvalid: its recorder does not stand for a run, however often it was made.
+        JobHeld, NotReleased: before a run; the recordings until then are kept.
+        RunInvalid: every recording of a run was invalid.
         DriverError, OutputFailed, ConfigurationError: see `daq.workflow.record`.
     """
     session = verified_runs(session)
     made = {run.name for run in session.state.runs}
     left = [planned for planned in context.section.runs if planned.name not in made]
-    plans = {planned.name: _plan(context, session, planned, journal.within(step="plan")) for planned in left}
+    plans = {planned.name: _plan(context.within(step="plan"), session, planned) for planned in left}
     warm = not left
     for planned in left:
-        run_journal = journal.within(step=f"record {planned.name}")
+        run_context = context.within(step=f"record {planned.name}")
         mount(context.section, planned, context.tools.run)
-        run_journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
+        run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
-            _warm_up(context, session, planned, plans[planned.name], journal.within(step=WARM_UP))
+            _warm_up(context.within(step=WARM_UP), session, planned, plans[planned.name])
             warm = True
-        run = _record_valid(context, session, planned, plans[planned.name], run_journal)
-        session = save(replace(session, state=session.state.with_(runs=(*session.state.runs, run))))
+        run = _record_valid(run_context, session, planned, plans[planned.name])
+        session = session.update(runs=(*session.state.runs, run))
     return session
 
 
-def _plan(context: JobContext, session: Session, planned: PlannedRun, journal: Journal) -> Plan:
-    """Approved moves, or those of the seed; a plan of this session is made once."""
+def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
+    """Load the approved plan, or make the plan of the seed once a session."""
     if planned.plan_file is not None:
         return load_plan(planned.plan_file, context.cell)
     path = session.folder / f"plan-{planned.seed}-{planned.duration_s:g}s.yaml"
     if path.exists():
         with suppress(ConfigurationError):  # what was damaged is made again
             return load_plan(path, context.cell)
-    journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
+    context.journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
     try:
         save_plan(context.tools.plan(context.cell, seed=planned.seed, duration_s=planned.duration_s), path)
     except OSError as error:
@@ -142,14 +102,11 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun, journal: J
     return load_plan(path, context.cell)  # as a person can read it
 
 
-def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: Plan, journal: Journal) -> None:
-    """Make a run's moves without keeping its log until the joints are as warm as the later runs will find them.
-
-    It is recorded all the same: in the same way, with the same supervision.
-    """
+def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> None:
+    """Repeat the moves of a run until the joints are warm; recorded under the same supervision, the log is dropped."""
     passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
     for number in range(1, passes + 1):
-        journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
+        context.journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
         out = log_of(session, WARM_UP)
         out.unlink(missing_ok=True)
         out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
@@ -157,21 +114,20 @@ def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: P
         out.unlink()
 
 
-def _record_valid(
-    context: JobContext, session: Session, planned: PlannedRun, plan: Plan, journal: Journal
-) -> RecordedRun:
+def _record_valid(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> RecordedRun:
+    """Record a run, again if the recording is invalid."""
     out = log_of(session, planned.name)
     lost, missing = 0, (0,) * len(context.cell.axes)
     for attempt in range(1, context.section.retries + 2):
-        _set_aside(out, journal)
-        journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
+        _set_aside(out, context.journal)
+        context.journal.say(Level.INFO, "recording", attempt=attempt, seconds=plan.duration_s)
         log = (recorded := _record(context, planned, plan, out)).log
         for warning in recorded.warnings:
-            journal.say(Level.WARNING, "warning of the recorder", text=warning)
+            context.journal.say(Level.WARNING, "warning of the recorder", text=warning)
         lost += log.lost_cycles
         missing = tuple(one + other for one, other in zip(missing, log.missing, strict=True))
         if log.valid:
-            journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
+            context.journal.say(Level.INFO, "recorded", samples=log.samples, lost_cycles=lost, missing=missing)
             return RecordedRun(
                 name=planned.name,
                 sha256=sha256_of(out) or "",
@@ -180,17 +136,17 @@ def _record_valid(
                 lost_cycles=lost,
                 missing=missing,
             )
-        journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
+        context.journal.say(Level.WARNING, "recording is invalid", reason=log.reason, attempt=attempt)
     raise RunInvalid(
         str(out),
         found=f"{context.section.retries + 1} recordings, none without losses (the last: {log.reason})",
-        expected="one that its recorder stands for",
+        expected="a valid one",
         remedy="see to the bus and to the load of this computer; the next job records this run again",
     )
 
 
 def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> Recorded:
-    """One recording. The interlock is asked before the drives are, and again right before they get power."""
+    """Make one recording; the interlock is checked before the drives are used, and again before they get power."""
 
     def released() -> None:
         require_release(context.section.interlock, context.tools.run, context.tools.now, context.section.working_folder)
@@ -208,23 +164,23 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
         run_id=str(uuid.uuid4()),
         free=context.tools.free,
         block_signals=context.block_signals,
-        # Waiting for the drives and mapping their PDOs takes seconds, in which somebody may open the cell.
+        # Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
         before_motion=released,
     )
 
 
 def payload_of(cell: Cell, planned: PlannedRun) -> Payload | None:
-    """What a run is declared to carry; that the cell has it was checked before anything moved."""
+    """Payload of a run; `section_of` has checked that the cell has it."""
     if planned.payload is None:
         return None
     return next(payload.payload for payload in cell.payloads if payload.name == planned.payload)
 
 
 def _set_aside(out: Path, journal: Journal) -> None:
-    """What an earlier recording of this name left: a log that the state does not know, or half of one.
+    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one.
 
     Raises:
-        UsageError: somebody still writes it.
+        UsageError: the log is still being written.
         OutputFailed: the file system refuses.
     """
     part = out.with_name(out.name + UNFINISHED)
@@ -253,11 +209,8 @@ def _free_names(out: Path, kind: str) -> Iterator[Path]:
             yield path
 
 
-# From a session's logs to its calibration and its report.
-
-
-def fit_session(context: JobContext, session: Session, journal: Journal) -> tuple[Session, Calibration]:
-    """Fit the logs, close the loop, and write calibration and report; nothing where that was done before.
+def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibration]:
+    """Fit the logs, add missing effects, and write calibration and report, unless an earlier job did.
 
     Raises:
         DataError, IdentificationError: the recordings cannot be used; the session is over.
@@ -268,14 +221,18 @@ def fit_session(context: JobContext, session: Session, journal: Journal) -> tupl
         return session, done
     logs = [log_of(session, run.name) for run in context.section.runs if not run.holdout]
     unseen = [log_of(session, run.name) for run in context.section.runs if run.holdout]
-    journal.say(Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen])
+    context.journal.say(
+        Level.INFO, "identifying", logs=[log.name for log in logs], holdout=[log.name for log in unseen]
+    )
     try:
         fitted = context.tools.fit(logs, holdout=unseen)
-        closed = context.tools.close_loop(fitted, context.section.seed, lambda step: journal.say(Level.INFO, step))
+        closed = context.tools.close_loop(
+            fitted, context.section.seed, lambda step: context.journal.say(Level.INFO, step)
+        )
         changed = context.tools.account(start_of(closed), closed.steps)
     except (DataError, IdentificationError):
-        # The same logs would end in the same way: the next job records others.
-        sessions.save(replace(session, state=session.state.with_(outcome=Outcome.UNFIT)))
+        # The same logs would fail again: the next job records new ones.
+        session.update(outcome=Outcome.UNFIT)
         raise
     calibration = context.tools.calibration(closed, context.tools.now())
     path, report = session.folder / CALIBRATION, session.folder / REPORT
@@ -287,12 +244,12 @@ def fit_session(context: JobContext, session: Session, journal: Journal) -> tupl
     context.tools.save_report(closed, changed, calibration, report)
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
     for sentence in fit.sentences:
-        journal.say(Level.INFO, "found", text=sentence)
-    return sessions.save(replace(session, state=session.state.with_(fitted=fit))), calibration
+        context.journal.say(Level.INFO, "found", text=sentence)
+    return session.update(fitted=fit), calibration
 
 
 def calibration_of_session(session: Session) -> Calibration | None:
-    """The calibration that the state speaks of, None where there is none, or where it is not of the session's logs."""
+    """Calibration of a session; None where there is none, or where it was made from other logs."""
     path, fitted = session.folder / CALIBRATION, session.state.fitted
     if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
@@ -306,5 +263,5 @@ def calibration_of_session(session: Session) -> Calibration | None:
 
 @lru_cache(maxsize=2)
 def _loaded(path: Path, _sha256: str) -> Calibration:
-    """Read once for all that tell of it: a content of that digest stays what it is."""
+    """Read a calibration once; its digest identifies the content."""
     return load(path)

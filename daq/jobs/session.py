@@ -1,7 +1,7 @@
-"""A session on the disk: a folder with logs, calibration and report, and a state file that says how far it has come.
+"""A recalibration session on disk: a folder with logs, calibration and report, and a state file with its progress.
 
-The state is replaced whole after every step, with the digests of what the step made. What is in the folder and not in
-the state, or not as the state has it, was left by a job that was killed.
+The state is replaced whole after every step, with the digests of the files that the step made. A file that the state
+does not list, or lists with another digest, is a remnant of a killed job.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 import shutil
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from pathlib import Path
@@ -23,8 +23,7 @@ from daq.errors import OutputFailed
 from daq.files import read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
-LARGEST_STATE_BYTES = 4 << 20
-"""A job writes a few kilobytes."""
+LARGEST_STATE_BYTES = 4 << 20  # a job writes a few kilobytes
 _STAMP = "%Y%m%dT%H%M%SZ"
 _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 
@@ -33,34 +32,34 @@ class Outcome(Enum):
     """How a job ended."""
 
     NOT_DUE = "not due"
-    """The last good calibration is young enough; no session was begun."""
+    """The last good calibration is recent enough; no session was begun."""
     APPLIED = "applied"
     UNCHANGED = "unchanged"
-    """No gain differs from the controller's by more than chance."""
+    """No gain differs significantly from the controller's."""
     PROPOSED = "proposed"
-    """A person must apply it."""
+    """An operator has to apply it."""
     REFUSED = "refused"
-    """A gate of the write-back is closed."""
+    """A check of the write-back failed."""
     UNFIT = "unfit"
     """The recordings cannot be used."""
     STOPPED = "stopped"
-    """Something stood in the way; the next job goes on with the session."""
+    """An error ended the job; the next job resumes the session."""
     INTERRUPTED = "interrupted"
-    """As STOPPED, by a signal."""
+    """Like STOPPED, by a signal."""
 
     @property
     def good(self) -> bool:
-        """Whether the calibration stands."""
+        """Whether the calibration is valid."""
         return self in (Outcome.APPLIED, Outcome.UNCHANGED, Outcome.PROPOSED)
 
     @property
     def concluded(self) -> bool:
-        """Whether the session is over: the same logs would end in the same way."""
+        """Whether the session is over: the same logs would end the same way."""
         return self not in (Outcome.STOPPED, Outcome.INTERRUPTED)
 
 
 class RecordedRun(StrictModel):
-    """A finished log of the session: its digest, how many recordings it took, and what was lost in all of them."""
+    """A finished log: its digest, the number of recordings it took, and the losses of all of them."""
 
     name: str
     sha256: str
@@ -71,17 +70,17 @@ class RecordedRun(StrictModel):
 
 
 class Fitted(StrictModel):
-    """The calibration file's digest, and the residual in words."""
+    """Digest of the calibration file, and the residual in words."""
 
     calibration_sha256: str
     sentences: tuple[str, ...]
 
 
 class JudgedGain(StrictModel):
-    """A gain against the one in the controller: both, their σ, and whether they differ by more than chance.
+    """A gain beside the one in the controller, with their σ, and whether they differ significantly.
 
-    The drift is their difference in σ of the difference, None where both σ are 0; the σ of a number that nobody knows
-    anything of is 0. The change is None where the number in the controller is 0.
+    `drift_sigma` is their difference in σ of the difference, None where both σ are 0; an unknown σ is 0.
+    `change_percent` is None where the number in the controller is 0.
     """
 
     axis: str
@@ -96,17 +95,16 @@ class JudgedGain(StrictModel):
 
 
 class Decision(StrictModel):
-    """What was decided, and from which gains."""
+    """The decision, with the gains it rests on."""
 
     gains: tuple[JudgedGain, ...]
     remark: str
 
 
 class Target(StrictModel):
-    """What is about to be written, noted before it is: after a kill the file's digest says whether it was.
+    """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made.
 
-    `looked_at` is what `apply --base` takes from whoever has looked at the change; `unsigned` where the policy wants
-    signatures that the calibration has not got yet.
+    `looked_at` is the value for `apply --base`; `unsigned` means that required signatures are missing.
     """
 
     file: str
@@ -117,16 +115,17 @@ class Target(StrictModel):
 
 
 class WatchedGain(StrictModel):
-    """What the chart of a gain over all calibrations says (`daq.ledger.watch`); no words where it raises no alarm."""
+    """Alarm of the drift chart of a gain (`daq.ledger.watch`), empty where there is none."""
 
     axis: str
     alarm: str
 
 
 class SessionState(StrictModel):
-    """`state.json`; what a step has not made yet is None, or not in the list.
+    """`state.json`; results of steps that are not done yet are None or missing from the list.
 
-    `plans_sha256` is of the approved plans that runs name, `audit_sha256` of the audit's entry about the session's end.
+    `plans_sha256` is the digest of the approved plans that the runs name, `audit_sha256` that of the audit entry about
+    the end of the session.
     """
 
     format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
@@ -156,34 +155,42 @@ class SessionState(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A folder and its state."""
+    """A session folder and its state."""
 
     folder: Path
     state: SessionState
 
     @property
     def began(self) -> datetime:
-        """When its first job began it."""
+        """Start of its first job."""
         return datetime.fromisoformat(self.state.began)
 
     @property
     def finished(self) -> bool:
-        """Whether no job takes it up any more; one that was killed before it told its end has not come to it."""
+        """Whether no job resumes it; a job that was killed before it reported its end did not finish it."""
         outcome = self.state.outcome
         return outcome is not None and outcome.concluded and self.state.ended is not None
 
     @property
     def last_written(self) -> datetime:
-        """The latest time in its state."""
+        """Latest time in its state."""
         return max(_times(self.state))
+
+    def update(self, **changed: object) -> Session:
+        """Change some values of the state, and write it.
+
+        Raises:
+            OutputFailed: see `save`.
+        """
+        return save(replace(self, state=self.state.with_(**changed)))
 
 
 def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
-    """Sessions in a folder, oldest first; what has no readable state is none.
+    """Read the sessions in a folder, oldest first; folders without a readable state are skipped.
 
     Args:
-        folder: where they are.
-        cell: name of the cell whose they are, since several may keep theirs in one folder; None for all of them.
+        folder: of the sessions; several cells may share one.
+        cell: name of the cell; None for all cells.
     """
     found: list[Session] = []
     with suppress(FileNotFoundError):
@@ -195,13 +202,7 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """What all recordings of a session have in common.
-
-    Attributes:
-        cell: name.
-        configuration_sha256: of its configuration.
-        plans_sha256: of the approved plans that its runs name.
-    """
+    """Cell, configuration and approved plans of a session: a session is resumed only with the same ones."""
 
     cell: str
     configuration_sha256: str
@@ -209,7 +210,7 @@ class Basis:
 
 
 def begin(folder: Path, basis: Basis, now: datetime) -> Session:
-    """Make the folder of a new session and write its state.
+    """Begin a session: make its folder and write its state.
 
     Raises:
         OutputFailed: the file system refuses.
@@ -235,7 +236,7 @@ def begin(folder: Path, basis: Basis, now: datetime) -> Session:
 
 
 def save(session: Session) -> Session:
-    """Write its state, whole.
+    """Write the state of a session, whole.
 
     Raises:
         OutputFailed: the file system refuses.
@@ -249,7 +250,7 @@ def save(session: Session) -> Session:
 
 
 def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, within_h: float) -> Session | None:
-    """The newest session, if it waits for its end: of this configuration, with these plans, and young enough."""
+    """Newest session, if it is unfinished, has the same basis and is recent enough."""
     if not found or found[-1].finished:
         return None
     last = found[-1]
@@ -259,7 +260,7 @@ def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, w
 
 
 def last_good(found: tuple[Session, ...]) -> Session | None:
-    """The newest session whose calibration stands."""
+    """Newest session with a valid calibration."""
     good = [
         session
         for session in found
@@ -269,15 +270,15 @@ def last_good(found: tuple[Session, ...]) -> Session | None:
 
 
 def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:
-    """Remove the oldest sessions beyond so many; the last good one stays, and so does what a controller rests on.
+    """Remove old sessions, except the last good one and those whose gains a controller has.
 
     Args:
         found: oldest first.
-        keep: so many of the newest stay.
+        keep: number of the newest sessions to keep.
         in_force: digests of the calibrations whose gains a controller has: their logs and signatures are its evidence.
 
     Returns:
-        what was removed; what the file system does not let go stays.
+        folders that were removed; one that the file system does not release is skipped.
     """
     good = last_good(found)
     removed = []
@@ -293,7 +294,7 @@ def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str])
 def _read(path: Path) -> SessionState | None:
     with suppress(OSError, ValidationError, ValueError):
         state = SessionState.model_validate_json(read_regular(path, LARGEST_STATE_BYTES))
-        # Ages are counted from them, so each must be a time, and of a known zone.
+        # Ages are counted from these times, so each must be one, with a known zone.
         if all(time.utcoffset() is not None for time in _times(state)):
             return state
     return None

@@ -1,4 +1,4 @@
-"""What makes a timer run the job: a systemd service with its timer, or a line for cron."""
+"""Run the job on a schedule: a systemd service with its timer, or a line for cron."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from daq.config.recalibration import Recalibration
 from daq.errors import ExitCode, UsageError
 
 MARK = "# Made by `drivegain install-units`, which may replace this file."
-"""First line of what is ours; any other file of that name is somebody else's."""
+"""First line of what is ours; a file of that name without it is not ours."""
 STOP_S = 30
-"""For the axes to stop and the session to be written down, after SIGTERM."""
+"""Time for the axes to stop and the session to be saved, after SIGTERM [s]."""
 CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}
 _NEEDS_LITTLE = """\
 NoNewPrivileges=yes
@@ -93,14 +93,14 @@ def cron_line(wanted: Installation) -> str:
 
 
 def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str, ...]:
-    """What a person types then."""
+    """Commands to type next."""
     systemctl = "systemctl --user" if wanted.user else "systemctl"
     journal = "journalctl --user" if wanted.user else "journalctl"
     service = timer.name.removesuffix(".timer") + ".service"
     return (
         f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
         f"{systemctl} daemon-reload",
-        f"{systemctl} start {service}    # once, while somebody watches the cell",
+        f"{systemctl} start {service}    # once, with an operator at the cell",
         f"{systemctl} enable --now {timer.name}",
         f"{systemctl} list-timers {timer.name}",
         f"{journal} -u {service} -o cat",
@@ -108,7 +108,7 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
 
 
 def cell_option(wanted: Installation) -> str:
-    """How a service of ours tells for which cell it is."""
+    """Option by which a service of ours is recognised as one of this cell."""
     return f"--cell {_quoted(str(wanted.cell_file))}"
 
 
@@ -133,10 +133,10 @@ Description=drivegain: scheduled recalibration of cell {_plain(cell.name)}
 Type=oneshot
 ExecStart={command}
 {owner}WorkingDirectory={_plain(str(wanted.cell_file.parent))}
-# 10: a change was found and waits for a person. 11 to 14 (interlock, bus, time, held) fail the unit on purpose:
-# OnFailure= may tell somebody.
+# 10: a change was found and waits for an operator. 11 to 14 (interlock, bus, time, held) fail the unit on purpose:
+# OnFailure= may report it.
 SuccessExitStatus={ExitCode.PROPOSED.value}
-# Never again by itself: whoever stands at the cell decides.
+# No automatic restart: an operator decides.
 Restart=no
 # The job bounds its own time (max_duration_min) and stops the axes; this is behind that bound.
 TimeoutStartSec={seconds}
@@ -189,7 +189,7 @@ def _quoted(part: str, *, dollar: str = "$$") -> str:
         raise UsageError(
             f"{part!r}",
             found="a control character in a path",
-            expected="a path that can stand in a line of a unit",
+            expected="a path that fits in a line of a unit",
             remedy="rename the folder or file",
         )
     plain = _plain(part).replace("$", dollar)

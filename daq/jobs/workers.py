@@ -1,4 +1,4 @@
-"""Who does the tasks of a fleet: threads of this process, processes of this machine, or the workers of a scheduler."""
+"""Workers of a fleet: threads of this process, processes of this machine, or the workers of a scheduler."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CONNECT_S = 10
 
 @dataclass(frozen=True, slots=True)
 class WorkerPool:
-    """Somebody at work.
+    """Running workers.
 
     Attributes:
         executor: runs functions.
         workers: tasks that it does at the same time; no more are ever given to it.
-        present: whether there is anybody left to do them.
+        present: whether any worker is left.
     """
 
     executor: Executor
@@ -99,14 +99,14 @@ class Scheduler:
 
         Raises:
             ConfigurationMissing: dask.distributed is not installed.
-            UsageError: nobody answers at the address, or it has no workers.
+            UsageError: no scheduler answers at the address, or it has no workers.
         """
         with _client(dask_distributed(), self.address, self.workers) as pool:
             yield pool
 
 
 def worker_pool(scheduler: str, workers: int | None) -> Threads | Processes | Scheduler:
-    """Who is meant by --scheduler and --workers.
+    """Choose the workers for --scheduler and --workers.
 
     Args:
         scheduler: threads, processes, or an address.

@@ -51,7 +51,7 @@ RUNS = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What may be chosen of a demonstration.
+    """Settings of a demonstration.
 
     Attributes:
         out: folder that it fills; files of an earlier demonstration in it are replaced.
@@ -68,7 +68,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class ProgressReporter:
-    """Whom to tell what is being done.
+    """Receivers of the progress.
 
     Attributes:
         step: a new step begins, in words.
@@ -111,7 +111,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     Args:
         settings: what may be chosen.
         now: wall clock with time zone.
-        reporter: whom to tell.
+        reporter: receives the progress.
 
     Raises:
         DaqError, DriverError, IdentificationError: whatever a real cell could raise.
@@ -129,7 +129,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, reporter) for index in range(len(RUNS)))
     reporter.step("identify all gains and parameters")
     fitted = fit(logs[:-1], holdout=logs[-1:])
-    reporter.step("look for what the model lacks")
+    reporter.step("detect missing effects")
     fitted = close_loop(fitted, settings.seed, lambda step: reporter.progress(0, 0, step))
     calibration = calibration_of(fitted, now())
     save(calibration, out / "calibration.yaml")
@@ -243,7 +243,7 @@ def _plan(settings: Settings, cell: Cell, index: int, reporter: ProgressReporter
 def _record_valid(
     settings: Settings, cell_file: Path, cell: Cell, plans: tuple[Plan, ...], index: int, reporter: ProgressReporter
 ) -> Recorded:
-    """One run, made again where its recorder does not stand for it; the last attempt is kept as it is, for the fit."""
+    """Record one run, again where it is invalid; the last attempt is kept as it is, for the fit."""
     name, payload, plan_name = RUNS[index]
     reporter.step(f"record {name}: {'without load' if payload is None else 'with ' + payload}")
     for attempt in range(1, RETRIES + 1):

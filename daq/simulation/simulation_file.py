@@ -84,7 +84,7 @@ def load_scenario(path: Path, axes: int, period_us: int) -> tuple[FaultSpec, ...
 
 
 def absent_axes(faults: Sequence[FaultModel], axes: int) -> list[Fault]:
-    """What is wrong with faults on axes that the cell lacks."""
+    """Describe faults on axes that the cell lacks."""
     return [
         Fault(("faults", number, "axis"), f"axis {fault.axis}", f"J1 to J{axes}")
         for number, fault in enumerate(faults)
@@ -224,7 +224,7 @@ def shipped_simulation(name: str = "demo") -> Path:
 
 
 def _starts(model: SimulationModel) -> list[tuple[float | None, float | None]]:
-    """Of each joint: degrees and millimetres, one of them None."""
+    """Position of each joint: degrees and millimetres, one of them None."""
     n = len(model.axes)
     return list(zip(model.start_deg or (None,) * n, model.start_mm or (None,) * n, strict=True))
 

@@ -75,7 +75,7 @@ class ReducedLogs:
 
 @dataclass(frozen=True, slots=True)
 class CaseFit:
-    """A fit, and what it was told of the payloads.
+    """A fit, and the payloads as they were declared to it.
 
     Attributes:
         fitted: without effects.
@@ -164,7 +164,7 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
 
 
 def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
-    """A payload with what a fit is told of it.
+    """Reduce a payload to the knowledge of a case.
 
     Args:
         payload: as the log has it.
@@ -191,7 +191,7 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
 
 
 def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
-    """The calibration, with what it was told of the payloads as parameters without deviation.
+    """Make the calibration; the known payload parameters are in it without deviation.
 
     Args:
         case: fitted.

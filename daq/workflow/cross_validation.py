@@ -39,7 +39,7 @@ class Mass:
         mass_kg: found [kg].
         std_percent: σ from the scatter of the moves, the gains taken as exact [% of the mass].
         std_with_gains_percent: the same with the σ of the gains.
-        error_percent: |found − weighed|/weighed [%], None where nobody has weighed it.
+        error_percent: |found − weighed|/weighed [%], None where it was not weighed.
     """
 
     mass_kg: float
@@ -89,7 +89,7 @@ class WeighedRun:
 
 @dataclass(frozen=True, slots=True)
 class CrossValidation:
-    """Everything that §4.3 tabulates.
+    """All figures of the tables of §4.3.
 
     Attributes:
         axes: their names.
@@ -111,7 +111,7 @@ class CrossValidation:
 def cross_validate(
     calibrations: Mapping[str, Calibration], logs: Sequence[Path], cell: Cell | None = None
 ) -> CrossValidation:
-    """Put calibrations to the test; each log is read once.
+    """Test calibrations on logs; each log is read once.
 
     Args:
         calibrations: by label, made under one filter; the first one is what is being validated.
@@ -198,7 +198,7 @@ def _condition(reduction: Reduction | Failure, calibration: Calibration) -> floa
 
 
 def _weighed_kg(payload: Payload, cell: Cell) -> float | None:
-    """What the log says, or for a payload whose mass it leaves open, the cell: a body weighs the same anywhere."""
+    """Weighed mass from the log, else from the cell, since a body weighs the same anywhere."""
     of_cell = (candidate.mass_kg for candidate in cell.payloads if candidate.name == payload.name)
     return payload.known.get("m", next(of_cell, None))
 

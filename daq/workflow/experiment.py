@@ -30,9 +30,6 @@ from ident.planning.excitation import (
     visible,
 )
 
-# The shape of a cell's arm for the planner: as declared, or guessed from its joint chain and said so.
-
-
 LINK_RADIUS = 0.08
 """Of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
 POSTURES = 400
@@ -47,7 +44,7 @@ class CheckedScene:
     Attributes:
         checker: answers whether a way is clear.
         guessed: the arm's shape is a guess.
-        together: names of pairs that are not looked at, because they touch in nearly every posture.
+        together: names of pairs that are not checked, because they touch in nearly every posture.
     """
 
     checker: Checker
@@ -56,7 +53,7 @@ class CheckedScene:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a person should know of it, in words."""
+        """Remarks for the operator."""
         scene = self.checker.scene
         shape = "a guess from the joint chain; declare `clearance` in the cell file" if self.guessed else "as declared"
         lines = [f"arm of {len(scene.capsules)} capsules, {shape}; {1000 * scene.minimum_m:.0f} mm kept"]
@@ -148,7 +145,7 @@ RUNS: tuple[int | None, ...] = (None, 0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Experiment:
-    """What is needed to judge moves before they are made.
+    """Everything needed to judge moves before they are made.
 
     Attributes:
         cell: of the arm.
@@ -185,7 +182,7 @@ class Experiment:
         return Excitation(motion, use), slices
 
     def informations(self, paths: Sequence[Trapezoid], thinning: int = 1) -> list[FloatArray]:
-        """Of each move, made once without load and once with the payload, all from one regressor."""
+        """Excitation of each move, without load and with the payload, all from one regressor."""
         if not paths:
             return []
         excitation, slices = self.excitation(paths, thinning)
@@ -206,7 +203,7 @@ class Experiment:
 
 
 def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
-    """What is expected of a cell's arm: inertias of the URDF, stated guesses for the rest, nameplate gains.
+    """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest, nameplate gains.
 
     Args:
         cell: with a payload.
@@ -280,9 +277,6 @@ def _rows(cell: Cell) -> tuple[float, float]:
     return filter_.factor / rate_hz, max(filter_.half - inside, 0) / rate_hz
 
 
-# One move of a plan, and the way it takes.
-
-
 @dataclass(frozen=True, slots=True)
 class PlannedMove:
     """One synchronised point-to-point move.
@@ -300,14 +294,14 @@ class PlannedMove:
 
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
-    """The joint trapezoid of a move from where the robot stands."""
+    """The joint trapezoid of a move from the robot's position."""
     velocity = np.array([axis.limits.velocity for axis in cell.axes]) * move.velocity
     acceleration = np.array([axis.limits.acceleration for axis in cell.axes]) * move.acceleration
     return synchronised(start_rad, np.array(move.target_rad), velocity, acceleration)
 
 
 def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
-    """Of all moves but the first: where the robot stands before that is not known."""
+    """Paths of all moves but the first, whose start is unknown."""
     starts = (np.array(move.target_rad) for move in moves)
     return tuple(path_of(cell, start, move) for start, move in zip(starts, moves[1:], strict=False))
 

@@ -40,16 +40,16 @@ from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdic
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """An identification with the cell and the logs it speaks of.
+    """An identification with its cell and logs.
 
     Attributes:
         cell: as the logs describe it.
         logs, holdout: what was fitted, and what was not; they are read again where rows are needed.
         sources: the same, with digests and roles.
         identification: the estimate without effects.
-        steps: turns of the loop, empty where nobody looked for effects.
+        steps: turns of the loop, empty without a search for effects.
         paper: the paper's total least squares on the same equations, None with fixed gains.
-        lossy: what was done with logs that tell of losses.
+        lossy: how logs with losses were handled.
     """
 
     cell: Cell
@@ -179,7 +179,7 @@ def fit(
         method: estimator; ``ml``, or with fixed gains the classical IDIM-WLS, when None.
         gains_fixed: hold the gains at their nameplate values.
         cell: another description of the cell than the one in the logs.
-        lossy: what to do with logs that tell of losses.
+        lossy: how to handle logs with losses.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
@@ -221,7 +221,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
 
     Args:
         fitted: with free gains.
-        progress: told what is being done.
+        progress: receives a line for each step.
 
     Raises:
         UsageError: its gains were held fixed.
@@ -261,7 +261,7 @@ LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
 """Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
 DOUBTFUL_PERCENT = 25.0
-"""In total; the default gate of `apply` stands here."""
+"""In total; the default limit of `apply`."""
 
 
 def check_explained(error: RelativeError, axes: tuple[str, ...]) -> None:
@@ -294,12 +294,12 @@ def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
 
 
 def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
-    """Look for effects that the model lacks, and refit with those that pass.
+    """Detect effects that the model misses, and refit with those that pass.
 
     Args:
         start: of method ``ml``; another one is refitted by it, because candidates are judged in its terms.
         seed: of the bootstrap.
-        progress: told what is being done.
+        progress: receives a line for each step.
 
     Raises:
         IdentificationError: a refit failed.
@@ -315,7 +315,7 @@ def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _
 
 
 def calibration_of(fitted: Fit, created: datetime) -> Calibration:
-    """The calibration that a fit amounts to.
+    """Make the calibration of a fit.
 
     Args:
         fitted: with or without effects.
@@ -343,9 +343,9 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
 
 
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
-    """What the hold-out would be told of with the nameplate's gains: same model, effects included, parameters refitted.
+    """Hold-out error with the nameplate's gains: same model, effects included, parameters refitted.
 
-    Without the effects, what they tell would be credited to the gains. ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the
+    Without the effects, their share would be credited to the gains. ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the
     scale of its gain, but ‖Y_j‖ does: the total is put together with the ‖Y_j‖ of the calibration, so that a smaller
     gain alone makes no total smaller.
     """
@@ -416,17 +416,11 @@ def _holdout_error(error: RelativeError | None, placed: PlacedEffect) -> float |
     return figure if np.isfinite(figure) else None
 
 
-# How well a fit has seen each gain, by what, and which moves would show it better.
-
-
-FloatArray = NDArray[np.float64]
-
-
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """Judge every gain of a fit with free gains; the logs are read again.
 
     The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
-    scaled from the prediction as the fit's deviation is: moves tell of it, not the size of the noise.
+    scaled from the prediction as the fit's deviation is: moves determine the ratio, not the size of the noise.
 
     Args:
         fitted: effects, if it has any, are left out of the judgement.
@@ -451,7 +445,7 @@ def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
 
 
 def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """The verdicts, or none where the gains were given or all are known so well that nobody needs to ask by what."""
+    """The verdicts, or none where the gains were given or all are known well enough."""
     estimate = fitted.estimate
     good = bool(np.all(100.0 * estimate.gains_std <= GOOD_PERCENT * np.abs(estimate.gains)))
     return () if good else gain_verdicts(fitted)

@@ -31,7 +31,7 @@ class Plan:
         predicted_std_percent: standard deviation of each gain [% of it] when the moves are made once without load and
             once with the cell's payload, as predicted from nominal parameters; empty in plans of earlier versions.
         duration_s: from the first target to the end of the last dwell [s]; how long the way to the first target takes
-            depends on where the robot stands.
+            depends on the robot's position.
         moves: in order.
         units: in which people read the targets, one a joint.
     """
@@ -46,7 +46,7 @@ class Plan:
 
 
 def units_of(cell: Cell) -> tuple[JointUnit, ...]:
-    """Of its joints."""
+    """Units of its joints."""
     return tuple(axis.unit for axis in cell.axes)
 
 
@@ -77,7 +77,7 @@ def plan(
         largest_condition: a plan worse than this is refused.
         largest_std_percent: a plan that predicts more than this for a gain is refused.
         experiment: that the plan is for, None for the one with the cell's first payload.
-        progress: told the number of tries and the deviation predicted for the worst gain so far [%].
+        progress: receives the number of tries and the deviation predicted for the worst gain so far [%].
 
     Raises:
         UsageError: no plan of this length shows every gain, or there is no clear way.
@@ -125,9 +125,6 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
     return replace(plan_, duration_s=duration_of(cell, moves), moves=moves)
 
 
-# Moves that could be added to an experiment, of every kind that is known to help some gain: the planner's advice.
-
-
 FloatArray = NDArray[np.float64]
 
 SECONDS = 5.0
@@ -135,7 +132,7 @@ SECONDS = 5.0
 POSTURES = 300
 POSITION_MARGIN = 0.03
 SLOW = 0.2
-"""Share of the speed limit at which gravity tells more than inertia."""
+"""Share of the speed limit at which gravity excites more than inertia."""
 STROKES = (1.0, 0.7, 0.4)
 """Shares of the range that are tried until the way is clear."""
 

@@ -44,7 +44,7 @@ PLACES = 3
 
 
 class Kind(Enum):
-    """Of a proposal."""
+    """Kind of a proposal."""
 
     ANEW = "another target"
     NEAR = "a target moved in some of the axes"
@@ -60,7 +60,7 @@ CHANCES = (0.2, 0.25, 0.2, 0.15, 0.1, 0.1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draft:
-    """Moves with the ways between them and what each way tells.
+    """Moves with the ways between them and the information of each way.
 
     Attributes:
         moves: the first only says where the run starts.
@@ -140,7 +140,7 @@ class Search:
         Args:
             draft: to begin with.
             tries: proposals; every one of them is made.
-            progress: told the number of tries and the predicted deviations so far [%].
+            progress: receives the number of tries and the predicted deviations so far [%].
         """
         best, worst = self._judge(draft, np.inf)
         done = 0
@@ -158,7 +158,7 @@ class Search:
         return draft
 
     def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
-        """What the search lowers, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
+        """Cost of the search, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
         information = np.sum(draft.informations, axis=0)
         found = self._experiment.design.std_percent(information)
         value = _worst(found)
@@ -204,7 +204,7 @@ class Search:
         return replace(move, target_rad=self._written(target))
 
     def _drafts(self, draft: Draft, proposals: Sequence[tuple[PlannedMove, ...]]) -> list[Draft]:
-        """The proposals that are short enough and whose new ways are clear, with what they tell."""
+        """The proposals that are short enough and whose new ways are clear, with their information."""
         known = {
             _way(pair): (path, information)
             for pair, path, information in zip(pairwise(draft.moves), draft.paths, draft.informations, strict=True)
@@ -215,7 +215,7 @@ class Search:
             ways = [_way(pair) for pair in pairwise(moves)]
             new = {way: path_of(self._cell, np.array(way[0]), way[1]) for way in ways if way not in known}
             lengths = [new[way].duration_s if way in new else known[way][0].duration_s for way in ways]
-            # The time is quick to tell, the clearance is not.
+            # The time is quick to check, the clearance is not.
             if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
                 continue
             if all(self._obstruction(path) is None for way, path in new.items() if way not in fresh):
@@ -248,7 +248,7 @@ class Search:
         return self._experiment.scene.checker.obstruction(path.start, path.end)
 
     def _random_move(self) -> PlannedMove:
-        # Slow and fast moves both: friction is told from inertia by moves of different speed and acceleration.
+        # Slow and fast moves both: friction is distinguished from inertia by moves of different speed and acceleration.
         return PlannedMove(
             target_rad=self._written(self._rng.uniform(self._low, self._high)),
             velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),

@@ -54,7 +54,7 @@ from ident.model.bodies import Payload
 FloatArray = NDArray[np.float64]
 
 LOCKSTEP_TIMEOUT_S = 3.0
-"""A simulated cell on a busy machine may be that late; one that ended is told of in four seconds."""
+"""A simulated cell on a busy machine may be that late; one that ended is reported in four seconds."""
 GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
 SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
@@ -97,7 +97,7 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
 
     Args:
         cell: its file.
-        undisturbed: keeps signals from the stop of the axes.
+        block_signals: keeps signals away while the axes are stopped.
 
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
@@ -134,7 +134,7 @@ def record(
         plan: the moves.
         out: log to write; must not exist.
         payload: what is mounted, None without load.
-        operator: who stands for the recording.
+        operator: person or job responsible for the recording.
         granted_by: who allows the motion; None refuses it.
         run_id: unique.
         speed: share of its planned speed that the plan's moves have been given (`daq.workflow.plan.slowed`), for the
@@ -142,14 +142,14 @@ def record(
         entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
         clocks: wall and monotonic time.
         free: room on the disk of a folder.
-        undisturbed: keeps signals from the stop of the axes.
-        progress: told the moves done and their number.
+        block_signals: keeps signals away while the axes are stopped.
+        progress: receives the number of finished moves and of all.
         before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it
             raises leaves the axes without power and no file.
 
     Raises:
         UsageError: the mass from the scale is not the payload's; nothing has moved and no file was made.
-        MotionRefused: nobody allowed it, or the moves leave the limits; nothing has moved and no file was made.
+        MotionRefused: motion is disabled, or the moves leave the limits; nothing has moved and no file was made.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
             marked invalid.
         ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
@@ -166,11 +166,11 @@ def record(
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
         rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
-        # Where the axes stand: what is refused there is refused before a file exists. A stream of its own asks, because
-        # the schedule of the recording's waits for nobody, and what follows here takes many periods.
+        # The positions of the axes: a refusal comes before a file exists. A stream of its own asks, because
+        # the schedule of the recording does not wait, and what follows here takes many periods.
         if producer is not None:
             producer.start()
-        start_counts = _standing(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
+        start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         moves = motor_moves(cell, plan, scale, start_counts)
         check_moves(start_counts, moves, permission, cell.axis_names)
@@ -235,7 +235,7 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
     """Log every sample of a walk, and end the walk when they cannot be kept any more.
 
     Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
-    confirm; only closed, it would have nobody to tell.
+    confirm; if it were only closed, that would be lost.
 
     Args:
         samples: of `drivers.motion.execute.execute`.
@@ -257,7 +257,7 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
 
 
 def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
-    """How long the moves of motors take, with their dwells, from where the axes stand [s]."""
+    """How long the moves of motors take, with their dwells, from the current positions [s]."""
     total_s, here = 0.0, tuple(start_counts)
     for move in moves:
         total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
@@ -278,7 +278,7 @@ def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
     return tuple(samples)
 
 
-def _standing(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
+def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
     """Where the axes are, as their PDOs and their objects both say [counts]."""
     asking = SyncStream(network, pacing)
     start = until_complete(asking)[-1]
@@ -288,7 +288,7 @@ def _standing(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
 
 
 def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
-    """What each motor may do so that no joint can leave its limits by one motor alone [counts].
+    """Limits of each motor, so that no joint can leave its limits by one motor alone [counts].
 
     A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). That each joint keeps its own
     limits is checked where joints are spoken of: in the plan.

@@ -1,7 +1,8 @@
-"""One mover a bus: a lock that every recording and every job takes before it says anything to the drives.
+"""Safeguards of a recording: bus lock, disk space, plausible currents, the payload's mass, deferred garbage collection.
 
-The locks are those of flock(2) on files in a folder of the system: they end with their process, however it ends. They
-keep out other programs of drivegain on this computer; somebody else's master is heard on the bus itself (BusBusy).
+Every recording and every job takes the lock of its bus before it sends anything to the drives. It is the lock of
+flock(2) on a file in a folder of the system, and ends with its process. It excludes other programs of drivegain on this
+computer; a foreign master is detected on the bus itself (BusBusy).
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
 
 
 def lock_name(bus: Bus) -> str:
-    """Of a bus's lock file: by its interface and channel, and of a hub by its host's address and its port."""
+    """Name of a bus's lock file: by interface and channel, for a hub by its host's address and port."""
     parts = [bus.interface, bus.channel]
     if bus.interface == "socketcand":
         parts += [_address(bus), str(bus.port)]
@@ -66,7 +67,7 @@ def lock_name(bus: Bus) -> str:
 
 
 def _address(bus: Bus) -> str:
-    """One for all names of a host; its name where nobody knows an address, since then nobody reaches it either."""
+    """One for all names of a host; its name where it has no address, since it is unreachable then."""
     try:
         found = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
@@ -155,9 +156,6 @@ def _is_at(descriptor: int, path: Path) -> bool:
     return False
 
 
-# Room on the disk for a recording: asked before anything moves, watched while it runs.
-
-
 FreeBytes = Callable[[Path], int]
 """Room left for this user on the disk of a folder [bytes]."""
 
@@ -198,7 +196,7 @@ class DiskRoom:
 
     Args:
         log: to be written.
-        free: tells the room.
+        free: free bytes of a folder's disk.
     """
 
     def __init__(self, log: Path, free: FreeBytes = free_bytes) -> None:
@@ -250,9 +248,6 @@ def _megabytes(number: int) -> str:
     return f"{number / 1e6:.1f} MB"
 
 
-# Whether the ampere that the drives tell can be true of the motors of the cell; asked before anything is recorded.
-
-
 def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
     """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
 
@@ -280,9 +275,6 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
     return grouped if note is None else (note, *grouped)
 
 
-# The payload's mass, entered twice: once in the cell file, once from the scale. All gains are in proportion to it.
-
-
 _ROUNDING_KG = 1e-9
 """Two spellings of one number are one number."""
 
@@ -303,7 +295,7 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
     Args:
         cell: with the tolerance.
         payload: that is mounted, with the mass of the cell file.
-        entered_kg: from the scale; None where nobody entered one.
+        entered_kg: from the scale; None where none was entered.
 
     Raises:
         UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.
@@ -325,9 +317,6 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
             expected=f"{declared_kg:g} kg within {within_kg:g} kg, as in the cell file",
             remedy="weigh it again and correct the wrong one of the two: all gains are in proportion to this mass",
         )
-
-
-# Python's search for garbage, kept short while SYNC must go out in time.
 
 
 NEVER = 2**31 - 1

@@ -50,7 +50,7 @@ class Shift:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhysicalRobot:
-    """What a calibration says of the bodies of its robot.
+    """Bodies of the robot, from a calibration.
 
     Attributes:
         parameters: with their certificate.
@@ -117,9 +117,6 @@ def cell_limits(cell: Cell) -> FloatArray:
     speed = [MOTION * axis.limits.velocity for axis in cell.axes]
     acceleration = [MOTION * axis.limits.acceleration for axis in cell.axes]
     return np.array([ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0]), speed, acceleration])
-
-
-# Where the elements of a URDF stand in its bytes; nothing in the text can make the reader work for it.
 
 
 MAX_BYTES = 16 * 2**20
@@ -317,9 +314,6 @@ def _end(file: str, joint: Element, which: str) -> str:
     return named[0]
 
 
-# Inertias and joint friction into a user's URDF: their elements are replaced, every other byte stays.
-
-
 FORMAT = "drivegain-urdf"
 """What the comment at the head of a written URDF says it is."""
 _MERGED = b"<!-- drivegain: this body's inertia is in that of the moving link it is fixed to -->"
@@ -327,7 +321,7 @@ _MERGED = b"<!-- drivegain: this body's inertia is in that of the moving link it
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointUpdate:
-    """What is known of a joint and the link it moves.
+    """New values of a joint and the link it moves.
 
     Attributes:
         body: everything that moves with the joint as one: its link and what fixed joints hold to it, in the link frame.

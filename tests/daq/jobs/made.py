@@ -11,7 +11,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.files import sha256_of
-from daq.jobs.tools import Tools
+from daq.jobs.context import Tools
 from daq.workflow.fit import Fit
 from daq.workflow.plan import Plan
 from daq.workflow.record import Recorded

@@ -20,11 +20,11 @@ from daq.config.bus import bus_address
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
-from daq.jobs.conclusion import Conclusion
+from daq.jobs.context import Tools
 from daq.jobs.job import recalibrate
 from daq.jobs.journal import Form, Journal
+from daq.jobs.reporting import Conclusion
 from daq.jobs.session import Session, sessions
-from daq.jobs.tools import Tools
 from daq.ledger.audit import AuditEntry, read, verify
 from daq.report.residual_page import save_report
 from daq.simulation.simulation_file import load_simulation

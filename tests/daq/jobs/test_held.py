@@ -30,10 +30,10 @@ from daq.errors import (
     TimeBoundReached,
     exit_code,
 )
+from daq.jobs.context import section_of
 from daq.jobs.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command, time_bound
 from daq.jobs.job import preview
 from daq.jobs.journal import Form, Journal
-from daq.jobs.preflight import section_of
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.workflow.record import Recorded

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from daq.errors import OutputFailed
-from daq.jobs.journal import Figures, Form, Journal, Level, form_of, write_metrics
+from daq.jobs.journal import Form, Journal, Level, form_of
+from daq.jobs.reporting import Figures, write_metrics
 from daq.jobs.session import Outcome
 
 AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from daq.errors import ExitCode
+from daq.jobs.context import Tools
 from daq.jobs.session import Outcome
-from daq.jobs.tools import Tools
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
 from daq.writeback.file_target import FileTarget

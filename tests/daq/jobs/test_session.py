@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from daq.config.cell_file import load_cell
 from daq.errors import JobHeld
-from daq.jobs.journal import file_stem
-from daq.jobs.preflight import CLOCK_SLACK, require_clock
+from daq.jobs.context import CLOCK_SLACK, require_clock
 from daq.jobs.recording import calibration_of_session
+from daq.jobs.reporting import file_stem
 from daq.jobs.session import STATE, Basis, Outcome, Session, SessionState, begin, remove_old, save, sessions
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import BEGAN, make_rig

@@ -22,11 +22,12 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
+from daq.jobs.decision import GainHistory
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
-from daq.jobs.verdict import GainHistory
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, logs_of, recorded_at
+from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS
@@ -301,7 +302,8 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
     declared = load_cell(cell)
     controller = declared.controller_path
     assert controller is not None
-    with GainHistory(declared, _place(cell), controller, lambda: BEGIN, "job") as past:
+    with Ledger(declared, _place(cell), "job") as ledger:
+        past = GainHistory(ledger, controller, lambda: BEGIN)
         if own is not None:
             file = cell.parent / "own.yaml"
             save(own, file)

@@ -1,23 +1,19 @@
-"""What becomes of a calibration: nothing, a proposal for a person, or the controller's new gains."""
+"""Decide about a calibration: keep the gains in the controller, propose new ones to an operator, or write them."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
-from daq.config.cell import Cell
-from daq.config.policy import AppliedBy, HistoryPlace
+from daq.config.policy import AppliedBy
 from daq.errors import DaqError, OutputFailed
 from daq.files import replace_file, sha256, sha256_of
-from daq.jobs import session as sessions
-from daq.jobs.journal import Journal, Level
-from daq.jobs.recording import JobContext
+from daq.jobs.context import JobContext
+from daq.jobs.journal import Level
 from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target, WatchedGain
 from daq.ledger.audit import AuditAction, append
 from daq.ledger.audit import read as read_audit
@@ -33,79 +29,65 @@ from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 from ident.drift.change import FALSE_ALARM
 
-# What the cell's history says of the gains in force, and what a job adds to it.
 
-
+@dataclass(slots=True)
 class GainHistory:
-    """The history of a cell, open; a context manager.
+    """History of a cell while a job uses it.
 
-    Args:
-        cell: that it is of.
-        place: of its files.
+    Attributes:
+        ledger: open.
         controller: file whose gains are in force.
         now: wall clock.
-        who: the job.
+        digest: of the session's calibration, once it is entered.
     """
 
-    def __init__(
-        self, cell: Cell, place: HistoryPlace, controller: Path, now: Callable[[], datetime], who: str
-    ) -> None:
-        self._target = str(resolve_links(controller))
-        self._now = now
-        self._store = Ledger(cell, place, who)
-        self._digest = ""
+    ledger: Ledger
+    controller: Path
+    now: Callable[[], datetime]
+    digest: str = ""
 
-    def __enter__(self) -> Self:
-        """Open it.
-
-        Raises:
-            HistoryUnreadable: see `daq.ledger.store`.
-        """
-        self._store.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._store.__exit__(kind, error, trace)
+    @property
+    def target(self) -> str:
+        """Name of the controller's file in the history."""
+        return str(resolve_links(self.controller))
 
     def enter(self, calibration: Calibration, path: Path) -> None:
-        """Enter this session's calibration; once, however often a session is taken up.
+        """Enter the session's calibration; once, however often the session is resumed.
 
         Raises:
             DataError, HistoryUnreadable, OutputFailed: see `daq.ledger.store`.
         """
-        self._digest = sha256_of(path) or ""
-        self._store.add(calibration, digest=self._digest, at=self._now())
+        self.digest = sha256_of(path) or ""
+        self.ledger.add(calibration, digest=self.digest, at=self.now())
 
     def note_applied(self, sha256_after: str) -> None:
         """Enter, once, that the controller's file has this session's gains and this SHA-256. Raises as `enter`."""
-        self._store.record_applied(self._digest, at=self._now(), target=self._target, sha256_after=sha256_after)
+        self.ledger.record_applied(self.digest, at=self.now(), target=self.target, sha256_after=sha256_after)
 
     def watched(self) -> tuple[WatchedGain, ...]:
-        """What the charts of all gains say, in the order of the axes. Raises as `keep`."""
-        series = watch(self._store.entries(), self._store.acknowledgements())
+        """Alarms of the drift charts, in the order of the axes. Raises as `enter`."""
+        series = watch(self.ledger.entries(), self.ledger.acknowledgements())
         return tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
 
     def known(self, changes: Sequence[GainChange]) -> Known:
-        """What the changes by this session's calibration are judged by. Raises as `keep`."""
-        return known_of(self._store, self._target, self._digest, changes)
+        """Evidence by which the changes of the gains are judged. Raises as `enter`."""
+        return known_of(self.ledger, self.target, self.digest, changes)
 
 
-CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: a person decides."
+CHANGED_SINCE_START = "The controller's file was written or rolled back since the session began: an operator decides."
 PROPOSAL, DIFF = "proposal.json", "proposal.diff"
 
 
 def decide_outcome(
-    context: JobContext, session: Session, calibration: Calibration, gain_history: GainHistory, journal: Journal
+    context: JobContext, session: Session, calibration: Calibration, gain_history: GainHistory
 ) -> Session:
-    """Compare a calibration with the gains in the controller, and do what follows from it; the state has the outcome.
+    """Compare a calibration with the gains in the controller, and act on it; the outcome is in the returned state.
 
     Raises:
-        CalibrationRefused: a gate is closed; the controller's file stands as it was, and the session is over.
+        CalibrationRefused: a check failed; the controller's file is unchanged, and the session is over.
         AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
-    session = _written_before(context, session, gain_history, journal)
+    session = _written_before(context, session, gain_history)
     if session.state.outcome is not None:
         return session
     path, now = session.folder / CALIBRATION, context.tools.now()
@@ -116,7 +98,7 @@ def decide_outcome(
     differs, touched = any(gain.differs for gain in decision.gains), _written_since(context, session)
     if differs and touched:
         decision = decision.model_copy(update={"remark": f"{decision.remark} {CHANGED_SINCE_START}"})
-    journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
+    context.journal.say(Level.NOTICE, "compared with the gains in the controller", words=decision.remark)
     after = sha256(edit.after)
     target = Target(
         file=str(edit.file),
@@ -126,24 +108,26 @@ def decide_outcome(
         unsigned=any(refusal.gate is Gate.SIGNATURE for refusal in proposal.refusals),
     )
     _write_proposal(session, proposal, after)
-    # Before anything is written: whoever finds this state after a kill sees by the file's digest whether it was.
-    session = sessions.save(replace(session, state=session.state.with_(decision=decision, target=target)))
+    # Before anything is written: after a kill, the digest of the file shows whether it was.
+    session = session.update(decision=decision, target=target)
     closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
     if closed:
         for refusal in closed:
-            journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
-        sessions.save(_with_outcome(session, Outcome.REFUSED))
+            context.journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
+        session.update(outcome=Outcome.REFUSED)
         _apply(context, proposal, now)  # which refuses it, and writes that down
     if not edit.has_effect or not differs:
-        return sessions.save(_with_outcome(session, Outcome.UNCHANGED))
+        return session.update(outcome=Outcome.UNCHANGED)
     if proposal.refusals or needs_person(context) or touched:
-        _propose(context, session, target, journal)
-        return sessions.save(_with_outcome(session, Outcome.PROPOSED))
+        _propose(context, session, target)
+        return session.update(outcome=Outcome.PROPOSED)
     written = _apply(context, proposal, now)
     if written is not None:
-        journal.say(Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup))
-    _note(context, gain_history, after, journal)
-    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+        context.journal.say(
+            Level.NOTICE, "written to the controller's file", file=edit.subject, backup=str(written.backup)
+        )
+    _note(context, gain_history, after)
+    return session.update(outcome=Outcome.APPLIED)
 
 
 def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
@@ -153,24 +137,21 @@ def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> 
         raise OutputFailed.of(proposal.edit.file, error) from error
 
 
-def _note(context: JobContext, gain_history: GainHistory, after_sha256: str, journal: Journal) -> None:
-    """The history's turn. The controller has its gains, and no trouble of the history's may call that undone."""
+def _note(context: JobContext, gain_history: GainHistory, after_sha256: str) -> None:
+    """Enter the write in the history; the controller has its gains already, so a failure is only reported."""
     try:
         gain_history.note_applied(after_sha256)
     except DaqError as error:
-        journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
+        context.journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
 
 
 def needs_person(context: JobContext) -> bool:
-    """Whether a person applies: by the cell's policy, and wherever drives are written to."""
+    """Whether an operator applies the gains: by the cell's policy, and whenever drives are written."""
     return context.cell.apply.by is AppliedBy.PERSON or bool(context.target.controller.objects)
 
 
 def decision_of(proposal: Proposal[FileEdit], gain_history: GainHistory) -> Decision:
-    """Whether any gain differs from the controller's by more than chance (`daq.ledger.judgement`).
-
-    An axis differs by itself where its probability among all of them says so.
-    """
+    """Judge which gains differ significantly from the controller's (`daq.ledger.judgement`), each among all axes."""
     known = gain_history.known(proposal.edit.changes)
     found = judge(proposal.edit.changes, known)
     changes = {change.axis: change for change in proposal.edit.changes}
@@ -191,23 +172,25 @@ def decision_of(proposal: Proposal[FileEdit], gain_history: GainHistory) -> Deci
     return Decision(gains=gains, remark=found.words)
 
 
-def _written_before(context: JobContext, session: Session, gain_history: GainHistory, journal: Journal) -> Session:
-    """A job that was killed behind its write has written all the same: it is noted, and never done twice."""
+def _written_before(context: JobContext, session: Session, gain_history: GainHistory) -> Session:
+    """Recognise a write whose job was killed right after it: it is entered, and never repeated."""
     target = session.state.target
     if target is None or target.base_sha256 == target.after_sha256:
         return session
     if sha256_of(Path(target.file)) != target.after_sha256:
         return session
-    journal.say(Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it")
-    _note(context, gain_history, target.after_sha256, journal)
-    return sessions.save(_with_outcome(session, Outcome.APPLIED))
+    context.journal.say(
+        Level.NOTICE, "the controller's file has these gains already: an earlier job of this session wrote it"
+    )
+    _note(context, gain_history, target.after_sha256)
+    return session.update(outcome=Outcome.APPLIED)
 
 
 def _written_since(context: JobContext, session: Session) -> bool:
-    """Whether the audit tells of a write of the controller's file, or of a way back, since the session began.
+    """Whether the audit has a write or a rollback of the controller's file since the session began.
 
-    An earlier job of it may have been killed right behind its write, and a person may have rolled that back since: the
-    file is then what it was before, and the job must not do again what the person has undone.
+    An earlier job may have been killed right after its write, and an operator may have undone that since. The file is
+    then as it was before, and the job must not repeat the write.
     """
     entries = read_audit(context.target.history.audit)
     begun = [
@@ -217,11 +200,11 @@ def _written_since(context: JobContext, session: Session) -> bool:
     ]
     file = str(resolve_links(context.target.file))
     ends = (AuditAction.APPLIED, AuditAction.ROLLED_BACK)
-    # Of an audit that does not know the begin, all of it is later: the part that knew it was moved away.
+    # Without the entry of the begin, the older part of the audit was moved away: all entries are later.
     return any(entry.action in ends and entry.subject == file for entry in entries[begun[0] if begun else 0 :])
 
 
-def _propose(context: JobContext, session: Session, target: Target, journal: Journal) -> None:
+def _propose(context: JobContext, session: Session, target: Target) -> None:
     append(
         context.target.history.audit,
         AuditAction.PROPOSED,
@@ -235,11 +218,11 @@ def _propose(context: JobContext, session: Session, target: Target, journal: Jou
             "sha256_after": target.after_sha256,
         },
     )
-    journal.say(Level.NOTICE, "proposed: a person must apply it", folder=str(session.folder))
+    context.journal.say(Level.NOTICE, "proposed: an operator has to apply it", folder=str(session.folder))
 
 
 def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256: str) -> None:
-    """The change as a person and a program read it, beside the calibration."""
+    """Write the change beside the calibration, as JSON and as a diff."""
     document = {
         "file": str(proposal.edit.file),
         "base_sha256": proposal.edit.base_sha256,
@@ -263,10 +246,6 @@ def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256
         replace_file(session.folder / DIFF, proposal.edit.diff.encode())
     except OSError as error:
         raise OutputFailed.of(session.folder / PROPOSAL, error) from error
-
-
-def _with_outcome(session: Session, outcome: Outcome) -> Session:
-    return replace(session, state=session.state.with_(outcome=outcome))
 
 
 def _finite(number: float) -> float | None:

@@ -1,0 +1,217 @@
+"""Context of a recalibration job, and the checks before it begins and before it moves anything."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from daq.config.cell import Cell, MotionPolicy
+from daq.config.controller import Controller
+from daq.config.policy import HistoryPlace
+from daq.config.recalibration import Recalibration
+from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, OutputFailed
+from daq.jobs.interlock import Runner, check_drives, require_release, run_command
+from daq.jobs.journal import Journal, Level
+from daq.jobs.session import Session, last_good
+from daq.ledger.store import HistoryStore
+from daq.workflow.fit import Fit, calibration_of, close_loop, fit
+from daq.workflow.plan import Plan, plan
+from daq.workflow.record import Recorded, record
+from daq.workflow.safeguards import FreeBytes, agree, free_bytes
+from daq.writeback.file_access import resolve_links
+from daq.writeback.file_target import FileEdit
+from daq.writeback.target import Proposal, Written, apply, propose
+from drivers.canopen.network import SignalBlocker
+from drivers.errors import MotionRefused
+from ident.calibration import Calibration
+from ident.discovery.before_after import Account, account
+
+CLOCK_SLACK = timedelta(minutes=1)
+"""A time service sets a clock back by less."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """Functions that a job calls; tests replace those whose result they know.
+
+    Attributes:
+        save_report: writes the report of a fit into a folder.
+        drives: checks the drives before anything moves.
+        run: runs a command of the cell.
+        free: free bytes of a folder's disk.
+        now: wall clock with time zone.
+        monotonic_s: clock for durations [s].
+    """
+
+    save_report: Callable[[Fit, Account, Calibration, Path], None]
+    drives: Callable[[Cell, SignalBlocker], None] = check_drives
+    plan: Callable[..., Plan] = plan
+    record: Callable[..., Recorded] = record
+    fit: Callable[..., Fit] = fit
+    close_loop: Callable[..., Fit] = close_loop
+    calibration: Callable[[Fit, datetime], Calibration] = calibration_of
+    account: Callable[..., Account] = account
+    propose: Callable[..., Proposal[FileEdit]] = propose
+    apply: Callable[..., Written | None] = apply
+    run: Runner = run_command
+    free: FreeBytes = free_bytes
+    now: Callable[[], datetime] = lambda: datetime.now(UTC)
+    monotonic_s: Callable[[], float] = time.monotonic
+
+
+@dataclass(frozen=True, slots=True)
+class GainTarget:
+    """Controller file that a job writes, and the history of its cell.
+
+    Attributes:
+        controller: its declaration in the cell file.
+        file: absolute path.
+        history: files of history and audit.
+    """
+
+    controller: Controller
+    file: Path
+    history: HistoryPlace
+
+
+@dataclass(frozen=True, slots=True)
+class JobContext:
+    """Everything that the steps of a job share.
+
+    Attributes:
+        file, cell, section: the cell file, the cell, and its `recalibration`.
+        target: controller file that the gains are compared with and written to.
+        tools: functions that the job calls.
+        journal: log of the job, labelled with session and step.
+        who: name of the job in audit and logs.
+        began_s: start of the job on the monotonic clock [s].
+        block_signals: keeps signals away while the axes are stopped.
+    """
+
+    file: Path
+    cell: Cell
+    section: Recalibration
+    target: GainTarget
+    tools: Tools
+    journal: Journal
+    who: str
+    began_s: float = 0.0
+    block_signals: SignalBlocker = nullcontext
+
+    def within(self, *, session: str | None = None, step: str | None = None) -> JobContext:
+        """The same context, with a journal that names the session or the step."""
+        return replace(self, journal=self.journal.within(session=session, step=step))
+
+
+def target_of(cell: Cell) -> GainTarget:
+    """Find the controller file of a cell.
+
+    Raises:
+        ConfigurationInconsistent: the cell names no controller file.
+        ControllerUnfit: it is a symbolic link that a write would not follow (`daq.writeback.file_access`).
+    """
+    file = cell.controller_path
+    if cell.controller is None or file is None or cell.history is None:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}: controller",
+            found="no file",
+            expected="a controller's file: a job compares its gains with those in it",
+            remedy="name it in the cell file; what is kept in drives alone is recorded and applied by hand",
+        )
+    resolve_links(file)  # refused now, not after an hour of recordings
+    return GainTarget(cell.controller, file, cell.history)
+
+
+def section_of(cell: Cell) -> Recalibration:
+    """Return the cell's `recalibration`, checked against the rest of the cell file.
+
+    Raises:
+        ConfigurationInconsistent: there is none, or a run's payload differs from the cell's.
+        MotionRefused: the cell's policy does not allow motion without an operator.
+    """
+    if cell.recalibration is None:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}",
+            found="no `recalibration`",
+            expected="its runs, its interlock and how payloads are mounted",
+            remedy="complete the cell file, as in docs/how-to/schedule-recalibration.md",
+        )
+    payloads = {payload.name: payload for payload in cell.payloads}
+    for index, run in enumerate(cell.recalibration.runs):
+        if run.payload is None or run.mass_kg is None:
+            continue
+        payload = payloads.get(run.payload)
+        if payload is None:
+            raise ConfigurationInconsistent(
+                f"recalibration.runs[{index}].payload",
+                found=repr(run.payload),
+                expected=f"one of the cell's payloads: {', '.join(payloads) or 'there are none'}",
+                remedy="correct the cell file",
+            )
+        if not agree(run.mass_kg, payload.mass_kg, payload.mass_tolerance_kg):
+            raise ConfigurationInconsistent(
+                f"recalibration.runs[{index}].mass_kg",
+                found=f"{run.mass_kg:g} kg",
+                expected=f"{payload.mass_kg:g} kg ± {payload.mass_tolerance_kg:g} kg, as `payloads` has {run.payload}",
+                remedy="weigh the payload again: its mass is in every gain",
+            )
+    if cell.motion is not MotionPolicy.ALLOWED:
+        raise MotionRefused(
+            "a scheduled job moves the robot without an operator: nothing moves unless the cell file says "
+            "`policy: {motion: allowed}`"
+        )
+    return cell.recalibration
+
+
+def require_clock(found: tuple[Session, ...], now: datetime) -> None:
+    """Check that the clock is not behind the times of the recorded sessions.
+
+    Raises:
+        JobHeld: the clock is behind the newest session.
+    """
+    last = max(found, key=lambda session: session.last_written, default=None)
+    if last is not None and now + CLOCK_SLACK < last.last_written:
+        raise JobHeld(
+            "the clock of this computer",
+            found=now.isoformat(timespec="seconds"),
+            expected=f"a time after {last.last_written.isoformat(timespec='seconds')}, found in {last.folder}",
+            remedy="set the clock (`timedatectl`), or where it is right, move that folder away: it was made by a wrong "
+            "one; ages, history and audit would be in the wrong order",
+        )
+
+
+def due_in(found: tuple[Session, ...], every_h: float, now: datetime) -> timedelta:
+    """Time until the next calibration is due, counted from the start of the last good one; not positive when it is."""
+    good = last_good(found)
+    return timedelta(0) if good is None else good.began + timedelta(hours=every_h) - now
+
+
+def before_motion(context: JobContext) -> None:
+    """Check disk space, history, interlock and drives.
+
+    Raises:
+        DiskSpaceShort, HistoryUnreadable, NotReleased, DriverError: nothing has moved.
+        OutputFailed: the session's folder is gone.
+    """
+    section, tools = context.section, context.tools
+    try:
+        free_mb = tools.free(section.folder) / 1e6
+    except OSError as error:
+        raise OutputFailed.of(section.folder, error) from error
+    if free_mb < section.min_free_mb:
+        raise DiskSpaceShort(
+            str(section.folder),
+            found=f"{free_mb:.0f} MB free",
+            expected=f"{section.min_free_mb:g} MB (min_free_mb)",
+            remedy="nothing has moved; free space, keep fewer sessions, or name a folder on another disk",
+        )
+    with HistoryStore(context.target.history.store) as store:
+        store.entries()  # the gains are compared with them: unreadable now is better than after the recordings
+    require_release(section.interlock, tools.run, tools.now, section.working_folder)
+    context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))
+    tools.drives(context.cell, context.block_signals)
+    context.journal.say(Level.INFO, "drives are as declared, without fault and without power")

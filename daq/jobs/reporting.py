@@ -1,0 +1,375 @@
+"""Report the end of a job: in the audit, the session's state and summary, the metrics and the journal."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
+
+from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code
+from daq.files import replace_file
+from daq.jobs import session as sessions
+from daq.jobs.context import JobContext
+from daq.jobs.journal import Level
+from daq.jobs.recording import calibration_of_session
+from daq.jobs.session import CALIBRATION, REPORT, JudgedGain, Outcome, Session, SessionState
+from daq.ledger.audit import AuditAction, AuditEntry, append
+from daq.ledger.judgement import digests_in_force
+from daq.ledger.store import HistoryStore
+from drivers.errors import WHILE
+from ident.calibration import Calibration
+
+SUMMARY_TEXT, SUMMARY_JSON = "summary.txt", "summary.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Conclusion:
+    """How a job ended.
+
+    Attributes:
+        outcome: of the job.
+        exit_code: of the command.
+        session: with its final state; None where none was begun.
+        remark: reason, in one sentence.
+    """
+
+    outcome: Outcome
+    exit_code: int
+    session: Session | None
+    remark: str
+
+
+CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}
+"""Exit codes of outcomes without an error; the others are OK."""
+
+
+def report_success(context: JobContext, session: Session) -> Conclusion:
+    """Report a session whose state has its outcome.
+
+    Raises:
+        OutputFailed, AuditUnusable: something could not be written; everything else was.
+    """
+    outcome = session.state.outcome or Outcome.STOPPED
+    remark = "" if session.state.decision is None else session.state.decision.remark
+    return _report(context, session, outcome, CODES.get(outcome, ExitCode.OK), remark, "")
+
+
+def report_failure(context: JobContext, folder: Path, error: BaseException) -> None:
+    """Report the error that ended a job; failures of the report itself are attached to the error as notes."""
+    try:
+        session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
+        interrupted = isinstance(error, KeyboardInterrupt)
+        outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
+        code = ExitCode.INTERRUPTED if interrupted else exit_code(type(error)) or ExitCode.UNEXPECTED
+        problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        notes = [note for note in getattr(error, "__notes__", ()) if note.startswith(WHILE)]
+        _report(context, session, outcome, code, "; ".join((problem, *notes)), problem)
+    except (DaqError, OSError, StopIteration) as second:
+        error.add_note(f"kept: the end of the session could not be recorded: {second}")
+
+
+def audit_entry(context: JobContext, action: AuditAction, session: Session, details: dict[str, object]) -> AuditEntry:
+    """Append an entry about the session to the audit.
+
+    Raises:
+        AuditUnusable, OutputFailed: it could not be written.
+    """
+    try:
+        return append(
+            context.target.history.audit,
+            action,
+            at=context.tools.now(),
+            who=context.who,
+            subject=str(session.folder),
+            details={"session": session.state.session, "cell": context.cell.name, **details},
+        )
+    except OSError as error:
+        raise OutputFailed.of(context.target.history.audit, error) from error
+
+
+def _report(
+    context: JobContext, session: Session, outcome: Outcome, code: int, remark: str, problem: str
+) -> Conclusion:
+    now = context.tools.now()
+    state = session.state.with_(
+        outcome=outcome, exit_code=int(code), problem=problem, ended=now.isoformat(timespec="seconds")
+    )
+    unwritten: DaqError | None = None
+    try:
+        details = _end_details(state)
+        entry = audit_entry(context, AuditAction.RECALIBRATION_ENDED, session, details)
+        # Kept here too: a chain does not show by itself that its last lines are missing.
+        state = state.with_(audit_sha256=entry.sha256)
+    except (AuditUnusable, OutputFailed) as error:
+        context.journal.say(Level.ERROR, "the audit could not be written", text=str(error))
+        unwritten = error
+    session = sessions.save(Session(session.folder, state))
+    conclusion = Conclusion(outcome, int(code), session, remark)
+    level = Level.NOTICE if outcome.good else Level.ERROR
+    context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
+    _write_summary(context, conclusion)
+    _write_metrics(context, conclusion, now)
+    _remove_old(context)
+    if unwritten is not None:
+        raise unwritten
+    return conclusion
+
+
+def _remove_old(context: JobContext) -> None:
+    try:
+        with HistoryStore(context.target.history.store) as store:
+            in_force = digests_in_force(store.events())
+    except HistoryUnreadable as error:
+        # The calibrations in force are unknown: keep all sessions.
+        context.journal.say(Level.WARNING, "no old session removed", text=str(error))
+        return
+    found = sessions.sessions(context.section.folder, context.cell.name)
+    for folder in sessions.remove_old(found, context.section.keep_sessions, in_force):
+        context.journal.say(Level.INFO, "old session removed", folder=str(folder))
+
+
+def _write_summary(context: JobContext, conclusion: Conclusion) -> None:
+    if conclusion.session is None:
+        return
+    folder = conclusion.session.folder
+    try:
+        replace_file(folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
+        replace_file(
+            folder / SUMMARY_JSON,
+            (json.dumps(document(conclusion, context.file), indent=2, ensure_ascii=False) + "\n").encode(),
+        )
+    except OSError as error:
+        raise OutputFailed.of(folder, error) from error
+
+
+def _write_metrics(context: JobContext, conclusion: Conclusion, now: datetime) -> None:
+    if context.section.metrics is None:
+        return
+    good = sessions.last_good(sessions.sessions(context.section.folder, context.cell.name))
+    shown = conclusion.session
+    calibration = None if shown is None else calibration_of_session(shown)
+    if calibration is None and good is not None:
+        shown, calibration = good, calibration_of_session(good)
+    figures = Figures(
+        cell=context.cell.name,
+        outcome=conclusion.outcome,
+        exit_code=conclusion.exit_code,
+        ended=now,
+        duration_s=context.tools.monotonic_s() - context.began_s,
+        last_good=None if good is None else good.began,
+        state=None if shown is None else shown.state,
+        calibration=calibration,
+    )
+    try:
+        write_metrics(figures, context.section.metrics)
+    except OutputFailed as error:
+        # A monitor reports missing metrics itself; the calibration is done.
+        context.journal.say(Level.ERROR, "metrics could not be written", text=str(error))
+
+
+def _end_details(state: SessionState) -> dict[str, object]:
+    return {
+        "outcome": None if state.outcome is None else state.outcome.value,
+        "exit_code": state.exit_code,
+        "problem": state.problem,
+        "logs": {run.name: run.sha256 for run in state.runs},
+        "calibration_sha256": None if state.fitted is None else state.fitted.calibration_sha256,
+    }
+
+
+def document(conclusion: Conclusion, cell_file: Path) -> dict[str, Any]:
+    """Convert a conclusion to the JSON of `recalibrate --json` and summary.json."""
+    found: dict[str, Any] = {
+        "outcome": conclusion.outcome.value,
+        "exit_code": conclusion.exit_code,
+        "remark": conclusion.remark,
+        "to_do": to_do(conclusion, cell_file),
+    }
+    if conclusion.session is not None:
+        session = conclusion.session
+        found |= {"folder": str(session.folder), **session.state.model_dump(mode="json")}
+        found["outcome"], found["exit_code"] = conclusion.outcome.value, conclusion.exit_code
+    return found
+
+
+def text(conclusion: Conclusion, cell_file: Path) -> str:
+    """Write the summary as text."""
+    session = conclusion.session
+    # The remark of a decision is printed above its table.
+    decided = session is not None and session.state.decision is not None and not session.state.problem
+    lines = [
+        f"Outcome: {conclusion.outcome.value} (exit code {conclusion.exit_code})",
+        *(() if decided or not conclusion.remark else (conclusion.remark,)),
+    ]
+    if session is not None:
+        state = session.state
+        lines += [
+            f"Session {state.session} of cell {state.cell}, begun {state.began}, job {state.attempt} of it.",
+            *(_run_line(run.name, run.samples, run.lost_cycles, run.attempts) for run in state.runs),
+        ]
+        if state.fitted is not None:
+            lines += ["", "Residual:", *(f"  {sentence}" for sentence in state.fitted.sentences)]
+        if state.decision is not None:
+            lines += ["", f"Gains: {state.decision.remark}", *map(_gain_line, state.decision.gains)]
+        drifts = [gain.alarm for gain in state.watched if gain.alarm]
+        if drifts:
+            lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
+        lines += ["", f"Folder: {session.folder}"]
+        if (session.folder / REPORT / "report.html").exists():
+            lines.append(f"Report: {session.folder / REPORT / 'report.html'}")
+    lines += ["", "To do:", *(f"  {line}" for line in to_do(conclusion, cell_file))]
+    return "\n".join(lines) + "\n"
+
+
+def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
+    """List the next steps for the operator, a line each."""
+    session, outcome = conclusion.session, conclusion.outcome
+    if outcome is Outcome.PROPOSED and session is not None and session.state.target is not None:
+        calibration, cell = shlex.quote(str(session.folder / CALIBRATION)), shlex.quote(str(cell_file))
+        sign = f"let a second person sign it: drivegain sign calibration {calibration} --key KEY --name NAME"
+        return [
+            *([sign] if session.state.target.unsigned else []),
+            f"drivegain apply {calibration} --cell {cell}",
+            "check the change, and if it is right, write it:",
+            f"drivegain apply {calibration} --cell {cell} --yes --base {session.state.target.looked_at}",
+        ]
+    if outcome is Outcome.APPLIED and session is not None and session.state.target is not None:
+        return [
+            "let the controller load the file",
+            f"to undo it: drivegain rollback --cell {shlex.quote(str(cell_file))}",
+        ]
+    return {
+        Outcome.REFUSED: ["see which check failed; the next job records anew"],
+        Outcome.UNFIT: ["see what is wrong with the recordings (`drivegain info LOG`); the next job records anew"],
+        Outcome.STOPPED: ["remove the cause; the next job resumes this session while it is recent"],
+        Outcome.INTERRUPTED: ["nothing, or run the job again: it resumes this session while it is recent"],
+    }.get(outcome, ["nothing"])
+
+
+def _run_line(name: str, samples: int, lost_cycles: int, recordings: int) -> str:
+    return f"  {name}: {samples} samples, {lost_cycles} cycles lost, {recordings} recording{'s' * (recordings != 1)}"
+
+
+def _gain_line(gain: JudgedGain) -> str:
+    change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
+    drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
+    return (
+        f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} {gain.unit} "
+        f"found{change}{drift}{': differs' if gain.differs else ''}"
+    )
+
+
+PREFIX = "drivegain_recalibration_"
+_Gauges = Callable[..., Gauge]
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """Figures that the metrics of a job are made of.
+
+    Attributes:
+        cell: name.
+        outcome, exit_code, ended, duration_s: of this job.
+        last_good: start of the last good session, None where there was none.
+        state: of this session if it has a calibration, else of the last good one.
+        calibration: of the same session, None where there is none.
+    """
+
+    cell: str
+    outcome: Outcome
+    exit_code: int
+    ended: datetime
+    duration_s: float
+    last_good: datetime | None
+    state: SessionState | None
+    calibration: Calibration | None
+
+
+def registry_of(figures: Figures) -> CollectorRegistry:
+    """Build the metrics in a registry of their own."""
+    registry = CollectorRegistry()
+
+    def gauge(name: str, text: str, *labels: str) -> Gauge:
+        return Gauge(PREFIX + name, text, ("cell", *labels), registry=registry)
+
+    cell = figures.cell
+    outcomes = gauge("outcome", "1 for the outcome of the last job, 0 for the others.", "outcome")
+    for outcome in Outcome:
+        outcomes.labels(cell, outcome.value).set(float(outcome is figures.outcome))
+    gauge("exit_code", "Of the last job.").labels(cell).set(figures.exit_code)
+    gauge("last_run_timestamp_seconds", "When the last job ended.").labels(cell).set(figures.ended.timestamp())
+    gauge("duration_seconds", "Of the last job.").labels(cell).set(figures.duration_s)
+    if figures.last_good is not None:
+        last = gauge("last_success_timestamp_seconds", "When the last good calibration was begun.")
+        last.labels(cell).set(figures.last_good.timestamp())
+    if figures.state is not None:
+        _set_session_gauges(gauge, figures.state, cell)
+    if figures.calibration is not None:
+        _set_calibration_gauges(gauge, figures.calibration, cell)
+    return registry
+
+
+def write_metrics(figures: Figures, folder: Path) -> Path:
+    """Write the metrics for the textfile collector of the Prometheus node exporter; the file is replaced whole.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    path = folder / f"drivegain_{file_stem(figures.cell)}.prom"
+    try:
+        write_to_textfile(str(path), registry_of(figures))
+        # The collector is another user, and a service's umask may be strict.
+        path.chmod(0o644)
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+    return path
+
+
+def file_stem(cell: str) -> str:
+    """File name of a cell; with six digits of its hash where characters that distinguish two cells were lost."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", cell)
+    return plain if plain == cell else f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
+
+
+def _set_session_gauges(gauge: _Gauges, state: SessionState, cell: str) -> None:
+    lost = gauge("lost_cycles", "Cycles that are not in any recording of a run.", "run")
+    missing = gauge("missing_answers", "Answers of drives that never came, of all recordings of a run.", "run")
+    attempts = gauge("recordings", "Recordings of a run until a valid one.", "run")
+    for run in state.runs:
+        lost.labels(cell, run.name).set(run.lost_cycles)
+        missing.labels(cell, run.name).set(sum(run.missing))
+        attempts.labels(cell, run.name).set(run.attempts)
+    if state.watched:
+        alarm = gauge("drift_alarm", "1 where the chart of all calibrations raises an alarm, else 0.", "axis")
+        for watched in state.watched:
+            alarm.labels(cell, watched.axis).set(float(bool(watched.alarm)))
+    if state.decision is not None:
+        drift = gauge("gain_drift_sigma", "Change from the gain in the controller, in σ of the change.", "axis")
+        in_force = gauge("gain_in_force", "In the controller when the job looked, in Nm or N per A.", "axis", "unit")
+        for gain in state.decision.gains:
+            in_force.labels(cell, gain.axis, gain.unit).set(gain.old)
+            if gain.drift_sigma is not None:
+                drift.labels(cell, gain.axis).set(gain.drift_sigma)
+
+
+def _set_calibration_gauges(gauge: _Gauges, calibration: Calibration, cell: str) -> None:
+    value = gauge("gain", "Identified drive gain, in Nm or N per A.", "axis", "unit")
+    std = gauge("gain_std", "Its standard deviation, in the same unit.", "axis", "unit")
+    for gain in calibration.gains:
+        value.labels(cell, gain.axis, gain.unit).set(gain.value)
+        std.labels(cell, gain.axis, gain.unit).set(gain.std)
+    residual = gauge("residual_percent", "Relative error of the torques.", "axis", "data")
+    axes = [gain.axis for gain in calibration.gains]
+    errors = (("fit", calibration.relative_error_percent), ("holdout", calibration.holdout_error_percent))
+    for data, error in errors:
+        if error is not None:
+            for axis, percent in zip((*axes, "total"), (*error.axes, error.total), strict=True):
+                residual.labels(cell, axis, data).set(percent)
