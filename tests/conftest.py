@@ -7,6 +7,7 @@ import os
 # Before NumPy is imported: what is equal bit by bit with one thread need not be with two.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import resource
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,10 @@ def shared_data() -> Path:
     if not (folder / "tx40").is_dir():
         pytest.skip(f"no real recordings at {folder}: set DRIVEGAIN_DATA to the folder that holds tx40/")
     return folder
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the processor time of the whole run: this process, its workers and the programs that they started."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    seconds = sum(one.ru_utime + one.ru_stime for one in used)
+    terminalreporter.write_line(f"processor time: {seconds:.0f} s")
