@@ -52,6 +52,6 @@ def test_what_was_not_checked_and_what_is_no_reference_is_said(checkout: Path) -
     for index in (2, 4):
         reported[index] = replace(reported[index], rated_torque_nm=None, warnings=("nothing",))
     note, unit, nothing = check_currents(changed, reported)
-    assert note.startswith("J1: ACTUAL current, not the reference (generic-cia402 has none to log)")
+    assert note.startswith("J1: ACTUAL current, not the reference (generic-cia402 reports none)")
     assert unit == "J2: the gain is in Nm/V; the torque constant cannot be checked"
     assert nothing == "J3, J5: nothing"
