@@ -1,4 +1,4 @@
-"""Effects as a technician calls them: the axis by its name, the effect in a few words."""
+"""Effects in a technician's words."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WORDS = {
     "position-friction": "friction that changes with the position",
     "cogging": "torque ripple that repeats with the motor's turn",
     "saturation": "a motor that gives less torque per ampere at large current",
-    "lag": "a current that is seen later than the position",
+    "lag": "a current that lags behind the position",
     "time-skew": "positions and currents that were not sampled at the same time",
     "warm-up": "friction that changes while the robot warms up",
     "presliding": "friction that builds up only some way after each reversal",
@@ -26,11 +26,11 @@ WORDS = {
     "hinge": "a cable or hose that pulls from some position on",
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
 }
-"""By family. One that is not here is called by its name."""
+"""Words by family; an effect that is not listed is called by its name."""
 
 
 def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
-    """`load-friction on J3`, `coupling on J4 with J5`.
+    """Name an effect and its place: `load-friction on J3`, `coupling on J4 with J5`.
 
     Args:
         placed: effect and axis.
@@ -44,7 +44,7 @@ def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
 
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
-    """What an axis has, to follow "J3 has": `friction that grows with the load`."""
+    """Describe an effect, to follow "J3 has": `friction that grows with the load`."""
     if is_unnamed(effect):
         return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
     words = WORDS.get(effect.name, f"the effect {effect.name!r}")
@@ -53,7 +53,7 @@ def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
 
 
 def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
-    """The variable that shows an effect, without its unit: `the joint position`."""
+    """Name the variable that an effect depends on, without its unit: `the joint position`."""
     other = other_axis(effect)
     if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:
         return f"the velocity of {axes[other]}"
@@ -61,11 +61,11 @@ def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
 
 
 def other_axis(effect: Effect) -> int | None:
-    """Index of the second axis of an effect that speaks of two."""
+    """Index of the second axis of an effect on two axes."""
     number = effect.settings.get("other_axis", 0)
     return int(number) - 1 if number else None
 
 
 def is_unnamed(effect: Effect) -> bool:
-    """Whether it is a smooth or periodic term, which fits anything and names nothing."""
+    """Whether it is a smooth or periodic term, which fits anything and names no cause."""
     return isinstance(effect, Smooth | Periodic)

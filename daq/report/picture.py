@@ -1,4 +1,4 @@
-"""What all pictures share: size, colours and the way to the disk. No pyplot: it keeps figures in a global list."""
+"""Shared by all pictures: size, colours and writing the file. No pyplot, which keeps figures in a global list."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-# Okabe and Ito, "Color Universal Design" (2008): told apart by colour-blind readers and in grey print.
+# Okabe and Ito, "Color Universal Design" (2008): distinct to colour-blind readers and in grey print.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
@@ -28,7 +28,7 @@ BLACK = "#000000"
 GREY = "#7F7F7F"
 
 QUANTITY = {"Nm": "torque", "N": "force"}
-"""What a joint gives, by its unit: N where it is prismatic."""
+"""Quantity of a joint, by its unit: N where it is prismatic."""
 
 DPI = 130
 _PANEL_IN = (5.6, 2.0)
@@ -36,19 +36,19 @@ _TITLE_AND_LEGEND_IN = 1.1
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """A figure of small multiples that share their horizontal axis, filled row by row.
+    """Make a figure of small multiples that share their horizontal axis, filled row by row.
 
     Args:
         count: number of panels.
         columns: panels side by side, at most.
-        title: says what the picture shows.
+        title: names what the picture shows.
     """
     columns = min(columns, count)
     rows = -(-count // columns)
     figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
     places: list[Axes] = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
-    for unused in places[count:]:
-        unused.set_axis_off()
+    for empty in places[count:]:
+        empty.set_axis_off()
     for position, place in enumerate(places[:count]):
         _plain(place)
         # In a last row that is not full, the panel above the gap is the lowest of its column.
@@ -57,12 +57,12 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
 
 
 def grid(rows: int, widths: tuple[float, ...], title: str, height_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """A figure whose rows share their vertical axis and whose columns share their horizontal one.
+    """Make a figure whose rows share their vertical axis and whose columns share their horizontal one.
 
     Args:
         rows: number of rows.
         widths: relative width of each column.
-        title: says what the picture shows.
+        title: names what the picture shows.
         height_in: of one row [inch].
     """
     figure = _figure(title, 2 * _PANEL_IN[0], height_in * rows + _TITLE_AND_LEGEND_IN)
@@ -86,7 +86,7 @@ def _figure(title: str, width_in: float, height_in: float) -> Figure:
 
 
 def legend_below(figure: Figure, *places: Axes) -> None:
-    """One legend for all panels, outside of them, so that it covers no data."""
+    """Draw one legend for all panels, outside of them, so that it covers no data."""
     pairs = [pair for place in places for pair in zip(*place.get_legend_handles_labels(), strict=True)]
     named = {label: handle for handle, label in reversed(pairs)}
     figure.legend(
@@ -101,11 +101,11 @@ def legend_below(figure: Figure, *places: Axes) -> None:
 
 
 def save_png(figure: Figure, path: Path | None) -> bytes:
-    """Draw a figure and put it at `path` whole; the same figure gives the same bytes.
+    """Draw a figure and write it whole; the same figure gives the same bytes.
 
     Args:
         figure: to draw.
-        path: None where the bytes alone are wanted, as for a page that carries its pictures.
+        path: None for the bytes alone, as for a page that embeds its pictures.
 
     Returns:
         the file's content.
@@ -121,12 +121,12 @@ def save_png(figure: Figure, path: Path | None) -> bytes:
 
 
 def unformatted(text: str) -> str:
-    """Text from a file as matplotlib shall show it: a dollar sign is one, and begins no formula."""
+    """Escape dollar signs, which would begin a formula in matplotlib."""
     return text.replace("$", r"\$")
 
 
 def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tuple[FloatArray, FloatArray]:
-    """Few enough points to draw, with every peak kept: minimum and maximum of each stretch, in their order of time.
+    """Reduce the points to draw and keep every peak: minimum and maximum of each stretch, in order of time.
 
     Args:
         time_s: shape (k,).
@@ -144,7 +144,7 @@ def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tupl
     empty = np.isnan(blocks)
     lowest = np.where(empty, np.inf, blocks).argmin(axis=1)
     highest = np.where(empty, -np.inf, blocks).argmax(axis=1)
-    # A stretch that has a gap must show it: its later point becomes NaN and the line is broken there.
+    # The later point of a stretch with a gap becomes NaN, which breaks the line there.
     picked = np.sort(np.stack([lowest, highest], axis=1), axis=1) + stretch * np.arange(len(blocks))[:, None]
     values = columns[picked]
     values[empty.any(axis=1), 1] = np.nan

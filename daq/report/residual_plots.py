@@ -1,4 +1,4 @@
-"""What the model lacks on one axis: the residual before and after an effect, over time and against its variable."""
+"""Pictures of the residual: one axis before and after an effect, and the candidates of a turn."""
 
 from __future__ import annotations
 
@@ -47,18 +47,18 @@ def plot_residual(
     """Draw the residual of one axis before and after an effect joined the model.
 
     Left over time, right against the variable that the effect depends on, with the mean of each stretch of it for
-    either direction of motion (what friction lacks cancels over both): a mean that still leaves zero is torque that the
-    model still lacks.
+    either direction of motion (missing friction cancels over both): a mean away from zero is torque that the model
+    still lacks.
 
     Args:
-        path: of the PNG; None where its bytes alone are wanted.
+        path: of the PNG; None for its bytes alone.
         time_s: shape (k,) [s].
         before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN where a row was left
             out.
-        variable: what the effect depends on, shape (k,).
+        variable: variable that the effect depends on, shape (k,).
         variable_label: its name and unit.
         velocity_rad_s: of the axis, shape (k,) [rad/s or m/s].
-        title: says which axis, which effect and which run it is.
+        title: names axis, effect and run.
         force: "Nm", or "N" along a prismatic joint.
 
     Returns:
@@ -102,7 +102,7 @@ def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, ve
 
 
 def _binned_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of y in stretches of x with equally many samples: no mean rests on a handful of them."""
+    """Mean of y in stretches of x with equally many samples, so that no mean is of a handful of them."""
     if len(x) < _BINS:
         return x[:0], y[:0]
     order = np.argsort(x, kind="stable")
@@ -110,13 +110,10 @@ def _binned_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.array([part.mean() for part in parts_x]), np.array([part.mean() for part in parts_y])
 
 
-# The candidates of one turn beside each other: what each would take off the error of moves left out.
-
-
 _BAR_IN = 0.32
-_PASSED, _RIVAL, _CLOSED = "passes every gate", "not told from the best", "a gate is closed"
-_LOOK = {_PASSED: (BLUE, ""), _RIVAL: (ORANGE, "//"), _CLOSED: (GREY, "")}
-"""Colour and hatch; hatched, so that grey print tells them too."""
+_PASSED, _RIVAL, _FAILED = "passes every gate", "indistinguishable from the best", "fails a gate"
+_LOOK = {_PASSED: (BLUE, ""), _RIVAL: (ORANGE, "//"), _FAILED: (GREY, "")}
+"""Colour and hatch; the hatch distinguishes them in grey print."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +122,9 @@ class Bar:
 
     Attributes:
         name: effect and axis.
-        fall: of the whole squared error on left-out moves, in units of the noise.
-        passed: every gate.
-        rival: not told from the one that was added (or, where none was, from the best).
+        fall: fall of the squared error on left-out moves, in noise variances.
+        passed: whether it passes every gate.
+        rival: not distinguishable from the added one (or, where none was added, from the best).
     """
 
     name: str
@@ -140,9 +137,9 @@ def plot_ranking(path: Path | None, bars: Sequence[Bar], *, title: str) -> bytes
     """Draw candidates from the best down; rivals of the best are marked.
 
     Args:
-        path: of the PNG; None where its bytes alone are wanted.
+        path: of the PNG; None for its bytes alone.
         bars: the best first, at least one.
-        title: says which turn it is.
+        title: names the turn.
 
     Returns:
         the PNG.
@@ -167,4 +164,4 @@ def plot_ranking(path: Path | None, bars: Sequence[Bar], *, title: str) -> bytes
 def _kind(bar: Bar) -> str:
     if bar.rival:
         return _RIVAL
-    return _PASSED if bar.passed else _CLOSED
+    return _PASSED if bar.passed else _FAILED

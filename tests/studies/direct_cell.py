@@ -266,6 +266,9 @@ class _DirectAccess:
     def read(self, entry: ObjectEntry) -> int:
         return int.from_bytes(self.node.read(entry.index, entry.subindex), "little", signed=entry.signed)
 
+    def read_optional(self, entry: ObjectEntry) -> int | None:
+        return self.read(entry)  # a simulated node has every object that is optional
+
     def write(self, entry: ObjectEntry, value: int) -> None:
         data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
         self.node.write(entry.index, entry.subindex, data)

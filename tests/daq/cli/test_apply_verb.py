@@ -54,7 +54,7 @@ class Bench:
         return main(["rollback", "--cell", str(self.cell), *options])
 
     def actions(self) -> list[AuditAction]:
-        """What was written down; the chain holds."""
+        """Actions in the audit, whose chain is unbroken."""
         verdict = verify(self.audit)
         assert verdict.holds
         assert verdict.open_writes == ()
@@ -368,7 +368,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
 
 
 def _shown_base(shown: str) -> str:
-    """What the dry run says to repeat."""
+    """Options that the dry run prints for the write."""
     return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
 
 
@@ -423,7 +423,7 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
     assert bench.apply() == ExitCode.CALIBRATION_REFUSED
     base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
-    assert "--yes" not in capsys.readouterr().out  # another gate is closed
+    assert "--yes" not in capsys.readouterr().out  # another gate refuses
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
     capsys.readouterr()
     # The file is another one than at the recording, by this very write.

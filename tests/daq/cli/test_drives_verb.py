@@ -1,4 +1,4 @@
-"""`drivegain apply --drives` and `rollback --drives`: what a person and a program are told."""
+"""`drivegain apply --drives` and `rollback --drives`: text and JSON."""
 
 from __future__ import annotations
 

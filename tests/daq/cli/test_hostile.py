@@ -1,4 +1,4 @@
-"""What an attacker or a dying disk would try, and what the operator is told."""
+"""Inputs of an attacker and of a dying disk, and the messages that they cause."""
 
 from __future__ import annotations
 

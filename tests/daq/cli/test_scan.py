@@ -1,4 +1,4 @@
-"""What `drivegain scan` makes of the nodes that it found."""
+"""`drivegain scan`: the table of the nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text and numbers from a file that somebody made: in tables, pictures and on the terminal they are only shown."""
+"""Text and numbers from an untrusted file: in tables, pictures and on the terminal they are only shown."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def test_the_table_shows_every_cell_and_marks_errors_on_the_fit_itself(
     lines = {line.split()[0]: line for line in shown.splitlines() if line.startswith("cell-")}
     assert set(lines) == {"cell-000", "cell-002", "cell-003"}
     assert [name for name, line in lines.items() if "*" in line] == ["cell-002", "cell-003"]
-    assert "* on the moves of the fit itself" in shown
+    assert "* on the moves of the fit" in shown
 
 
 def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys: pytest.CaptureFixture[str]) -> None:

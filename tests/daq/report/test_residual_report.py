@@ -1,4 +1,4 @@
-"""The report of `residual`: it stands for itself, escapes what files say, and its numbers are those of the rows."""
+"""The report of `residual`: it needs no other file, escapes what files say, and its numbers are those of the rows."""
 
 from __future__ import annotations
 
