@@ -44,7 +44,7 @@ def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
 
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
-    """What an axis has, to follow "J3 has": `friction that grows with the load`."""
+    """Return an effect in words that follow "J3 has": `friction that grows with the load`."""
     if is_unnamed(effect):
         return f"a torque that depends on {variable_text(effect, axes)} and that no named effect explains"
     words = WORDS.get(effect.name, f"the effect {effect.name!r}")

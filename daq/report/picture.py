@@ -1,4 +1,4 @@
-"""What all pictures share: size, colours and the way to the disk. No pyplot: it keeps figures in a global list."""
+"""Style shared by all pictures: size, colours and the way to the disk. No pyplot: it keeps figures in a global list."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-# Okabe and Ito, "Color Universal Design" (2008): told apart by colour-blind readers and in grey print.
+# Okabe and Ito, "Color Universal Design" (2008): distinguishable by colour-blind readers and in grey print.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
@@ -47,8 +47,8 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
     rows = -(-count // columns)
     figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
     places: list[Axes] = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flat)
-    for unused in places[count:]:
-        unused.set_axis_off()
+    for empty in places[count:]:
+        empty.set_axis_off()
     for position, place in enumerate(places[:count]):
         _plain(place)
         # In a last row that is not full, the panel above the gap is the lowest of its column.

@@ -1,4 +1,4 @@
-"""What the model lacks on one axis: the residual before and after an effect, over time and against its variable."""
+"""Pictures of one axis: the residual before and after an effect, over time and against its variable."""
 
 from __future__ import annotations
 
@@ -114,9 +114,9 @@ def _binned_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 _BAR_IN = 0.32
-_PASSED, _RIVAL, _CLOSED = "passes every gate", "not told from the best", "a gate is closed"
+_PASSED, _RIVAL, _CLOSED = "passes every gate", "as good as the best", "fails a gate"
 _LOOK = {_PASSED: (BLUE, ""), _RIVAL: (ORANGE, "//"), _CLOSED: (GREY, "")}
-"""Colour and hatch; hatched, so that grey print tells them too."""
+"""Colour and hatch; hatched, so that they differ in grey print too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class Bar:
         name: effect and axis.
         fall: of the whole squared error on left-out moves, in units of the noise.
         passed: every gate.
-        rival: not told from the one that was added (or, where none was, from the best).
+        rival: indistinguishable from the one that was added (or, where none was, from the best).
     """
 
     name: str

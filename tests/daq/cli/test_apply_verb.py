@@ -42,7 +42,7 @@ class Bench:
 
     @property
     def audit(self) -> Path:
-        """Of the cell."""
+        """Audit log of the cell."""
         return self.cell.with_name("cell.audit.jsonl")
 
     def apply(self, *options: str) -> int:
@@ -54,7 +54,7 @@ class Bench:
         return main(["rollback", "--cell", str(self.cell), *options])
 
     def actions(self) -> list[AuditAction]:
-        """What was written down; the chain holds."""
+        """Recorded actions; the chain holds."""
         verdict = verify(self.audit)
         assert verdict.holds
         assert verdict.open_writes == ()
@@ -368,7 +368,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
 
 
 def _shown_base(shown: str) -> str:
-    """What the dry run says to repeat."""
+    """Base digest that the dry run prints for `--base`."""
     return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
 
 
@@ -423,7 +423,7 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
     assert bench.apply() == ExitCode.CALIBRATION_REFUSED
     base = _shown_base(capsys.readouterr().out)
     assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
-    assert "--yes" not in capsys.readouterr().out  # another gate is closed
+    assert "--yes" not in capsys.readouterr().out  # another check fails
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
     capsys.readouterr()
     # The file is another one than at the recording, by this very write.
@@ -519,7 +519,7 @@ def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 @pytest.mark.parametrize("folder", [False, True], ids=["file", "folder"])
 @pytest.mark.parametrize("behind", [False, True], ids=["named", "behind one's own"])
-def test_a_stranger_s_link_of_the_cell_file_is_refused(
+def test_another_user_s_link_to_the_cell_file_is_refused(
     bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     link = bench.controller.parent if folder else bench.controller

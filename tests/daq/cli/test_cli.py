@@ -40,7 +40,7 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
         shown = next((kind for kind in kinds if kind.name == command[-1]), verb)
         assert shown.example.startswith("drivegain " + " ".join(command))
         assert output.splitlines()[-1].strip() == shown.example
-        # Nothing of a help text is taken for markup: units stand in brackets.
+        # Nothing of a help text is taken for markup: units are in brackets.
         reported = _squeezed(output)
         for parameter in inspect.signature(shown.function, eval_str=True).parameters.values():
             (option,) = parameter.annotation.__metadata__

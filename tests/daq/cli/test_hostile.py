@@ -1,4 +1,4 @@
-"""What an attacker or a dying disk would try, and what the operator is told."""
+"""Attacks and failing disks, and the messages that the operator reads."""
 
 from __future__ import annotations
 

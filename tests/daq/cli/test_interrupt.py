@@ -55,7 +55,7 @@ def test_what_must_not_be_disturbed_is_not_for_as_long_as_a_stop_takes() -> None
         with block_signals():
             now_s += GRACE_S
             with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)  # nobody is left without a way out
+                signal.raise_signal(signal.SIGINT)  # a stop that hangs can be interrupted
 
 
 def test_what_is_not_known_to_rest_is_not_said_to() -> None:

@@ -197,7 +197,7 @@ def test_what_is_not_known_is_shown_as_that() -> None:
 
 @pytest.fixture
 def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The demo cell on a bus of this test, on which nobody else speaks: a short silence will do."""
+    """The demo cell on a bus of this test, that has no other senders: a short silence will do."""
     monkeypatch.setattr("drivers.stream.monitor.QUIET_S", 0.1)
     text = (CHECKOUT / "configs/cells/demo.yaml").read_text().replace("../robots", str(CHECKOUT / "configs/robots"))
     path = tmp_path / "cell.yaml"

@@ -1,4 +1,4 @@
-"""What `drivegain record` says when a recording fails, and before it begins."""
+"""Messages of `drivegain record` when a recording fails, and before it begins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `drivegain scan` makes of the nodes that it found."""
+"""Report of `drivegain scan` on the nodes that it found."""
 
 from __future__ import annotations
 

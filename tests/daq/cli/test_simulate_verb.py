@@ -1,4 +1,4 @@
-"""What `drivegain simulate` makes of its buses, and what it says to put into a cell file."""
+"""`drivegain simulate`: its buses, and the lines that it prints for a cell file."""
 
 from __future__ import annotations
 

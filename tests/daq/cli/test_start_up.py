@@ -15,7 +15,7 @@ from daq.ledger.store import HistoryStore
 from tests.daq.histories import fill
 from tests.daq.logs import DISC, demo_content, samples, write
 
-UNUSED = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
+HEAVY = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
 """Libraries that only identification, simulation and pictures use."""
 
 HELP = """
@@ -41,7 +41,7 @@ def _loaded(code: str, names: tuple[str, ...], checkout: Path) -> list[str]:
 
 
 def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
-    assert _loaded(HELP, (*UNUSED, "scipy", "numpy", "can", "canopen", "mcap"), checkout) == []
+    assert _loaded(HELP, (*HEAVY, "scipy", "numpy", "can", "canopen", "mcap"), checkout) == []
 
 
 @pytest.mark.parametrize("verb", ["scan", "info", "history"])
@@ -56,7 +56,7 @@ def test_a_quick_verb_loads_only_libraries_that_it_uses(verb: str, checkout: Pat
     else:
         command, expected = ["history", str(_cell_with_history(checkout, tmp_path))], ExitCode.OK
     code += f"assert main({command!r}) == {int(expected)}\n"
-    assert _loaded(code, UNUSED, checkout) == []
+    assert _loaded(code, HEAVY, checkout) == []
 
 
 def _cell_with_history(checkout: Path, folder: Path) -> Path:

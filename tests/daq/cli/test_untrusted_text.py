@@ -1,4 +1,4 @@
-"""Text and numbers from a file that somebody made: in tables, pictures and on the terminal they are only shown."""
+"""Text and numbers from an untrusted file: tables, pictures and the terminal only show them."""
 
 from __future__ import annotations
 
