@@ -127,7 +127,7 @@ def _write_beside(target: Path, content: bytes, like: Path | None) -> Path:
 
 
 def _new_file(target: Path, mode: int) -> tuple[Path, int]:
-    """Create a hidden file of an unused name (O_EXCL); the umask of the process applies to its mode."""
+    """Create a hidden file under a new name (O_EXCL); the umask of the process applies to its mode."""
     attempt = 0
     while True:
         temporary = target.parent / f".{target.name}.{os.getpid()}-{attempt}.tmp"

@@ -1,4 +1,4 @@
-"""What several rooms' tests share."""
+"""Fixtures and hooks shared by several packages' tests."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LONG = ("test_guide.py", "test_main_job.py", "test_any_robot.py")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long begins first."""
+    """Run the longest files first."""
     items.sort(key=lambda item: item.path.name not in LONG)
 
 

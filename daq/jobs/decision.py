@@ -113,7 +113,7 @@ def decide_outcome(
     closed = [refusal for refusal in proposal.refusals if refusal.gate is not Gate.SIGNATURE]
     if closed:
         for refusal in closed:
-            context.journal.say(Level.ERROR, "a gate is closed", gate=refusal.gate.value, text=str(refusal))
+            context.journal.say(Level.ERROR, "a check failed", gate=refusal.gate.value, text=str(refusal))
         session.update(outcome=Outcome.REFUSED)
         _apply(context, proposal, now)  # which refuses it, and writes that down
     if not edit.has_effect or not differs:

@@ -51,7 +51,7 @@ def is_address(place: str) -> bool:
 def list_logs(place: str) -> tuple[StoredLog, ...]:
     """Whatever has the name of a finished log at a place and in the folders below it, by name.
 
-    A folder, a pipe or a link that leads nowhere may have such a name: `fingerprint` tells of it.
+    A folder, a pipe or a link that leads nowhere may have such a name: `fingerprint` reports it.
 
     Raises:
         LogMissing: there is no such folder, or no log in it.
@@ -114,7 +114,7 @@ def _listed_local(folder: Path) -> list[StoredLog]:
         raise LogMissing(
             str(folder), found="no such folder", expected="a folder with the logs of cells", remedy="check the name"
         )
-    # Absolute: a worker may run elsewhere. What is no file is not left out: it may stand for a log of a cell.
+    # Absolute: a worker may run elsewhere. Entries that are no files are kept: one may be in place of a cell's log.
     return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
 
 
@@ -122,7 +122,7 @@ def _listed_remote(place: str) -> list[StoredLog]:
     with _name_errors(place):
         store, root = _store(place)
         if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
-            return _listed_local(Path(root))  # file://: with links, pipes and devices, of which fsspec does not tell
+            return _listed_local(Path(root))  # file://: with links, pipes and devices, which fsspec does not report
         found = [path for path in store.find(root) if path.endswith(ENDING)]
     below = root.rstrip("/") + "/"
     return [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in found]
@@ -152,7 +152,7 @@ def _copy(log: StoredLog, folder: Path) -> Path:
 def _store(address: str) -> tuple[Any, str]:
     """The file system of an address, and the path in it."""
     try:
-        # Untyped, and in no installation that nobody asked it into.
+        # Untyped, and an optional dependency.
         store, path = import_module("fsspec.core").url_to_fs(address)
     except (ImportError, ValueError) as error:
         bare = find_spec("fsspec") is None
@@ -253,7 +253,7 @@ def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
 
 
 def _roles(cell: str, digest: str, logs: list[SeenLog]) -> CellLogs:
-    # The order of a session, and by content where a clock does not tell: a fit's last digits depend on the order.
+    # The order of a session, and by content where clocks agree: a fit's last digits depend on the order.
     logs = sorted(logs, key=lambda log: (log.started_ns, log.fingerprint, log.log.name))
     mountings = [log.mounting for log in logs]
     loaded = [log for log in logs if log.mounting is not None]
@@ -291,12 +291,12 @@ def _head(log: StoredLog) -> LogHead:
             try:
                 return _unfinished_head(beginning(log, HEAD_BYTES, Path(folder)))
             except LogUnreadable:
-                pass  # a longer head, or an older log: the whole of it tells
+                pass  # a longer head, or an older log: read the whole of it
         path = at_hand(log, Path(folder))
         try:
             return _whole_head(path)
         except LogUnreadable as damage:
-            # A log with a damaged end still tells whose it is; the fit of its cell then tells of the damage.
+            # A log with a damaged end still names its cell; the fit of that cell then reports the damage.
             try:
                 return _unfinished_head(path)
             except LogUnreadable:

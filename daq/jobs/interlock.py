@@ -186,7 +186,7 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
         subject,
         found=found,
         expected=expected,
-        remedy="nothing moves: close the cell, leave nobody inside, set automatic mode; the next job takes it up",
+        remedy="nothing moves: close the cell, let everyone leave it, set automatic mode; the next job takes it up",
     )
 
 

@@ -46,9 +46,9 @@ def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart:
         above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
         _draw_gains(above, series)
         _draw_limits(beneath, series, chart)
-    for unused in range(len(all_series), columns * bands):
+    for empty in range(len(all_series), columns * bands):
         for row in range(2):
-            places[(2 * (bands - 1) + row) * columns + unused % columns].set_axis_off()
+            places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
     _date(places, [_days(point.entry.recorded) for series in all_series for point in series.points])
     upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
     legend_below(figure, *upper)

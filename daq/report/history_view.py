@@ -297,7 +297,7 @@ def _words(digest: str, events: Sequence[Event], digest_in_force: str | None) ->
         parts.append(f"{_WORDS[last.action]} by {last.who}")
         then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
         if then is not None and then.action is WriteAction.ROLLED_BACK:
-            parts.append(f"taken back by {then.who}")
+            parts.append(f"rolled back by {then.who}")
     if digest == digest_in_force:
         parts.append("in force")
     return ", ".join(parts) or "-"

@@ -1,7 +1,7 @@
 """The main job from end to end on a simulated cell, over the same driver that a real one is recorded with.
 
-This file and the simulate verb are the only ones that may read a simulation file: the truth is looked at to judge the
-result, after it stands.
+This file and the simulate verb are the only ones that may read a simulation file: the truth serves to judge the result
+once it is final.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class CheckedScene:
         lines = [f"arm of {len(scene.capsules)} capsules, {shape}; {1000 * scene.minimum_m:.0f} mm kept"]
         if self.together:
             pairs = ", ".join(f"{first} and {second}" for first, second in self.together)
-            lines.append(f"not told apart, as they touch in nearly every posture: {pairs}")
+            lines.append(f"left unchecked, as they touch in nearly every posture: {pairs}")
         if not scene.boxes and scene.workspace is None:
             lines.append("no obstacles and no workspace declared: tables, cables and people are not known")
         return tuple(lines)

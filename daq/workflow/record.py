@@ -62,7 +62,7 @@ SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
 ALLOWANCE_S = 10.0
 """Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
 LATE_LOSSES_S = 0.25
-"""After the last sample: the interface's own counters are looked at five times a second (drivers/stream/capture.py)."""
+"""After the last sample: the interface's own counters are read five times a second (drivers/stream/capture.py)."""
 SPACE_CHECK_S = 0.1
 """Of recorded time, between two looks at the room on the disk."""
 ROUNDING = 1.001
@@ -158,7 +158,7 @@ def record(
     """
     clocks = clocks or Clocks()
     if granted_by is None:
-        raise MotionRefused("recording moves the robot: nothing moves unless somebody allows it (--enable-motion)")
+        raise MotionRefused("recording moves the robot and motion is disabled: pass --enable-motion")
     check_entered_mass(cell, payload, entered_kg)
     with defer_full_gc(), network_of(cell, block_signals) as network, _sync_producer(cell, network) as producer:
         network.prepare()
@@ -333,7 +333,7 @@ def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
         "late answers": statistics.late,
         "answers of wrong length": statistics.wrong_length,
         "answers twice": statistics.duplicate,
-        "PDOs that no axis was told to send": statistics.surplus,
+        "PDOs that no axis was configured to send": statistics.surplus,
         "periods without SYNC": statistics.skipped_periods,
         "frames dropped by the kernel": statistics.kernel_dropped,
         "frames dropped by the interface": statistics.interface_dropped,

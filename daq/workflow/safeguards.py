@@ -94,7 +94,7 @@ def _shared_folder() -> Path:
 
 @contextmanager
 def _held(lock: Path, bus: Bus) -> Iterator[None]:
-    """The file is removed at the end: whoever opened it just before sees by the inode that it has no name any more."""
+    """Hold the lock file and remove it at the end; others recognise by its inode that it is gone."""
     while True:
         try:
             descriptor = _open(lock)
@@ -182,7 +182,7 @@ def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float,
         names: of the axes.
         rate_hz: samples a second.
         duration_s: of the run [s].
-        attached: what stands at its start.
+        attached: files at its start, by name.
     """
     state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
@@ -233,7 +233,7 @@ class DiskRoom:
                 str(self._log),
                 found=f"{_megabytes(free)} left on its disk",
                 expected=f"{_megabytes(RESERVE_BYTES)} in reserve",
-                remedy="the axes were told to stop; the log up to there is finished and marked invalid: free space and "
+                remedy="the axes were sent a stop; the log up to there is finished and marked invalid: free space and "
                 "record again",
             )
 
@@ -325,7 +325,7 @@ NEVER = 2**31 - 1
 
 @contextmanager
 def defer_full_gc() -> Iterator[None]:
-    """What has lived for long is not searched until the block ends; what is made meanwhile is.
+    """Defer full collections until the block ends; young objects are still collected.
 
     A search through all that the program and its libraries have made takes tens of milliseconds, in which nothing else
     of the process runs: so many periods without SYNC at 1 kHz, and a run that is marked invalid.

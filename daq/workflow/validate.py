@@ -213,7 +213,7 @@ def _left_to_the_log(calibration: Calibration, run: Run) -> Payload | None:
     if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
         raise DataUnfit(
             run.name,
-            f"carries {weighed:g} kg on mounting {run.payload.mounting!r}; the calibration was told {mass.value:g} kg: "
+            f"carries {weighed:g} kg on mounting {run.payload.mounting!r}; the calibration has {mass.value:g} kg: "
             "give each way of mounting a name of its own",
         )
     return replace(run.payload, known={name: value for name, value in run.payload.known.items() if name not in own})

@@ -173,7 +173,7 @@ def _figaroh_python() -> Path:
 
 
 def _json_of(command: list[str]) -> dict[str, Any]:
-    """What a child process prints; what it complains of is not ours to show unless it fails."""
+    """Return what a child process prints; its stderr is shown only if it fails."""
     child = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, check=False)
     if child.returncode:
         raise SystemExit(f"`{' '.join(command)}` ended with {child.returncode}:\n{child.stderr}")

@@ -4,7 +4,7 @@
 
 Wall time of whole commands, workers started and libraries imported included: it is about cells side by side, so other
 work on the machine disturbs it. Commands with one worker and with two take turns; the median of each counts. A ratio
-below 1.7 is told. It ends with 1 where a result is another one than that of a single fit.
+below 1.7 is reported. It ends with 1 where a result is another one than that of a single fit.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def summary_text(found: dict[str, Any]) -> str:
 
 
 def _single(folder: Path) -> dict[str, Any]:
-    """What `drivegain fit` makes of a cell's logs; when it was made is no part of it."""
-    fitted = fit([folder / "bare.mcap", folder / "loaded.mcap"], holdout=[folder / "unused.mcap"])
+    """Result of `drivegain fit` for a cell's logs, without its time."""
+    fitted = fit([folder / "bare.mcap", folder / "loaded.mcap"], holdout=[folder / "held-out.mcap"])
     return _timeless(as_document(calibration_of(fitted, datetime.now(UTC))))
 
 

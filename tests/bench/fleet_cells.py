@@ -3,7 +3,7 @@
     python -m tests.bench.fleet_cells FOLDER CELLS     makes what is missing
 
 Motion and currents are the simulated cell's without a bus (tests/studies/direct_cell.py), the logs are written by the
-recorder's own writer. FOLDER/<cell>/{bare,loaded,unused}.mcap.
+recorder's own writer. FOLDER/<cell>/{bare,loaded,held-out}.mcap.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ CELLS = 200
 DURATION_S = 12.0
 FIRST_SEED = 7001
 PLAN_SETS = 4
-RUNS = (("bare", False), ("loaded", True), ("unused", True))
-"""Of a session, in the order in which they are made."""
+RUNS = (("bare", False), ("loaded", True), ("held-out", True))
+"""Runs of a session, in the order in which they are made."""
 START_NS = 1_750_000_000_000_000_000
 BETWEEN_NS = 120_000_000_000
 ENABLED = 0x1237
@@ -116,7 +116,7 @@ def _own_file(text: str, made: FleetCell, mass_kg: float) -> str:
 
 
 def _of_mass(body: Body, mass_kg: float) -> Body:
-    """Of the same shape and another density."""
+    """Return a body of the same shape and another density."""
     scale = mass_kg / body.mass_kg
     xx, xy, xz, yy, yz, zz = (scale * value for value in body.inertia_kg_m2)
     return replace(body, mass_kg=mass_kg, inertia_kg_m2=(xx, xy, xz, yy, yz, zz))

@@ -42,7 +42,7 @@ class _Measured:
 
 
 def main(urdf: str, samples: str) -> None:
-    """Fit so many samples, and tell what it took."""
+    """Fit so many samples, and report what it took."""
     robot = robot_from_urdf(Path(urdf).read_text())
     begin = time.process_time()
     measured = _Measured(robot, int(samples))

@@ -91,7 +91,7 @@ def hour(path: Path) -> dict[str, float]:
 
 
 def _peak_mb() -> float:
-    """Of this program alone: in `getrusage` Linux counts what a parent held before it started us."""
+    """Peak memory of this program alone [MB]: in `getrusage` Linux counts what a parent held before it started us."""
     status = Path("/proc/self/status")
     if status.exists():
         return float(re.findall(r"VmHWM:\s+(\d+) kB", status.read_text())[0]) / 1024.0

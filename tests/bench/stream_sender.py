@@ -29,7 +29,7 @@ def main(interface: str, period_us: int, cycles: int) -> None:
     sys.stdout.flush()
     sys.stdin.readline()
     if period_us:
-        # Wires and drives wait for nobody: on one processor a busy thread would else set the rate of the bus.
+        # Wires and drives do not wait: on one processor a busy thread would else set the rate of the bus.
         with suppress(PermissionError):
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as bus:

@@ -1,4 +1,4 @@
-"""The job that is timed is done right; how fast is nobody's assertion."""
+"""The job that is timed is done right; its speed is not asserted."""
 
 from __future__ import annotations
 

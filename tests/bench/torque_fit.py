@@ -44,7 +44,7 @@ class TorqueFit:
 
 
 def names(joints: int) -> tuple[str, ...]:
-    """Of the standard parameters, joint by joint."""
+    """Names of the standard parameters, joint by joint."""
     return tuple(f"{name}{number + 1}" for number in range(joints) for name in LINK_PARAMETERS + DRIVE_PARAMETERS)
 
 

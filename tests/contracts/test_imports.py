@@ -39,7 +39,7 @@ def copied(tmp_path: Path) -> Path:
 
 
 def _lint_imports(folder: Path) -> subprocess.CompletedProcess[str]:
-    # -c with the folder first on the path: an editable installation must not be looked at instead of the copy.
+    # -c with the folder first on the path: an editable installation must not be examined instead of the copy.
     code = (
         "import sys; sys.path.insert(0, ''); from importlinter.cli import lint_imports_command; lint_imports_command()"
     )
@@ -80,7 +80,7 @@ def test_the_contracts_are_kept() -> None:
         ("daq/files.py", "import daq.config.cell", "daq.files is not allowed to import daq.config"),
         ("daq/config/drive.py", "import daq.log.metadata", "daq.config is not allowed to import daq.log"),
         ("daq/log/reader.py", "import daq.workflow.fit", "daq.log is not allowed to import daq.workflow"),
-        # Also by way of a module that nobody has named.
+        # Also through a module that no contract names.
         ("drivers/errors.py", "import drivers.simulation.spec", "daq.writeback is not allowed to import drivers.sim"),
     ],
 )
@@ -97,7 +97,7 @@ def test_a_contract_broken_on_purpose_is_reported(copied: Path, file: str, line:
 
 
 def test_the_science_brings_no_bus_no_log_and_no_screen() -> None:
-    """What a program gets into memory that uses `ident` alone, all of its modules imported."""
+    """A program that uses `ident` alone imports none of them, even with all of its modules."""
     code = (
         "import importlib, pkgutil, sys, ident\n"
         "names = [m.name for m in pkgutil.walk_packages(ident.__path__, 'ident.')]\n"

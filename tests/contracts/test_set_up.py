@@ -1,4 +1,4 @@
-"""What `make setup` shows while pip works."""
+"""Output of `make setup` while pip works."""
 
 from __future__ import annotations
 

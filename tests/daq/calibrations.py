@@ -19,7 +19,7 @@ KEYS = {axis: f"drives.{axis}.gain" for axis in AXES}
 
 
 def demo_calibration() -> Calibration:
-    """Of the demo cell, with the gains of the paper's Table 4 and σ of 0.4 %."""
+    """Calibration of the demo cell, with the gains of the paper's Table 4 and σ of 0.4 %."""
     return Calibration(
         cell="demo",
         method="ml",
@@ -39,7 +39,7 @@ def demo_calibration() -> Calibration:
         sources=(
             Source("unloaded", "a" * 64, "fit", recording=demo_recording()),
             Source("loaded", "b" * 64, "fit", False, "disc", 4.59, demo_recording(4.592)),
-            Source("unused", "d" * 64, "holdout", False, "disc", 4.59, demo_recording(4.588)),
+            Source("held-out", "d" * 64, "holdout", False, "disc", 4.59, demo_recording(4.588)),
         ),
         configuration_sha256="c" * 64,
         created="2025-01-02T03:04:05+00:00",
@@ -50,7 +50,7 @@ def demo_calibration() -> Calibration:
 
 
 def demo_recording(entered_kg: float | None = None, at: datetime = RECORDED) -> Recording:
-    """Of the demo cell's drives, without losses, some samples saturated."""
+    """Recording of the demo cell's drives, without losses, some samples saturated."""
     serials = tuple(range(1001, 1007))
     return Recording(at.timestamp(), entered_kg, serials, (0.0, 0.1, 0.0, 0.0, 1.9, 0.0), 0, (0,) * 6, None)
 
@@ -61,7 +61,7 @@ def recorded(calibration: Calibration, at: datetime) -> Calibration:
 
 
 def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
-    """The same with something else in what every log tells of its making."""
+    """The same calibration with changes in how every log was recorded."""
     reported = [(source, source.recording) for source in calibration.sources]
     return replace(
         calibration,

@@ -61,7 +61,7 @@ def on_its_own_bus(folder: Path, channel: str) -> Cell:
 def simulated(
     address: BusAddress, *faults: FaultSpec, entered: tuple[float, ...] = NAMEPLATE
 ) -> Iterator[SimulatedCell]:
-    """The demo cell, its drives with gains that somebody entered and faults."""
+    """The demo cell, its drives with entered gains and faults."""
     spec = load_simulation(CONFIGS / "simulation" / "clean.yaml")
     axes = tuple(replace(axis, entered_gain_nm_per_a=gain) for axis, gain in zip(spec.axes, entered, strict=True))
     bus: can.BusABC = open_bus(address)
@@ -90,13 +90,13 @@ def with_mapping(axis: Axis, mapping: Mapping) -> Axis:
 
 
 def entered_gain(node: Node, gain_object: GainObject = WHOLE) -> float:
-    """What stands in a drive now [Nm/A]."""
+    """Gain in a drive now [Nm/A]."""
     word = int.from_bytes(node.read(gain_object.parameter.index, gain_object.parameter.subindex), "little")
     return gain_object.parameter.value(word) / gain_object.factor
 
 
 def saved_gain(node: Node) -> float:
-    """What stands there after the next power-on [Nm/A]."""
+    """Gain in a drive after the next power-on [Nm/A]."""
     value = node.saved.values[0x2003, 1]
     assert isinstance(value, int)
     return value / 1000.0

@@ -1,4 +1,4 @@
-"""A child process that is killed at the system call that somebody chooses, by a small tracer (Linux, ptrace(2))."""
+"""A child process that is killed at a chosen system call, by a small tracer (Linux, ptrace(2))."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def killed_at(number: int, work: Callable[[], object]) -> bool:
         _be_traced(work)
     _, status = os.waitpid(child, 0)
     if os.WIFEXITED(status) and os.WEXITSTATUS(status) == _NOT_PERMITTED:
-        reason = "ptrace is not permitted here: nobody can be killed at a chosen system call"
-        # Where nobody reads what was skipped, this test must not be: it alone shows that no kill leaves half a file.
+        reason = "ptrace is not permitted here: no process can be killed at a chosen system call"
+        # In CI a skip goes unread, so this test must not be skipped: it alone shows that no kill leaves half a file.
         if os.environ.get("CI"):
             pytest.fail(reason)
         pytest.skip(reason)

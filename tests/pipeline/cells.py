@@ -44,7 +44,7 @@ class Job:
 
     @property
     def gains(self) -> dict[str, tuple[float, float]]:
-        """Of each axis: error and σ, both in percent of the truth."""
+        """Error and σ of each axis, both in percent of the truth."""
         return {
             gain["axis"]: (
                 100.0 * (gain["value"] / self.truth[gain["axis"]] - 1.0),
@@ -98,6 +98,6 @@ def _do(arguments: list[str]) -> None:
 
 
 def as_json(text: str) -> dict[str, Any]:
-    """What a verb printed with --json."""
+    """Parse the output of a verb with --json."""
     document: dict[str, Any] = json.loads(text)
     return document

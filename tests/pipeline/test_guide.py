@@ -54,7 +54,7 @@ def second_terminal(command: Command, folder: Path, environment: dict[str, str])
 def test_the_guide_is_followed_to_the_letter(checkout: Path, tmp_path: Path) -> None:
     with socket.socket() as probe:
         if probe.connect_ex(("127.0.0.1", PORT)) == 0:
-            pytest.skip(f"somebody uses port {PORT} of this machine: a simulated cell in another terminal?")
+            pytest.skip(f"port {PORT} of this machine is in use: a simulated cell in another terminal?")
     commands = commands_of((checkout / "docs" / "tutorial" / "guide.md").read_text(encoding="utf-8"))
     assert len(commands) > 25
     environment = os.environ | {

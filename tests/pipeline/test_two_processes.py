@@ -41,7 +41,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[P
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_simulated_cell_in_the_background_of_a_script_can_be_ended(checkout: Path, number: signal.Signals) -> None:
-    """What a script starts with & ignores SIGINT from its birth on."""
+    """A program that a script starts with & ignores SIGINT from its birth on."""
     command = f"trap '' INT; exec {shlex.quote(sys.executable)} -m daq simulate clean --port 0"
     with subprocess.Popen(
         ["sh", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=checkout

@@ -1,4 +1,4 @@
-"""Console blocks of a page, as somebody who follows it types them, and what the page says that he sees."""
+"""Console blocks of a page, as a reader types them, and the output that the page shows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Command:
     Attributes:
         line: of the page, from 1.
         text: what is typed, continuation lines and here-documents included.
-        seen: what the page shows after it; "…" stands for anything.
+        seen: what the page shows after it; "…" matches anything.
         background: it runs on in a second terminal.
     """
 

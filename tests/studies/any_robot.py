@@ -1,4 +1,4 @@
-"""The seven-axis arm and the gantry, several seeds: how far the gains are off, and whether σ tells it.
+"""The seven-axis arm and the gantry, several seeds: how far the gains are off, and whether σ shows it.
 
     python -m tests.studies.any_robot
 

@@ -5,7 +5,7 @@
 
 Each cell has a truth of its own (study_cells.py) and each of its runs a noise of its own; plans are shared by the
 cells in turn, because a plan is no part of what an error bar has to cover. Layout: out/coverage/<cell>.npz, counts as
-the amplifiers tell them. `load_coverage` gives them back as runs with their truth.
+the amplifiers report them. `load_coverage` gives them back as runs with their truth.
 """
 
 from __future__ import annotations

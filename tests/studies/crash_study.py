@@ -71,7 +71,7 @@ class Tap:
 
 
 ASKED = 1
-"""SYNCs before the log begins: a recorder first asks where the axes stand (daq/workflow/record.py)."""
+"""SYNCs before the log begins: a recorder first reads the positions of the axes (daq/workflow/record.py)."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
 
 @dataclass(frozen=True)
 class Damage:
-    """What became of one kind of damage to a finished log.
+    """Outcome of one kind of damage to a finished log.
 
     Attributes:
         tried: files.
@@ -201,7 +201,7 @@ class Damage:
         wrong: read, and another in some number; must be zero.
         crashed: any other exception, by its name; must be empty.
         salvage_wrong: something before the damage that salvage would take was not as recorded; must be zero.
-        recovered_share: of the samples, that stand before the damage, least and mean.
+        recovered_share: of the samples before the damage, least and mean.
     """
 
     tried: int

@@ -16,6 +16,6 @@ def as_csv(markdown: str) -> str:
             cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip()[1:-1])]
             if not all(re.fullmatch(r":?-+:?", cell) for cell in cells):
                 writer.writerow(cells)
-        elif text.tell():
+        elif text.getvalue():
             break
     return text.getvalue()

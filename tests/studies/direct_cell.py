@@ -48,7 +48,7 @@ from ident.model.bodies import Payload
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawRun:
-    """The samples of one run as the amplifiers tell them.
+    """The samples of one run as the amplifiers report them.
 
     Attributes:
         name: of the run.
@@ -90,7 +90,7 @@ def simulate_run(
     """
     stream = DirectStream(cell, spec, began_s)
     scale = _scaling(cell, stream.ampere_per_unit)
-    first = next(stream)  # as a recording does: it asks where the axes stand before its log begins
+    first = next(stream)  # as a recording does: it reads the positions before its log begins
     permission = MotionPermission("a simulated cell", motor_limits(cell, scale))
     planned = motor_moves(cell, plan, scale, first.position_counts)
     samples = [next(stream)]
@@ -146,7 +146,7 @@ class DirectStream:
     Attributes:
         network: what the walk asks of a network: its nodes and the names of its axes.
         pacing: of the samples' time.
-        max_missing_cycles, silent: none is ever missing, and somebody always answers.
+        max_missing_cycles, silent: none is ever missing, and a node always answers.
         events: in their order.
         time_ns: of the last sample.
         ampere_per_unit: of the raw current, from the drives' own scale objects.
@@ -178,7 +178,7 @@ class DirectStream:
             for index, axis in enumerate(spec.axes)
         )
         axes = drive_axes(cell)
-        # Nobody can die between this recorder and its amplifiers: they need not be guarded.
+        # No bus between this recorder and its amplifiers can fail: they need not be guarded.
         self.network = cast(
             CanopenNetwork,
             SimpleNamespace(
@@ -274,7 +274,7 @@ class _DirectAccess:
         self.node.write(entry.index, entry.subindex, data)
 
     def prepare(self) -> None:
-        """What `CanopenNetwork.prepare` does to a node that has just been powered on: it needs no SYNC for that."""
+        """Act as `CanopenNetwork.prepare` does on a node that has just been powered on: it needs no SYNC for that."""
         self.node.boot(0.0)
         for record in records(Direction.RPDO, self.node_id, SETPOINT_PDOS):
             write_record(cast(ObjectAccess, self), record)

@@ -33,7 +33,7 @@ SCATTER = DISPERSION
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Of histories with an alarm [%]: by its kind, and of whatever kind."""
+    """Shares of histories with an alarm [%]: by its kind, and of whatever kind."""
 
     cusum: float
     single: float
@@ -62,7 +62,7 @@ def share_percent(late: NDArray[np.int64], within: int) -> float:
 
 
 def draw(rng: np.random.Generator, shape: tuple[int, ...], dispersion: float) -> tuple[FloatArray, FloatArray]:
-    """Errors of gains in units of their true σ, and σ as the fits tell it."""
+    """Errors of gains in units of their true σ, and σ as the fits report it."""
     reported = np.sqrt(rng.chisquare(MOVES, shape) / MOVES)
     return dispersion * rng.standard_normal(shape), reported
 
@@ -112,7 +112,7 @@ def delays(
 
 
 def most_percent(*, std_percent: float, before: int, false_percent: float, dispersion: float = SCATTER) -> float:
-    """What no test finds more of, two recalibrations after the drift has cumulated FOUND_SIGMAS [%].
+    """Upper limit of detections by any test, two recalibrations after the drift has cumulated FOUND_SIGMAS [%].
 
     The two-sided test of that day (Neyman and Pearson) that knows σ, the day on which the drift began and its course,
     but neither the gain before nor the direction, and spends on this day what a chart has for all: `false_percent` over

@@ -4,7 +4,7 @@
     python -m tests.studies.effect_runs clean-03  these cases alone
 
 Loaded and unloaded runs alternate in one session, so that the load cannot be taken for the time. Layout:
-out/effects-study/<case>.npz, counts as the amplifiers tell them.
+out/effects-study/<case>.npz, counts as the amplifiers report them.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ RUNS = (
     ("disc-1", "disc", 0),
     ("bare-2", None, 1),
     ("disc-2", "disc", 1),
-    ("unused-bare", None, 2),
-    ("unused-disc", "disc", 2),
+    ("held-out-bare", None, 2),
+    ("held-out-disc", "disc", 2),
 )
 """Name, payload and plan (of the case's set) of each run, in the order of the session."""
 HELD_OUT = 2
@@ -51,7 +51,7 @@ class CaseRuns:
     """The runs of one case: of the fit, and those that it may not see."""
 
     fit: tuple[Run, ...]
-    unused: tuple[Run, ...]
+    held_out: tuple[Run, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ VARIABLES = {
 }
 """Families that the dictionary is made to lack, and what their residual is a function of.
 
-Stribeck and non-linear viscous friction are not among them: each stands in for the other (their ambiguity says so)."""
+Stribeck and non-linear viscous friction are not among them: each explains the other (their ambiguity says so)."""
 REMOVED = tuple(case for case in SINGLES if case.effects[0].name in VARIABLES)
 SAME = {"spring": ("hinge", "gravity-compensator")}
 """Families that say the same as another one, and are removed with it."""
@@ -81,8 +81,8 @@ class Row:
         true: effects of the plant, as `family on J3`.
         named: effects that the search accepted, in its order.
         ambiguity: of the first one.
-        error_before_percent, error_after_percent: on the unused runs, of the first true effect's axis; of the whole for
-            a clean cell.
+        error_before_percent, error_after_percent: on the held-out runs, of the first true effect's axis; of the whole
+            for a clean cell.
         floor_percent: the same error of the same seed's clean cell, None where that was not simulated.
         max_gain_error_percent: after, of the worst gain.
         excess_removed: share of the excess over the floor, squared, that went; None without a floor.
@@ -143,7 +143,7 @@ def _search(task: _Task) -> Row:
     families = tuple(family for family in EFFECTS if family[0].name not in removed)
     begun_s = time.process_time()
     found = identify(model_of(cell), runs.fit, cell.conditioning)
-    start = gather(found, runs.fit, runs.unused)
+    start = gather(found, runs.fit, runs.held_out)
     steps = find_effects(start, np.random.default_rng(0), families=families)
     spent_s = time.process_time() - begun_s
     truth = np.array([axis.gain_nm_per_a for axis in study_cell(case.seed).bare.axes])
@@ -183,7 +183,7 @@ def _floor(case: EffectCase, out: Path, axis: int | None) -> float | None:
     if axis is None or clean is None or not (out / f"{clean.name}.npz").is_file():
         return None
     cell, runs = load_cell(CELL), load_runs(clean, out)
-    return _holdout(gather(identify(model_of(cell), runs.fit, cell.conditioning), runs.fit, runs.unused), axis)
+    return _holdout(gather(identify(model_of(cell), runs.fit, cell.conditioning), runs.fit, runs.held_out), axis)
 
 
 def _worst(evidence: Evidence, truth: FloatArray) -> float:

@@ -18,7 +18,7 @@ def digest(*things: object) -> str:
 
 
 def digest_of_source(module: str) -> str:
-    """Of a module and of all modules of this repository that it imports, in turn, hex; docstrings and comments apart.
+    """Digest of a module and of all modules of this repository that it imports, in hex; docstrings and comments apart.
 
     Args:
         module: dotted name.
@@ -46,7 +46,7 @@ def is_finished(path: Path, fingerprint: str) -> bool:
 
 
 def finish(path: Path, fingerprint: str) -> None:
-    """Mark a file that stands."""
+    """Mark a finished file."""
     replace_file(_mark(path), f"{fingerprint}\n".encode())
 
 
@@ -55,7 +55,7 @@ def _mark(path: Path) -> Path:
 
 
 class _Wordless(ast.NodeTransformer):
-    """Takes the docstrings out: texts that stand as statements."""
+    """Removes docstrings: texts that are statements."""
 
     def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         is_text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)

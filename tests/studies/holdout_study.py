@@ -1,4 +1,4 @@
-"""What the hold-out tells of the gains beside an effect: of right ones, and of one that is wrong among them.
+"""Verdict of the hold-out on the gains beside an effect: of right ones, and of one that is wrong among them.
 
 `make holdout-study` prints the figures of docs/evidence/hold-out.md. Sessions obey the declared model and a
 low-speed friction that it lacks; the loop finds it. Each session is fitted twice: for a cell whose nameplate is 2 to
@@ -26,7 +26,7 @@ from ident.estimators.method import Method
 from tests.ident.recordings import GAINS, MOUNTED, record, tx40_truth
 
 FIT = ("bare-1", "loaded-1", "bare-2", "loaded-2")
-UNUSED = "unused"
+HELD_OUT = "held-out"
 WRONG_AXIS = 3
 FACTORS = (1.0, 0.7, 0.9, 1.1)
 
@@ -49,7 +49,7 @@ class Ratio:
 def session(seed: int) -> dict[str, Run]:
     """Four runs for the fit and one to be held out, by name."""
     truth, rng = tx40_truth(), np.random.default_rng(seed)
-    mounted = {name: None if name.startswith("bare") else MOUNTED for name in (*FIT, UNUSED)}
+    mounted = {name: None if name.startswith("bare") else MOUNTED for name in (*FIT, HELD_OUT)}
     return {
         name: _sticking(record(truth, name, rng, payload, noise_a=0.3, seconds=22.0))
         for name, payload in mounted.items()
@@ -65,7 +65,7 @@ def _sticking(run: Run) -> Run:
 
 def fitted(cell: Cell, runs: dict[str, Run]) -> Fit:
     """With the effects that the loop accepts."""
-    trained, unseen = [runs[name] for name in FIT], [runs[UNUSED]]
+    trained, unseen = [runs[name] for name in FIT], [runs[HELD_OUT]]
     found = identify(model_of(cell), trained, cell.conditioning, holdout=unseen)
     steps = find_effects(gather(found, trained, unseen), np.random.default_rng(0))
     return Fit(cell, (), (), (), found, steps, None)
@@ -82,7 +82,7 @@ def with_factor(right: Fit, factor: float) -> Fit:
 
 
 def ratios(seeds: range) -> Iterator[Ratio]:
-    """Of every session, nameplate and factor."""
+    """Yield the ratios of every session, nameplate and factor."""
     off = load_cell(shipped_configurations() / "cells" / "demo.yaml")
     axes = (replace(axis, nameplate_gain=float(gain)) for axis, gain in zip(off.axes, GAINS, strict=True))
     true = replace(off, axes=tuple(axes))

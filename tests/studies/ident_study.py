@@ -135,7 +135,7 @@ def _print_line(line: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Record, score, tell."""
+    """Record, score and report."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.ident_study", description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
     parser.add_argument("--floors", nargs="+", choices=tuple(FLOORS), default=list(FLOORS))

@@ -1,4 +1,4 @@
-"""The paper's own figures, to stand beside ours: Gautier and Briot, doi 10.1115/1.4027506, Tables 1 to 8."""
+"""The paper's own figures, for comparison with ours: Gautier and Briot, doi 10.1115/1.4027506, Tables 1 to 8."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ CASES = ("manufacturer", "case-1", "case-2", "case-3", "case-4", "ml")
 
 @dataclass(frozen=True, slots=True)
 class Merit:
-    """What a set of gains is worth on one cell [%].
+    """Merit of a set of gains on one cell [%].
 
     Attributes:
         gains: |g/truth − 1| of each axis.

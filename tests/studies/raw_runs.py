@@ -1,4 +1,4 @@
-"""Raw runs of a study in one compressed file, counts as the amplifiers tell them."""
+"""Raw runs of a study in one compressed file, counts as the amplifiers report them."""
 
 from __future__ import annotations
 

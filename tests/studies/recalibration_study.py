@@ -71,7 +71,7 @@ def one_job(rig: Rig, factor: float, seed: int, *faults: FaultSpec) -> str:
 
 
 def week_text(rig: Rig, factor: float) -> str:
-    """Of J4: drift and gain found, beside the truth and the controller's gain."""
+    """Drift and gain found on J4, beside the truth and the controller's gain."""
     state = rig.sessions[-1].state
     if state.decision is None:
         return ""

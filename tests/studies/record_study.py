@@ -244,7 +244,7 @@ def _folder(out: Path, floor: str, seed: int) -> Path:
 
 
 def _fingerprint(cell: Cell, spec: CellSpec, moves: Plan, run: StudyRun) -> str:
-    """Of everything that decides what is in a log, but the time of day.
+    """Digest of everything that decides what is in a log, but the time of day.
 
     Of the simulator and the walk of the moves it takes what they do, not how they are written: the samples of the first
     move, which the direct path gives as they would be in the log.

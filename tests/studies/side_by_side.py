@@ -25,12 +25,12 @@ class _Reporting(Generic[Task, Made]):
     def __call__(self, task: Task) -> tuple[Made | None, str]:
         try:
             return self.function(task), ""
-        except Exception:  # noqa: BLE001 - told whole to the process that asked
+        except Exception:  # noqa: BLE001 - passed whole to the calling process
             return None, f"{task}:\n{traceback.format_exc()}"
 
 
 def side_by_side(function: Callable[[Task], Made], tasks: Iterable[Task], processes: int) -> Iterator[Made]:
-    """What a function makes of each task, in the order of the tasks.
+    """Yield the results of a function for each task, in the order of the tasks.
 
     Args:
         function: of a module, so that another process finds it; it makes something.

@@ -49,7 +49,7 @@ class PayloadTruth:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What a fit of a study's cell is scored with.
+    """True values with which a fit of a study's cell is scored.
 
     Attributes:
         seed: of the cell.
@@ -127,7 +127,7 @@ def spec_of(cell: StudyCell, payload: str | None, run: int) -> CellSpec:
 
 
 def truth_of(cell: StudyCell) -> Truth:
-    """What a fit of this cell is scored with."""
+    """Return the true values of a cell, with which a fit is scored."""
     rng = np.random.default_rng(np.random.SeedSequence(cell.seed, spawn_key=(3,)))
     payloads = {}
     for name, body in cell.bodies.items():
@@ -147,7 +147,7 @@ def truth_of(cell: StudyCell) -> Truth:
 
 
 def truth_from(document: dict[str, Any]) -> Truth:
-    """What `dataclasses.asdict` made of a truth, read back from JSON."""
+    """Rebuild a truth from its `dataclasses.asdict`, read back from JSON."""
     return Truth(
         seed=document["seed"],
         noise_factor=document["noise_factor"],
@@ -158,7 +158,7 @@ def truth_from(document: dict[str, Any]) -> Truth:
 
 
 def declared_payload(name: str) -> Payload:
-    """What a log of the study says of a payload: the weighed mass of the disc alone, of the plate nothing.
+    """Return a payload as a log of the study declares it: the weighed mass of the disc alone, of the plate nothing.
 
     The plate's mass is what the study looks for (paper, Tables 7 and 8).
     """
@@ -208,7 +208,7 @@ def _drawn_body(body: Body, rng: np.random.Generator) -> Body:
 
 def _drawn_links(urdf: str, rng: np.random.Generator) -> str:
     """Every link with another density and another centre of mass: still a body that can exist."""
-    # The text is a file of this repository, no stranger's.
+    # The text is a file of this repository, so it is trusted.
     robot = ElementTree.fromstring(urdf)
     for inertial in robot.iterfind("link/inertial"):
         scale = 1.0 + LINK_SPREAD * float(rng.uniform(-1.0, 1.0))

@@ -1,4 +1,4 @@
-"""Closing the loop on the real TX-40, nested: whoever chooses effects has not seen what they are scored on.
+"""Closing the loop on the real TX-40, nested: effects are chosen without the runs that score them.
 
 Run by `make tx40-study`; needs the recording in ../shared/data or $DRIVEGAIN_DATA. The run is cut into blocks of 0.5 s;
 each quarter of them, every fourth block, is left out in turn. The rest is a run of its own: it is fitted, the loop is

@@ -178,7 +178,7 @@ def signature(context: GateContext) -> Iterator[Finding]:
     applying = {_as_read(name) for name in request.appliers}
     others = _others(signed, applying)
     if len(others) < policy.signatures:
-        may = ", ".join(_others(tuple(policy.signers), applying)) or "nobody else"
+        may = ", ".join(_others(tuple(policy.signers), applying)) or "no one else"
         yield (
             subject,
             f"{len(others)} signatures ({', '.join(others) or 'none'}), not counting the operator's",

@@ -42,7 +42,7 @@ class Bench:
 
     @property
     def audit(self) -> Path:
-        """Of the cell."""
+        """Audit log of the cell."""
         return self.cell.with_name("cell.audit.jsonl")
 
     def apply(self, *options: str) -> int:
@@ -519,7 +519,7 @@ def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 @pytest.mark.parametrize("folder", [False, True], ids=["file", "folder"])
 @pytest.mark.parametrize("behind", [False, True], ids=["named", "behind one's own"])
-def test_a_stranger_s_link_of_the_cell_file_is_refused(
+def test_another_user_s_link_to_the_cell_file_is_refused(
     bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     link = bench.controller.parent if folder else bench.controller

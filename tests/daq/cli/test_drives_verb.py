@@ -95,7 +95,7 @@ def test_look_write_and_go_back(cell: Cell, simulation: SimulatedCell, capsys: p
     with HistoryStore(cell.history.store) as store:
         assert [event.target for event in store.events()] == ["drives of cell demo"] * 2
         assert store.in_force() is None
-        # The two entries that tell how the writes ended.
+        # The two entries that record how the writes ended.
         assert store.audited() == {entry.sha256 for entry in read(cell.history.audit)[1::3]}
     _back(cell)
     with HistoryStore(cell.history.store) as store:

@@ -21,12 +21,12 @@ from tests.daq.jobs.rig import Rig, make_plan, make_rig, powerless, serving
 
 @dataclass(frozen=True)
 class Made:
-    """What a whole real job has made, for tests of what comes after the recordings.
+    """Products of a whole real job, for tests of what comes after the recordings.
 
     Attributes:
         plan_file: of its runs.
         logs: by their runs' names.
-        recorded: what the recorder told of each.
+        recorded: what the recorder reported on each.
         fitted, closed: before and after the loop.
         calibration: of the latter.
     """
@@ -80,7 +80,7 @@ class Made:
             drives=lambda _cell, _undisturbed: None,
             record=copied,
             fit=lambda _logs, **_: self.fitted,
-            close_loop=lambda _fit, _seed, _told: self.closed,
+            close_loop=lambda _fit, _seed, _report: self.closed,
             calibration=in_this_cell,
         )
 

@@ -42,7 +42,7 @@ WHO = "the test's job"
 RUNS: tuple[dict[str, Any], ...] = (
     {"name": "bare-1"},
     {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59},
-    {"name": "unused", "payload": "disc", "mass_kg": 4.59, "holdout": True},
+    {"name": "held-out", "payload": "disc", "mass_kg": 4.59, "holdout": True},
 )
 
 
@@ -57,7 +57,7 @@ def _truth(payload: str | None) -> CellSpec:
 
 
 class TestClock:
-    """A wall clock that goes on by a second whenever it is asked, and further when it is told."""
+    """A wall clock that advances by a second at each reading, and further with `go_on`."""
 
     __test__ = False
 

@@ -1,4 +1,4 @@
-"""What becomes of a calibration, by statistics and by policy, over many weeks."""
+"""Fate of a calibration, by statistics and by policy, over many weeks."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_sh
     assert all(gain.old_std > 0 for gain in decision.gains)
 
 
-def test_a_closed_gate_refuses_and_the_next_job_records_anew(tmp_path: Path, made: Made) -> None:
+def test_a_failed_check_refuses_and_the_next_job_records_anew(tmp_path: Path, made: Made) -> None:
     strict = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 0.01}}
     rig = made_rig(tmp_path / "cell", made, policy=strict)
     before = rig.controller.read_bytes()
@@ -146,7 +146,7 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
 
 
 def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(tmp_path: Path, made: Made) -> None:
-    """Whoever wrote them was killed right behind it: taken for exact, they would differ from each new one too often."""
+    """Their writer was killed right after the write: taken for exact, they would differ from each new one too often."""
     rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
     assert rig.job().outcome is Outcome.APPLIED
     with closing(sqlite3.connect(rig.cells / "demo.history.sqlite")) as history:

@@ -36,7 +36,7 @@ BORNE = (
     FaultSpec(FaultKind.REFUSES_SAVE, AXIS),
     FaultSpec(FaultKind.ERROR_PASSIVE, None, STRIKE),
 )
-"""No run ends of them: one is warned of, one is told in the log, and a job writes no gain into a drive."""
+"""No run ends of them: one is warned of, one is noted in the log, and a job writes no gain into a drive."""
 ONLY_BARE = {"command": ["sh", "-c", 'test "$1" = none', "mount"]}
 
 
@@ -90,7 +90,7 @@ def test_a_cell_that_is_cut_off_ends_the_job_and_what_no_one_can_reach_is_said(
     rig = make_rig(tmp_path / "cell", short_plan)
     with serving(rig, fault) as cell:
         error = fails(rig, cell, kind)
-        # Those that can be reached stand; the others stop by themselves (tests/faults), later than this test waits.
+        # Those that can be reached are stopped; the others stop by themselves (tests/faults), after this test ends.
         others = [node for index, node in enumerate(cell.nodes) if fault.axis is not None and index != fault.axis]
         assert {node.drive.state for node in others} <= {PowerState.SWITCH_ON_DISABLED}
     assert any(note.startswith("while stopping") for note in error.__notes__)
@@ -109,7 +109,7 @@ def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
 
 
 def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
-    """Once its recorder stands for it the job goes on, here to a payload that nobody mounts."""
+    """Once its recorder accepts the run the job goes on, here to a payload that is never mounted."""
     rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=ONLY_BARE)
     with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
         assert "mount command" in str(fails(rig, cell, JobHeld))

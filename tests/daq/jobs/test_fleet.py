@@ -1,4 +1,4 @@
-"""Many cells' logs: each fitted as it would be alone, whoever does it and however often it was interrupted."""
+"""Many cells' logs: each fitted as it would be alone, by any worker and however often it was interrupted."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def single(fleet: Path) -> dict[str, dict[str, Any]]:
-    """What single fits make of them, by cell."""
+    """Results of single fits, by cell."""
     made = {}
     for folder in sorted(fleet.iterdir()):
-        holdout = [log for log in (folder / "unused.mcap",) if log.exists()]
+        holdout = [log for log in (folder / "held-out.mcap",) if log.exists()]
         fitted = fit([folder / "bare.mcap", folder / "loaded.mcap"], holdout=holdout)
         made[folder.name] = _timeless(as_document(calibration_of(fitted, CREATED)))
     return made
@@ -160,10 +160,10 @@ def test_the_table_shows_every_cell_and_marks_errors_on_the_fit_itself(
 
 def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (few / "cell-000" / "loaded.mcap").unlink()
-    (few / "cell-000" / "unused.mcap").unlink()
+    (few / "cell-000" / "held-out.mcap").unlink()
     whole = (few / "cell-002" / "bare.mcap").read_bytes()
     (few / "cell-002" / "bare.mcap").write_bytes(whole[: len(whole) // 2])
-    (few / "nobody's.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
+    (few / "ownerless.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
     write(few / "foreign.mcap", content(2), samples([(1, 2)] * 5))
     assert main(["fleet", str(few), "--json"]) == ExitCode.DATA_UNFIT
     document = json.loads(capsys.readouterr().out)
@@ -173,7 +173,7 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(few: Path, capsys
         "cell-002": "LogTruncated",
         "cell-003": None,
         "foreign.mcap": "SchemaMismatch",
-        "nobody's.mcap": "LogTruncated",
+        "ownerless.mcap": "LogTruncated",
     }
     assert [cell["exit_code"] for cell in document["cells"]] == [4, 4, 0, 6, 4]
     (truncated,) = (cell for cell in document["cells"] if cell["cell"] == "cell-002")
@@ -213,7 +213,7 @@ def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     assert [row.kept for row in second] == [True] * 3
     assert second == tuple(replace(row, kept=True) for row in first)
     # Another log, another content, a damaged calibration, a state that is none.
-    (few / "cell-000" / "unused.mcap").unlink()
+    (few / "cell-000" / "held-out.mcap").unlink()
     assert [row.kept for row in _fitted(few, out)] == [False, True, True]
     bare = few / "cell-002" / "bare.mcap"
     bare.write_bytes(bare.read_bytes()[:-1])
@@ -361,7 +361,7 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         assert list(scratch.iterdir()) == []
         seen = by_cell(log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog))
         assert all(open_cache(out, Loop.OPEN).cached(cell) is not None for cell in seen)
-        # What is wrong with a copy is told of what it is a copy of.
+        # A fault of a copy is reported under the name of its original.
         whole = store.cat_file("/hall/cell-002/bare.mcap")
         store.pipe("/hall/cell-002/bare.mcap", whole[:-100])
         with Threads(1).start_pool() as pool:
@@ -385,7 +385,7 @@ def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
 def test_a_name_of_a_log_that_is_no_file_is_a_row(
     address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """None of them is opened: nobody would ever come to the other end of the pipe."""
+    """None of them is opened: nothing would ever open the other end of the pipe."""
     logs = tmp_path / "logs"
     (logs / "folder.mcap").mkdir(parents=True)
     (logs / "folder.mcap" / "gone.mcap").symlink_to(tmp_path / "unmounted.mcap")
@@ -462,7 +462,7 @@ def test_processes_of_this_machine_listen_to_no_one_else() -> None:
 
 def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers_module, "CONNECT_S", 0.2)
-    # Port 9, discard: nobody answers there.
+    # Port 9, discard: nothing answers there.
     with (
         pytest.raises(UsageError, match="a dask scheduler that answers"),
         Scheduler("tcp://127.0.0.1:9", 1).start_pool(),
@@ -512,7 +512,7 @@ def test_heads_that_no_one_could_read_are_rows(few: Path, monkeypatch: pytest.Mo
 
 
 def test_a_name_that_is_no_text_ends_nothing(few: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Bytes that are no UTF-8, in a log of a cell and in one of nobody."""
+    """Bytes that are no UTF-8, in a log of a cell and in one of no cell."""
     shutil.rmtree(few / "cell-000")
     (few / "cell-002" / "bare.mcap").rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
     (few / os.fsdecode(b"=c\xff\x1b[2J.mcap")).write_bytes(b"\x89MCAP0\r\nno log of ours")
@@ -534,7 +534,7 @@ def test_a_name_that_is_no_text_ends_nothing(few: Path, tmp_path: Path, capsys: 
 def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
     cells = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
     shutil.copy(few / "cell-002" / "bare.mcap", few / "cell-003" / "loaded.mcap")
-    shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "unused.mcap")
+    shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "held-out.mcap")
     kinds = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
     assert [made.failure.kind if isinstance(made, Unfitted) else "" for made in kinds] == [
         "LogRepeated",
@@ -591,7 +591,7 @@ def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) ->
             results[piece] = made
             back += 1
     assert results == {piece: piece**2 for piece in range(pieces)}
-    # The next one goes out before the one that came back is looked at.
+    # The next one goes out before the finished one is examined.
     assert most <= workers + 1
 
 

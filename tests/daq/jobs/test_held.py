@@ -1,4 +1,4 @@
-"""What holds a job: interlock, mount, another job, time, signals, room, clock; and that the next one takes it up."""
+"""Reasons that hold a job: interlock, mount, another job, time, signals, room, clock; the next job takes it up."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from tests.daq.jobs.rig import BEGAN, Rig, make_rig, powerless, serving
 
 
 def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
-    """The job is held by that; nothing was written but where it is told."""
+    """The job is held by that; nothing was written but its report."""
     before = rig.controller.read_bytes()
     with pytest.raises(kind) as caught:
         rig.job()
@@ -73,7 +73,7 @@ def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made
 
 
 def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(tmp_path: Path, one_move: Path) -> None:
-    """In the simulated cell: whoever mounts the payload leaves the door open."""
+    """In the simulated cell: the person who mounts the payload leaves the door open."""
     left_open = {"command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]}
     rig = make_rig(tmp_path / "cell", one_move, mount=left_open)
     with serving(rig) as cell:
@@ -130,7 +130,7 @@ def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with
 
     rig.tools = replace(rig.tools, record=noting)
     assert rig.job().outcome is Outcome.APPLIED
-    assert recorded == ["loaded-1", "unused"]
+    assert recorded == ["loaded-1", "held-out"]
     assert rig.session.state.runs[0] == first
 
 
@@ -150,11 +150,11 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
     shared = replace(
         rig.cell, buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
     )
-    read_end, tell = os.pipe()
+    read_end, signal_end = os.pipe()
     child = os.fork()
     if child == 0:
         with suppress(BaseException), bus_lock(shared, rig.folder):
-            os.write(tell, b"x")
+            os.write(signal_end, b"x")
             signal.pause()
         os._exit(0)
     try:
@@ -165,7 +165,7 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
         os.close(read_end)
-        os.close(tell)
+        os.close(signal_end)
     with bus_lock(shared, rig.folder):
         pass
 
@@ -484,7 +484,7 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(tmp_pat
     rig.tools = replace(rig.tools, record=noting, run=asking)
     assert rig.job().outcome is Outcome.APPLIED
     # 12 s in passes of a plan of about 4.4 s.
-    assert made_of == ["warm-up"] * 3 + ["bare-1", "loaded-1", "unused"]
+    assert made_of == ["warm-up"] * 3 + ["bare-1", "loaded-1", "held-out"]
     # Preflight; then before each recording, and again before its motion.
     assert asked == ["test", "sh", *["test"] * 8, "sh", *["test"] * 2, "sh", *["test"] * 2]
     assert not list(rig.session.folder.glob("warm-up*"))

@@ -1,4 +1,4 @@
-"""What a job says while it runs, and what a monitor reads."""
+"""Journal of a job while it runs, and metrics for a monitor."""
 
 from __future__ import annotations
 

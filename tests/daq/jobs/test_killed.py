@@ -75,7 +75,7 @@ def killed_job(rig: Rig, kill: Kill) -> None:
 
 
 def applied_once(rig: Rig) -> None:
-    """By all that tells of it."""
+    """Check the single write in every record of it."""
     session = rig.session
     assert session.state.outcome is Outcome.APPLIED
     actions = [entry.action for entry in rig.audit]
@@ -91,7 +91,7 @@ def applied_once(rig: Rig) -> None:
 
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory, made: Made) -> list[str]:
-    """Those of a job that nobody kills."""
+    """System calls of a job that runs to its end."""
     rig = made_rig(tmp_path_factory.mktemp("counted") / "cell", made, metrics=None)
     kill = Kill()
     assert replace(rig, tools=kill.tools(rig.tools)).job().outcome is Outcome.APPLIED
@@ -134,7 +134,7 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
 
 
 @pytest.mark.parametrize("way", ["rollback", "cp", "edited"])
-def test_what_a_person_took_back_behind_a_killed_write_is_not_written_again(
+def test_a_rollback_by_hand_after_a_killed_write_is_not_written_again(
     tmp_path: Path, made: Made, calls: list[str], way: str
 ) -> None:
     """The file is as it was before the write; only the audit knows that there was one."""
@@ -147,16 +147,16 @@ def test_what_a_person_took_back_behind_a_killed_write_is_not_written_again(
     else:
         shutil.copyfile(backup, rig.controller)
     if way == "edited":
-        rig.controller.write_text(rig.controller.read_text() + "\n# looked at\n")
-    taken_back = rig.controller.read_bytes()
+        rig.controller.write_text(rig.controller.read_text() + "\n# reviewed\n")
+    rolled_back = rig.controller.read_bytes()
     rig.clock.go_on(minutes=10)
     ended = rig.job()
     assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
     assert "rolled back since the session began" in ended.remark
-    assert rig.controller.read_bytes() == taken_back
+    assert rig.controller.read_bytes() == rolled_back
     assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
     assert rig.job().outcome is Outcome.NOT_DUE
-    assert rig.controller.read_bytes() == taken_back
+    assert rig.controller.read_bytes() == rolled_back
 
 
 def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:
@@ -201,7 +201,7 @@ def of_another_configuration(rig: Rig) -> None:
 
 
 def with_another_plan(rig: Rig) -> None:
-    """Somebody has approved other moves: half of the logs would be of these, half of those."""
+    """Other moves have been approved: half of the logs would be of these, half of those."""
     plan = rig.cells / "plan.yaml"
     plan.write_bytes(plan.read_bytes() + b"\n# approved again\n")
 

@@ -1,4 +1,4 @@
-"""`recalibration` of the cell file: what may stand there, and what is refused with its line."""
+"""`recalibration` of the cell file: what it may contain, and what is refused with its line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def changed(tmp_path: Path, **section: Any) -> Path:
 BASIS = Basis("demo", "c" * 64, "b" * 64)
 RUN = {"name": "bare-1", "plan": {"seed": 1}}
 LOADED = {"name": "loaded-1", "payload": "disc", "mass_kg": 4.59, "plan": {"seed": 1}}
-UNUSED = {**LOADED, "name": "unused", "holdout": True}
+HELD_OUT = {**LOADED, "name": "held-out", "holdout": True}
 
 
 @pytest.mark.parametrize(
@@ -38,13 +38,13 @@ UNUSED = {**LOADED, "name": "unused", "holdout": True}
     [
         ({"interlock": {}}, "no job moves a robot unasked"),
         ({"warm_up_minutes": 1}, "warm_up_min"),
-        ({"runs": [RUN, LOADED, {**UNUSED, "holdout": False}]}, "holdout: true"),
-        ({"runs": [RUN, {**LOADED, "holdout": True}, UNUSED]}, "one run without and one with a payload"),
-        ({"runs": [RUN, {**LOADED, "name": "bare-1"}, UNUSED]}, "names of their own"),
-        ({"runs": [{**RUN, "mass_kg": 1.0}, LOADED, UNUSED]}, "payload and its mass_kg"),
-        ({"runs": [{**RUN, "plan_file": "a.yaml"}, LOADED, UNUSED]}, "plan_file with approved moves"),
-        ({"runs": [{**RUN, "name": "warm-up"}, LOADED, UNUSED]}, "another name than warm-up"),
-        ({"runs": [{**RUN, "name": "../up"}, LOADED, UNUSED]}, "name"),
+        ({"runs": [RUN, LOADED, {**HELD_OUT, "holdout": False}]}, "holdout: true"),
+        ({"runs": [RUN, {**LOADED, "holdout": True}, HELD_OUT]}, "one run without and one with a payload"),
+        ({"runs": [RUN, {**LOADED, "name": "bare-1"}, HELD_OUT]}, "names of their own"),
+        ({"runs": [{**RUN, "mass_kg": 1.0}, LOADED, HELD_OUT]}, "payload and its mass_kg"),
+        ({"runs": [{**RUN, "plan_file": "a.yaml"}, LOADED, HELD_OUT]}, "plan_file with approved moves"),
+        ({"runs": [{**RUN, "name": "warm-up"}, LOADED, HELD_OUT]}, "another name than warm-up"),
+        ({"runs": [{**RUN, "name": "../up"}, LOADED, HELD_OUT]}, "name"),
         ({"mount": {"command": []}}, "at least 1 item"),
         ({"mount": {"command": "mount-it"}}, "mount"),
         ({"every_h": -1}, "greater than or equal to 0"),
@@ -58,7 +58,7 @@ def test_what_is_not_so_is_refused(tmp_path: Path, section: dict[str, Any], mess
 def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
     file = changed(
         tmp_path,
-        runs=[{**RUN, "plan": None, "plan_file": "plans/a.yaml"}, LOADED, UNUSED],
+        runs=[{**RUN, "plan": None, "plan_file": "plans/a.yaml"}, LOADED, HELD_OUT],
         interlock={"file": "state/interlock"},
         metrics="../metrics",
     )

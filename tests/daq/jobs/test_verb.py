@@ -100,7 +100,7 @@ def test_the_simulated_payload_changes_with_the_file_but_never_under_power(
     assert frame() == pytest.approx(bare + 4.59)
     cell.nodes[2].drive.reset()
     assert frame() == bare
-    # While it is being written, and what nobody knows: it stays as it was.
+    # While it is being written, and with an unknown name: it stays as it was.
     file.write_text("plate\n")
     frame()
     for text in ("", "anvil\n"):

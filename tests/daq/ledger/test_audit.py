@@ -171,7 +171,7 @@ def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path)
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
 def test_what_killed_writers_leave_stays_and_is_reported(cuts: list[float], data: st.DataObject) -> None:
-    """Each write is cut at any byte; whoever comes next begins a line of its own, and the chain holds throughout."""
+    """Each write is cut at any byte; the next writer begins a line of its own, and the chain holds throughout."""
     with _folder() as folder:
         path = folder / "a"
         _filled(path, 1)
@@ -231,7 +231,7 @@ def test_nothing_is_appended_to_a_file_that_is_no_audit(tmp_path: Path, content:
         _filled(path, 1)
     assert path.read_bytes() == content
     assert not verify(path).holds
-    # Behind entries it is nobody's unfinished line either.
+    # After entries it is no writer's unfinished line either.
     path.unlink()
     _filled(path, 1)
     with path.open("ab") as stream:
@@ -287,7 +287,7 @@ def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     append(path, AuditAction.APPLIED, at=NOW, who="K.", subject=str(file), details={"begun": second.number})
     found = {one.begun.number: one.content for one in verify(path).open_writes}
     assert found == {1: Content.AFTER, 2: Content.OTHER}
-    (tmp_path / "y.yaml").mkdir()  # nobody can read it
+    (tmp_path / "y.yaml").mkdir()  # unreadable
     assert {one.begun.number: one.content for one in verify(path).open_writes}[2] is Content.UNKNOWN
 
 
@@ -391,7 +391,7 @@ def test_an_entry_knows_whether_it_is_its_own(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
 def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object) -> None:
-    """A chain that holds can be written by anybody."""
+    """Any program can write a chain that holds."""
     path, foreign_details = tmp_path / "a", {"sha256_before": strange, "sha256_after": strange, "begun": strange}
     for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
         append(path, action, at=NOW, who="", subject="x", details=foreign_details)

@@ -48,7 +48,7 @@ recalibration:
   runs:
     - {name: bare, plan: {seed: 1}}
     - {name: loaded, payload: disc, mass_kg: 4.59, plan: {seed: 1}}
-    - {name: unused, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
+    - {name: held-out, payload: disc, mass_kg: 4.59, plan: {seed: 3}, holdout: true}
   interlock: {file: interlock}
   mount: {command: ["true"]}
 """
@@ -431,7 +431,7 @@ def test_a_baseline_that_begins_later_than_now_is_refused(cell: Path, capsys: py
 
 
 def test_a_log_of_tomorrow_begins_its_baseline_now(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The clock of whoever recorded it was ahead."""
+    """The clock of its recorder was ahead."""
     weeks = (datetime.now(UTC) - BEGIN).days // 7 + 2
     with HistoryStore(_place(cell).store) as store:
         enter(store, calibration_of(weeks))
@@ -520,7 +520,7 @@ def test_a_broken_audit_is_reported_by_its_first_line(cell: Path, capsys: pytest
 
 
 def test_an_audit_whose_end_was_cut_off_is_noticed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A chain cannot tell that by itself: the history knows which entries there must be."""
+    """A chain cannot show that by itself: the history knows which entries there must be."""
     place = _place(cell)
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     entries = [
@@ -595,7 +595,7 @@ def _enter_write(cell: Path, digest: str, ended: AuditEntry, who: str = "anna") 
 
 
 def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """What --verify finds, in one line; empty where all is well."""
+    """Return the findings of --verify in one line; empty where all is well."""
     capsys.readouterr()
     code = main(["history", str(cell), "--verify"])
     output = " ".join(capsys.readouterr().err.split())
@@ -702,7 +702,7 @@ def test_a_row_that_was_taken_away_is_reported(cell: Path, capsys: pytest.Captur
 
 
 def test_a_write_that_another_command_entered_later_is_no_flaw(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whoever wrote was killed before the history knew; the next command says in the audit who it is."""
+    """The writer was killed before the history knew; the next command says in the audit who it is."""
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     ended = _write_down(cell, digest)
     begun, later = read(_place(cell).audit)[0], BEGIN + timedelta(hours=1)
@@ -736,7 +736,7 @@ def test_a_write_that_a_job_entered_holds_within_the_job(cell: Path, capsys: pyt
 
 
 def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`apply --drives` writes what stands there already once more, to let the drives save it."""
+    """`apply --drives` writes the values that are already there once more, to let the drives save it."""
     (digest,) = _filled(cell, 1, lambda _: FLAT)
     subject, evidence = drives_of("demo"), {"calibration": {"sha256": digest}}
     ends = []
@@ -805,12 +805,12 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
     done += [event("a", WriteAction.ROLLED_BACK, "dora")]
     assert describe_actions(entries, done, "a") == {
         "a": "restored by dora, in force",
-        "b": "applied by ben, taken back by dora",
+        "b": "applied by ben, rolled back by dora",
         "c": "applied by cem",
     }
     done += [event(None, WriteAction.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
-    assert describe_actions(entries, done, None)["c"] == "applied by cem, taken back by eva"
-    assert describe_actions(entries, done, "c")["c"] == "applied by cem, taken back by eva, in force"
+    assert describe_actions(entries, done, None)["c"] == "applied by cem, rolled back by eva"
+    assert describe_actions(entries, done, "c")["c"] == "applied by cem, rolled back by eva, in force"
 
 
 def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:

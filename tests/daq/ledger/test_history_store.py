@@ -119,7 +119,7 @@ def test_what_is_applied_and_rolled_back_is_reported(tmp_path: Path) -> None:
         in_force()
         assert back("0") is None
         in_force()
-        assert back("1") == first  # takes the rollback back
+        assert back("1") == first  # undoes the rollback
         in_force()
         store.applied(second, at=BEGIN, who="job", target="x.yaml", sha256_after="2")
         in_force()
@@ -141,7 +141,7 @@ def test_what_is_applied_and_rolled_back_is_reported(tmp_path: Path) -> None:
 
 
 def test_what_a_person_entered_between_two_writes_is_no_calibration(tmp_path: Path) -> None:
-    """The order of the writes does not tell to what a rollback leads back: the content does."""
+    """The target of a rollback follows from the content, not from the order of the writes."""
     with HistoryStore(tmp_path / "h") as store:
         first, second = (enter(store, calibration_of(week)) for week in range(2))
         store.applied(first, at=BEGIN, who="anna", target="x.yaml", sha256_after="1")
@@ -190,7 +190,7 @@ def _write_on(path: Path, week: int, written: Any, begun: Any) -> None:
 
 
 def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) -> None:
-    """What was committed is there, what was not is not, and nothing is half."""
+    """Committed entries are there, others are not, and none is half."""
     path = tmp_path / "h"
     rng = random.Random(7)
     written = FORK.RawValue("i", 0)  # without a lock, which a killed writer would keep
@@ -230,7 +230,7 @@ def _die_while_writing(path: Path) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_an_unfinished_transaction_is_taken_back_by_the_next_program_that_opens_the_file(tmp_path: Path) -> None:
+def test_an_unfinished_transaction_is_rolled_back_by_the_next_program_that_opens_the_file(tmp_path: Path) -> None:
     path = tmp_path / "h"
     with HistoryStore(path) as store:
         for week in range(30):
@@ -289,7 +289,7 @@ def test_who_waits_too_long_is_reported_by_whom(tmp_path: Path, monkeypatch: pyt
                 enter(store, calibration_of(1))
 
 
-@pytest.mark.parametrize("content", [b"not SQLite at all, and long enough to be looked at" * 100, b"\x00" * 4096, None])
+@pytest.mark.parametrize("content", [b"not SQLite at all, and long enough to be examined" * 100, b"\x00" * 4096, None])
 def test_a_foreign_file_is_refused_and_left_alone(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "h"
     if content is None:

@@ -30,7 +30,7 @@ def _said(configs: Path, text: str) -> None:
         "policy: {motion: allowed}\n",
         "policy: {apply: {max_age_days: 7, by: job, max_change: {J4: 2.0}}}\n",
         "history: {store: elsewhere.sqlite}\n",
-        "# K. has looked at it.\n",
+        "# K. has reviewed it.\n",
     ],
 )
 def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(configs: Path, afterwards: str) -> None:

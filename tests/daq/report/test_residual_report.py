@@ -292,7 +292,7 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
         (folder / name).write_text("the user's own", encoding="utf-8")
         with pytest.raises(UsageError, match=name):
             check_report(folder)
-        # Nothing of the logs is looked at: they do not exist.
+        # The logs are not read: they do not exist.
         assert main(["residual", "no.mcap", "--report", str(folder)]) == ExitCode.USAGE
         assert name in capsys.readouterr().err
         assert (folder / name).read_text(encoding="utf-8") == "the user's own"

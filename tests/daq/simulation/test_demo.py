@@ -36,7 +36,7 @@ def test_an_invalid_run_is_made_again_and_said_so(
     cell_file = checkout / "configs/cells/demo.yaml"
     plans = (Plan.__new__(Plan),) * 3
     done = demo._record_valid(
-        Settings(tmp_path, tmp_path / "unused.yaml", 1, 10.0),
+        Settings(tmp_path, tmp_path / "not-read.yaml", 1, 10.0),
         cell_file,
         load_cell(cell_file),
         plans,

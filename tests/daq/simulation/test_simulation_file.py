@@ -1,4 +1,4 @@
-"""The simulator's truth: read strictly, and by nobody who identifies."""
+"""The simulator's truth: read strictly, and never by identification."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ from tests.ident.recordings import GAINS, MOUNTED, PAYLOAD_TRUTH, record, tx40_t
 
 CREATED = datetime(2025, 1, 2, tzinfo=UTC)
 PLATE = Payload("plate", "b")
-"""The same body as the disc, of which the log says nothing: whoever finds its mass finds 4.59 kg."""
+"""The same body as the disc, of which the log says nothing: a fit that finds its mass finds 4.59 kg."""
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def test_another_weight_in_the_same_mounting_is_refused(shelf: Shelf, calibratio
     other = replace(shelf.runs["disc3"], payload=replace(MOUNTED, known={"m": 2.0}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cross_validation_module, "load_run", lambda *_: (other, shelf.cell))
-        with pytest.raises(DataUnfit, match=r"carries 2 kg .* was told 4\.59 kg"):
+        with pytest.raises(DataUnfit, match=r"carries 2 kg .* has 4\.59 kg"):
             cross_validate({"case-4": calibrations["case-4"]}, _paths("x"))
 
 

@@ -85,7 +85,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_a_controlled_way(
         return GIGABYTE if len(looks) < 4 else RESERVE_BYTES - 1
 
     rig = _rig(checkout, tmp_path, monkeypatch, filling)
-    with pytest.raises(DiskSpaceShort, match="told to stop") as caught:
+    with pytest.raises(DiskSpaceShort, match="sent a stop") as caught:
         rig.run()
     assert not getattr(caught.value, "__notes__", [])
     assert {decode(node.statusword) for node in rig.bus.nodes} <= set(POWERLESS)

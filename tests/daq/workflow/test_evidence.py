@@ -1,4 +1,4 @@
-"""What a log tells of its making: written at the recording, carried by the calibration, there for the gates."""
+"""Evidence of how a log was recorded: written at the recording, carried by the calibration, there for the gates."""
 
 from __future__ import annotations
 
@@ -108,10 +108,10 @@ def test_a_source_carries_payload_and_recording(tmp_path: Path, checkout: Path) 
 def truth_runs() -> dict[str, Run]:
     """Two runs without load, two with, one of them to be held out."""
     truth, rng = tx40_truth(), np.random.default_rng(3)
-    names = ("bare-1", "loaded-1", "bare-2", "loaded-2", "unused")
+    names = ("bare-1", "loaded-1", "bare-2", "loaded-2", "held-out")
     made = [
         invented(
-            truth, name, rng, MOUNTED if name.startswith(("loaded", "unused")) else None, noise_a=0.3, seconds=22.0
+            truth, name, rng, MOUNTED if name.startswith(("loaded", "held-out")) else None, noise_a=0.3, seconds=22.0
         )
         for name in names
     ]
@@ -132,7 +132,7 @@ def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_wor
 
     monkeypatch.setattr(fit_module, "load_run", load)
     logs = [Path(name) for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
-    found = calibration_of(fit(logs, holdout=[Path("unused")]), datetime(2025, 1, 2, tzinfo=UTC))
+    found = calibration_of(fit(logs, holdout=[Path("held-out")]), datetime(2025, 1, 2, tzinfo=UTC))
     held, nameplate = found.holdout_error_percent, found.nameplate_holdout_error_percent
     assert held is not None
     assert nameplate is not None
@@ -161,7 +161,7 @@ def with_effect(truth_runs: dict[str, Run]) -> Fit:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
         patch.setattr(fit_module, "find_effects", partial(find_effects, families=((Stribeck(0.3),),)))
-        start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("unused")])
+        start = fit([Path(name) for name in tuple(runs)[:4]], holdout=[Path("held-out")])
         found = close_loop(start, 0)
     assert [(placed.effect.name, placed.axis) for placed in _effects(found)] == [("stribeck", 1)]
     return found
@@ -172,7 +172,7 @@ def _effects(fitted: Fit) -> tuple[PlacedEffect, ...]:
 
 
 def _with_gains(fitted: Fit, factors: tuple[float, ...]) -> Calibration:
-    """What comes of other gains with all the rest refitted to them, as if they had been identified."""
+    """Return the calibration of other gains, all the rest refitted to them, as if they had been identified."""
     after = fitted.steps[-1].after
     other = estimate_with(Method.ML, after.training.system(), after.estimate.gains * np.array(factors))
     other = replace(other, gains_fixed=False, covariance=after.estimate.covariance)
@@ -216,7 +216,7 @@ def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (truth_runs[path.name], cell))
     logs, now = [Path("bare-1"), Path("loaded-1")], datetime(2025, 1, 2, tzinfo=UTC)
     assert calibration_of(fit(logs), now).nameplate_holdout_error_percent is None
-    fixed = fit(logs, holdout=[Path("unused")], gains_fixed=True)
+    fixed = fit(logs, holdout=[Path("held-out")], gains_fixed=True)
     assert calibration_of(fixed, now).nameplate_holdout_error_percent is None
 
 

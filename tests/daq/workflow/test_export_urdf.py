@@ -282,7 +282,7 @@ def test_everything_else_of_the_file_stays_byte_for_byte() -> None:
     assert text.count("\n") == text.count("\r\n")
 
     def without(document: str) -> str:
-        """What the export may change taken out, and the room around it."""
+        """Remove the parts that the export may change, and the space around them."""
         kept = re.sub(r"(?s)<!-- (format: drivegain-urdf|drivegain:).*?-->", "", document)
         kept = re.sub(r"(?s)<inertial>(?=\s*<(origin|mass)).*?</inertial>|<dynamics (?!damping=\"3\").*?/>", "", kept)
         return re.sub(r"\s+", "", kept.replace("<link name='arm'>\r\n\t</link>", "<link name='arm'/>"))

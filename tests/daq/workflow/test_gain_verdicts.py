@@ -1,4 +1,4 @@
-"""What a fit says of each gain: its own σ, by what it was seen, and moves that would help."""
+"""Verdict of a fit on each gain: its own σ, what identified it, and moves that would help."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a cell file says of a payload, and what of it a fit is told."""
+"""Parameters of a payload in a cell file, and those that a fit takes as known."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _cell(configurations: Path, payload: str) -> Cell:
 def test_a_drawing_gives_all_ten_in_the_last_joints_frame(configurations: Path) -> None:
     (disc,) = _cell(configurations, DRAWN).payloads
     assert set(disc.drawn.known) == set(LINK_PARAMETERS)
-    assert disc.payload.known == {"m": 4.59}  # what a log says, and what a fit takes unless told otherwise
+    assert disc.payload.known == {"m": 4.59}  # as in the log; a fit takes it unless given another
     x, y, z = -0.06, -0.063, 0.095
     known = disc.drawn.known
     assert (known["mx"], known["my"], known["mz"]) == pytest.approx((4.59 * x, 4.59 * y, 4.59 * z))

@@ -77,7 +77,7 @@ class Rig:
         )
 
     def profiles(self) -> list[bytes]:
-        """What the elbow was told about velocity and acceleration."""
+        """Commands to the elbow that set velocity and acceleration."""
         cob_id = 0x300 + ELBOW
         return [bytes(frame.data) for frame in self.bus.sent if frame.arbitration_id == cob_id]
 
@@ -181,7 +181,7 @@ def test_a_schedule_that_slipped_is_refused(timed: Rig) -> None:
         load_run(timed.out)
 
 
-@pytest.mark.parametrize(("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was told to send")])
+@pytest.mark.parametrize(("twice", "says"), [(0x182, "1 answers twice"), (0x482, "no axis was configured to send")])
 def test_what_the_stream_cannot_explain_makes_a_run_invalid(lockstep: Rig, twice: int, says: str) -> None:
     sent: list[int] = []
 
@@ -228,7 +228,7 @@ def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
 
 
 def test_what_is_reported_after_the_last_sample_counts_too(lockstep: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The interface's own counters are looked at five times a second, so they may tell after the last cycle."""
+    """The interface's own counters are read five times a second, so they may report losses after the last cycle."""
     bus, recv = lockstep.bus, lockstep.bus.recv
     ended_ns: list[int] = []
 

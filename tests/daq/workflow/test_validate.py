@@ -106,7 +106,7 @@ def test_a_calibration_without_its_filter_is_unreadable(spoilt: dict[str, float 
 
 @pytest.fixture
 def complete() -> Calibration:
-    """Of the demo cell, with a filter, and with parameters of no robot."""
+    """Calibration of the demo cell, with a filter, and with parameters of no robot."""
     whole: dict[str, float | list[float]] = {
         "position_cutoff_hz": 40.0,
         "position_order": 4.0,

@@ -1,4 +1,4 @@
-"""Writing back: every failure of the disk, two writers, and the way back. The gates are in test_gates.py."""
+"""Writing back: every failure of the disk, two writers, and rollback. The gates are in test_gates.py."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
 
 
 class _Failing:
-    """Stands for a system call and fails on its n-th use, when the disk is full."""
+    """Replaces a system call and fails on its n-th use, when the disk is full."""
 
     def __init__(self, call: Callable[..., object], at: int) -> None:
         self.call, self.at, self.uses = call, at, 0
@@ -266,7 +266,7 @@ def test_a_disk_that_gives_back_something_else_is_noticed(controller: Path, monk
 def test_what_a_person_saves_during_the_write_is_not_lost(
     controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: str
 ) -> None:
-    """An editor asks nobody for the lock: the last look is right before the rename."""
+    """An editor takes no lock: the last check is right before the rename."""
     proposal = _propose(demo_calibration(), controller)
     fsync, edited = os.fsync, controller.read_bytes() + b"# by hand\n"
 
@@ -339,7 +339,7 @@ def _make_backup(controller: Path, was: bytes, after_digest: bytes, stamp: str =
 def test_without_a_backup_there_is_nothing_to_roll_back(controller: Path) -> None:
     with pytest.raises(CalibrationRefused, match="no backup beside it"):
         rollback(FileTarget(controller), NOW)
-    # What a writer leaves that was killed before it replaced the file is no way back either.
+    # A backup of a writer that was killed before it replaced the file does not allow a rollback either.
     _make_backup(controller, controller.read_bytes(), b"never written")
     with pytest.raises(CalibrationRefused, match="same content"):
         rollback(FileTarget(controller), NOW)

@@ -50,7 +50,7 @@ _elsewhere = st.sampled_from(
 
 @dataclass(frozen=True)
 class _Case:
-    """A generated file: its text cut where the numbers meant stand, and their keys in that order."""
+    """A generated file: its text cut where the numbers meant are, and their keys in that order."""
 
     pieces: tuple[str, ...]
     numbers: tuple[str, ...]
@@ -114,7 +114,7 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
 
 
 def _of_axes(gains: tuple[Gain, ...]) -> Calibration:
-    """The demo calibration with other gains, and what it tells of each axis for as many."""
+    """The demo calibration with other gains, and its facts on each axis for as many."""
     count, demo = len(gains), demo_calibration()
 
     def first(error: RelativeError | None) -> RelativeError | None:
@@ -135,7 +135,7 @@ def _of_axes(gains: tuple[Gain, ...]) -> Calibration:
 @settings(max_examples=500, deadline=None)
 @given(_cases(), st.data())
 def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, data: st.DataObject) -> None:
-    """The whole way, with lock, audit, backup and rename; and the bytes that stand there afterwards."""
+    """The whole way, with lock, audit, backup and rename; and the bytes in the file afterwards."""
     axes = [f"J{number + 1}" for number in range(len(case.keys))]
     olds = [float(number) for number in case.numbers]
     shares = data.draw(st.lists(st.floats(0.7, 1.3), min_size=len(axes), max_size=len(axes)))

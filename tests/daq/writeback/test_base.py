@@ -47,10 +47,10 @@ def test_the_whole_digest_alone_names_no_change() -> None:
     assert parse_base(None, b"old") == ReviewedChange(None, None)
 
 
-@pytest.mark.parametrize("told", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
-def test_what_is_no_digest_is_refused(told: str) -> None:
+@pytest.mark.parametrize("text", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])
+def test_what_is_no_digest_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="12 digits, a hyphen, 12 digits"):
-        parse_base(told, b"old")
+        parse_base(text, b"old")
 
 
 @pytest.fixture

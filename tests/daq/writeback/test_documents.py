@@ -33,7 +33,7 @@ _words = st.text("abcdefghijklmnopqrstuvwxyzéß漢", min_size=1, max_size=5)
 
 @dataclass(frozen=True)
 class _Case:
-    """A generated file: its text cut where the numbers meant stand, their keys, and how it is encoded."""
+    """A generated file: its text cut where the numbers meant are, their keys, and how it is encoded."""
 
     pieces: tuple[str, ...]
     numbers: tuple[str, ...]
@@ -45,7 +45,7 @@ class _Case:
 
 
 _HOLE = "\0"
-"""Stands for a number meant while a file is made."""
+"""Placeholder of a number meant while a file is made."""
 
 
 def _case(text: str, numbers: list[str], keys: list[str], encoding: str = "utf-8") -> _Case:

@@ -159,7 +159,7 @@ def test_written_to_ram_alone_is_gone_with_the_power(address: BusAddress, tmp_pa
         assert not any(change.saved for change in written.parameters)
         assert _gains(simulation) == NEW
         assert _saved(simulation) == IN_DRIVES
-        # What stands in RAM is no reason not to save it the next time.
+        # A value in RAM is no reason not to save it the next time.
         assert all(change.saved for change in _write(demo_cell(tmp_path), address).parameters)
         assert _saved(simulation) == NEW
 
@@ -528,7 +528,7 @@ def test_a_rollback_that_would_lose_what_someone_did_is_refused(address: BusAddr
 
 
 def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(address: BusAddress, tmp_path: Path) -> None:
-    """The newest record says what drivegain left there: that, or what stood there before, is no surprise."""
+    """The newest record holds the value that drivegain left there: that, or the one before it, is no surprise."""
     cell = demo_cell(tmp_path)
     entry = ObjectEntry(0x2003, 1, 32, signed=True)
     with simulated(address), network_of(cell, address) as network:

@@ -126,7 +126,7 @@ def _nameplate(axis: str, nameplate: float) -> Callable[[Scene], Scene]:
 
 
 def _payload(**changes: object) -> Callable[[Scene], Scene]:
-    """Another disc in the cell file now, which somebody has looked at: every digest is right."""
+    """Another disc in the cell file now, which has been reviewed: every digest is right."""
 
     def broken(scene: Scene) -> Scene:
         payloads = (replace(one, **changes) for one in scene.cell.payloads)  # type: ignore[arg-type]
@@ -328,7 +328,7 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.SOURCES, "calibration", _calibration(sources=())),
     (Gate.SOURCES, "log loaded", _source(1, sha256="")),
     (Gate.SOURCES, "log run.mcap.part", _source(0, name="run.mcap.part")),
-    (Gate.SOURCES, "log unused", _source(2, recording=None)),
+    (Gate.SOURCES, "log held-out", _source(2, recording=None)),
     (Gate.SOURCES, "log loaded", _source(1, serials=())),
     (Gate.SOURCES, "log loaded", _source(1, serials=tuple(range(1001, 1006)))),
     (Gate.SOURCES, "log loaded", _source(1, saturated_percent=())),
@@ -336,7 +336,7 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.SOURCES, "log loaded", _source(1, missing=())),
     (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0, 0.0, -0.1, 0.0, 0.0, 0.0))),
     (Gate.SOURCES, "log loaded", _source(1, saturated_percent=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0))),
-    (Gate.SOURCES, "log unused", _source(2, sha256="b" * 64)),
+    (Gate.SOURCES, "log held-out", _source(2, sha256="b" * 64)),
     (Gate.SOURCES, "log loaded", _source(1, sha256="a" * 64)),
     (Gate.SOURCES, "log other", _both(_doubled, _source(3, name="other", sha256="e" * 64, role="train"))),
     (Gate.SOURCES, "calibration", _both(_bare, _only(0, 1))),
@@ -345,7 +345,7 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.PARTIAL, "log loaded", _source(1, partial=True)),
     (Gate.PARTIAL, "log loaded", _source(1, partial=True, missing=(0, 3, 0, 0, 0, 0))),
     (Gate.LOSSY, "log loaded", _source(1, lost_cycles=1)),
-    (Gate.LOSSY, "log unused", _source(2, missing=(0, 3, 0, 0, 0, 0))),
+    (Gate.LOSSY, "log held-out", _source(2, missing=(0, 3, 0, 0, 0, 0))),
     (Gate.STALE, "log unloaded", _source(0, recorded_s=(NOW - 30.1 * DAY).timestamp())),
     (Gate.STALE, "log unloaded", _source(0, recorded_s=(NOW + 1.1 * DAY).timestamp())),
     (Gate.STALE, "log unloaded", _source(0, recorded_s=None)),
@@ -362,7 +362,7 @@ CLOSED: tuple[tuple[Gate, str, Callable[[Scene], Scene]], ...] = (
     (Gate.MASS, "log loaded, payload disc", _source(1, mass_kg=None)),
     (Gate.MASS, "payload disc", _scene(entered_kg={"disc": 4.58})),
     (Gate.MASS, "log unloaded", _source(0, mass_kg=4.59)),
-    (Gate.MASS, "log unused", _source(2, payload=None)),
+    (Gate.MASS, "log held-out", _source(2, payload=None)),
     (Gate.MASS, "payload disc", _payload(mass_kg=4.60)),
     (Gate.MASS, "payload disc", _payload(name="other disc")),
     (Gate.BASE, "demo.yaml", _edited),
@@ -491,7 +491,7 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "wanted"),
+    ("section", "wanted"),
     [
         ({}, False),
         ({"holdout": "required"}, True),
@@ -499,9 +499,9 @@ def test_the_policy_moves_the_bounds(scene: Scene) -> None:
         ({"by": "job", "holdout": "required"}, True),
     ],
 )
-def test_a_job_that_applies_by_itself_wants_a_hold_out(told: dict[str, str], wanted: bool) -> None:
-    policy = PolicyModel.model_validate_json(json.dumps({"apply": told})).apply
-    assert (policy.requires_holdout, policy.by) == (wanted, AppliedBy(told.get("by", "person")))
+def test_a_job_that_applies_by_itself_wants_a_hold_out(section: dict[str, str], wanted: bool) -> None:
+    policy = PolicyModel.model_validate_json(json.dumps({"apply": section})).apply
+    assert (policy.requires_holdout, policy.by) == (wanted, AppliedBy(section.get("by", "person")))
     with pytest.raises(ValueError, match="holdout: required"):
         PolicyModel.model_validate_json('{"apply": {"by": "job", "holdout": "optional"}}')
 

@@ -1,4 +1,4 @@
-"""Kill -9 at every system call of the write path: the old file or the new one, whole, and the audit tells which."""
+"""Kill -9 at every system call of the write path: the old file or the new one, whole, and the audit says which."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OLD = b"# K. has weighed it.\ndrives:\n  J1: {gain: 32.96, kp: 120.0}   # Nm/A\n
 KEYS = {"J1": "drives.J1.gain"}
 MIN_CALLS = 50
 LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.yaml\..*\.tmp")
-"""What may lie about: the files themselves, whole backups, the lock that nobody holds, and unfinished copies."""
+"""Files that may remain: the files themselves, whole backups, the lock file without a holder, unfinished copies."""
 
 
 def _calibration(gain: float) -> Calibration:
@@ -71,11 +71,11 @@ class Place:
         return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
 
     def to_roll_back(self) -> Callable[[], object]:
-        """The way back from a write before."""
+        """Return the rollback of an earlier write."""
         return lambda: rollback(FileTarget(self.file), NOW + timedelta(minutes=1), audit=self.audit, who="Bob")
 
     def content(self) -> bytes | None:
-        """Of the file; None where it is gone."""
+        """Content of the file; None where it is gone."""
         return self.file.read_bytes() if self.file.exists() else None
 
     def kinds_left(self) -> set[str]:
@@ -90,7 +90,7 @@ def _unflushed(_descriptor: int) -> None:
 
 
 def _fresh(folder: Path) -> Place:
-    """Nobody has written there yet, and there is no audit."""
+    """A place without a write so far, and without an audit."""
     folder.mkdir()
     place = Place(folder)
     place.file.write_bytes(OLD)
@@ -172,7 +172,7 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
         print(f"\n  killed at each of {number - 1} system calls: {reported}; left behind: {', '.join(sorted(left))}")  # noqa: T201
     assert number > MIN_CALLS
     assert set(outcomes) == {Content.BEFORE, Content.AFTER}
-    # Otherwise nobody was killed half-way.
+    # Otherwise no writer was killed half-way.
     assert {"lock", "tmp"} <= left
 
 
@@ -203,7 +203,7 @@ def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
 
 
 def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -> None:
-    """Whoever comes next is not hindered, and the audit still tells what the killed one has done."""
+    """The next writer is not hindered, and the audit still records what the killed one has done."""
     was = place.content()
     reported = [one.content for one in verify(place.audit).open_writes]
     if was is None:

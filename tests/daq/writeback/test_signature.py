@@ -131,7 +131,7 @@ def test_a_signature_beside_the_file_is_found(calibration: Path) -> None:
 def test_an_untrusted_signer_is_not_considered(calibration: Path) -> None:
     secret, _ = generate(calibration.parent, "mallory")
     sign(calibration, secret, "mallory", at=NOW)
-    signature_path(calibration, "somebody").write_text("nonsense")
+    signature_path(calibration, "someone").write_text("nonsense")
     _, public = generate(calibration.parent, "anna")
     assert signers_of(calibration, {"anna": public.line}) == ()
 
@@ -149,7 +149,7 @@ def test_every_changed_bit_of_the_content_is_noticed(place: int, bit: int) -> No
 @settings(max_examples=200, deadline=None)
 @given(place=st.integers(0, len(SIGNATURE) - 1), letter=st.characters(min_codepoint=1, max_codepoint=0x17F))
 def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int, letter: str) -> None:
-    """Behind "untrusted comment: " anything may stand; the last letters of a base64 text have bits that say nothing."""
+    """Behind "untrusted comment: " any text is allowed; the last letters of a base64 text have meaningless bits."""
     changed = SIGNATURE[:place] + letter + SIGNATURE[place + 1 :]
     public = minisign.parse_public_key(PUBLIC)
     try:
@@ -279,7 +279,7 @@ def test_a_name_is_part_of_a_file_name(calibration: Path, name: str) -> None:
 
 def test_whatever_is_not_there_or_in_the_way_is_reported(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna")
-    for absent in (calibration.parent / "nobody.key", secret.with_suffix(".pub")):
+    for absent in (calibration.parent / "missing.key", secret.with_suffix(".pub")):
         with pytest.raises(UsageError, match="a secret key of"):
             sign(calibration, absent, "anna")
     with pytest.raises(CalibrationMissing):

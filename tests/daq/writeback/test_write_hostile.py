@@ -1,4 +1,4 @@
-"""Files that are no files: links, loops, pipes, devices. A clear word for each, and nobody waits."""
+"""Files that are no files: links, loops, pipes, devices. A clear message for each, and no waiting."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controlle
     controller.parent.chmod(0o777)
     with pytest.raises(ControllerUnfit, match="everybody may write"):
         propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
-    # Whoever names the file itself has chosen it.
+    # An operator who names the file itself has chosen it.
     assert propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)).refusals == ()
     controller.parent.chmod(0o755)
     assert propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)).refusals == ()
@@ -111,7 +111,7 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
 
 
 def test_a_file_of_two_names_is_not_written_under_one_of_them(controller: Path, tmp_path: Path) -> None:
-    """The other name would keep the old gains, and whoever reads it would not know."""
+    """The other name would keep the old gains, and its readers would not know."""
     other = tmp_path / "plc's.yaml"
     other.hardlink_to(controller)
     for name in (controller, other):

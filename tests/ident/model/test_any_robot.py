@@ -190,11 +190,11 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(kind: Kind, da
 def test_the_mounting_must_be_declared(kind: Kind) -> None:
     """Data of a leaning robot, fitted as an upright one: the residual shows it."""
     leaning, _, _ = _truth(kind.urdf, LEANING)
-    standing, _, _ = _truth(kind.urdf, UPRIGHT)
+    upright, _, _ = _truth(kind.urdf, UPRIGHT)
     bare = _runs(kind.urdf, LEANING)[:1]
     right, wrong = (
         identify(model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains).training_error.total
-        for model in (leaning, standing)
+        for model in (leaning, upright)
     )
     assert right < 1e-4
     # The offsets of prismatic axes take most of a wrong weight: 1.1 % on the gantry, above 40 % on the arms.

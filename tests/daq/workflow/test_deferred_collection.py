@@ -1,4 +1,4 @@
-"""Not everything is searched while SYNC must go out in time; what is made meanwhile is."""
+"""No full collection runs while SYNC must go out in time; young objects are still collected."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from daq.workflow.safeguards import defer_full_gc
 
 
 class Ring:
-    """Garbage that only a search finds."""
+    """A reference cycle, which only a collection frees."""
 
     def __init__(self) -> None:
         self.itself = self
 
 
-def test_everything_is_searched_by_no_one_and_what_is_made_meanwhile_by_all() -> None:
-    searched: list[int] = []
+def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
+    collected: list[int] = []
 
     def note(phase: str, reported: dict[str, int]) -> None:
         if phase == "start":
-            searched.append(reported["generation"])
+            collected.append(reported["generation"])
 
     gc.collect()
     gc.callbacks.append(note)
@@ -31,10 +31,10 @@ def test_everything_is_searched_by_no_one_and_what_is_made_meanwhile_by_all() ->
             fresh = weakref.ref(Ring())
             kept = [[number] for number in range(4 * len(gc.get_objects()))]
         assert fresh() is None
-        assert 2 not in searched
-        assert {0, 1} <= set(searched)
-        kept += [[number] for number in range(len(kept))]  # the same outside has everything searched
-        assert 2 in searched
+        assert 2 not in collected
+        assert {0, 1} <= set(collected)
+        kept += [[number] for number in range(len(kept))]  # outside the block the same causes a full collection
+        assert 2 in collected
     finally:
         gc.callbacks.remove(note)
 
