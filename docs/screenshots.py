@@ -84,7 +84,7 @@ def _short_diff(lines: list[str]) -> list[str]:
 def _report(folder: Path, demo: Path) -> None:
     """The first two pages of report.html, side by side."""
     logs = [str(demo / f"{name}.mcap") for name in ("bare-1", "loaded-1", "bare-2", "loaded-2")]
-    holdout = str(demo / "unused.mcap")
+    holdout = str(demo / "held-out.mcap")
     _run(["residual", *logs, "--holdout", holdout, "--out", "found.yaml", "--report", "report"], folder)
     python = REPORT_VENV / "bin" / "python"
     if not python.exists():

@@ -205,4 +205,4 @@ def save_pictures(fitted: Fit, calibration: Calibration, folder: Path) -> None:
         draw_fit(fitted, calibration, None, folder)
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout unused.mcap --out calibration.yaml")
+FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")

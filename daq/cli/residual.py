@@ -113,5 +113,5 @@ def check_report(folder: Path | None) -> None:
 RESIDUAL = Verb(
     "residual",
     residual_verb,
-    "drivegain residual bare.mcap loaded.mcap --holdout unused.mcap --out calibration.yaml --report report",
+    "drivegain residual bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
 )

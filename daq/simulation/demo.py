@@ -44,7 +44,7 @@ RUNS = (
     ("loaded-1", "disc", "a"),
     ("bare-2", None, "b"),
     ("loaded-2", "disc", "b"),
-    ("unused", "disc", "c"),
+    ("held-out", "disc", "c"),
 )
 """Name, payload and plan of each run; bare and loaded in turn, so that warm-up is no payload. The last is held out."""
 

@@ -125,7 +125,7 @@ def test_validate_measures_the_calibration_on_the_holdout_run(
 ) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
     capsys.readouterr()
-    calibration, held_out = demonstration / "calibration.yaml", demonstration / "unused.mcap"
+    calibration, held_out = demonstration / "calibration.yaml", demonstration / "held-out.mcap"
     assert main(["validate", str(calibration), str(held_out), "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
     assert found["logs"][0]["relative_error_percent"]["total"] == pytest.approx(
