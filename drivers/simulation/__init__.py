@@ -1,1 +1,1 @@
-"""A simulated cell of CiA 402 amplifiers that answers on a real bus."""
+"""Simulated cell of CiA 402 amplifiers that answers on a real CAN bus."""

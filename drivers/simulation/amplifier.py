@@ -1,4 +1,4 @@
-"""The control loops of a set of amplifiers: set-point, position and velocity loop, limits, monitoring."""
+"""Control loops of a set of amplifiers: tuning, set-point, position and velocity loop, limits, monitoring."""
 
 from __future__ import annotations
 
@@ -14,141 +14,22 @@ from drivers.simulation.friction import compiled
 from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec
 
-# How the loops of a simulated amplifier are tuned: one rule from what the motor turns, for any robot.
-
+FloatArray = NDArray[np.float64]
 
 VELOCITY_BANDWIDTH_RAD_S = 220.0
-"""Of the closed velocity loop at the tuned inertia; low enough for a few-fold lighter axis to stay stable at 4 kHz."""
+"""Bandwidth of the closed velocity loop at the tuned inertia; an axis a few times lighter is still stable."""
 
 POSITION_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 4.0
 INTEGRAL_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 5.0
 
 VELOCITY_FILTER_S = 0.0008
-"""Of the differenced encoder: one count a substep is a coarse velocity."""
+"""Time constant of the velocity filter: one encoder count a substep is a coarse velocity."""
 
 POSTURES = 3
-"""Positions tried for each joint."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoopTuning:
-    """Of the loops of n axes, in the drives' own units (motor counts and ampere).
-
-    Attributes:
-        counts_per_rad: motor counts per radian of the rotor, shape (n,).
-        inertia_a_s2: current per motor acceleration [A per count/s²], signed as the axis is wired, shape (n,).
-        position_1_s, velocity_1_s, integral_1_s: loop bandwidths.
-        filter_s: time constant of the velocity filter.
-    """
-
-    counts_per_rad: FloatArray
-    inertia_a_s2: FloatArray
-    position_1_s: float = POSITION_BANDWIDTH_RAD_S
-    velocity_1_s: float = VELOCITY_BANDWIDTH_RAD_S
-    integral_1_s: float = INTEGRAL_BANDWIDTH_RAD_S
-    filter_s: float = VELOCITY_FILTER_S
-
-
-def tuned(spec: CellSpec, plant: Plant) -> LoopTuning:
-    """Tune to the geometric mean of the smallest and largest inertia that each motor meets over the postures.
-
-    Args:
-        spec: the cell.
-        plant: of that cell, for its inertias.
-    """
-    counts_per_rad = np.array([axis.counts_per_revolution for axis in spec.axes]) / (2.0 * np.pi)
-    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
-    swept = range(1, min(len(spec.axes), 7))
-    tried = plant.postures(spec.start_rad, POSTURES)
-    inertias = []
-    for posture in itertools.product(*(tried[joint] for joint in swept)):
-        position = spec.start_rad.copy()
-        position[list(swept)] = posture
-        inertias.append(plant.motor_inertia_at(position))
-    inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
-    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
-    # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring together.
-    return LoopTuning(counts_per_rad, inertia / (gain * reduction(spec.ratio) * counts_per_rad))
-
-
-# The set-point of profile position mode: a trapezoid of velocity from wherever the axis is (CiA 402-2).
-
+"""Positions tried for each joint in tuning."""
 
 SEGMENTS = 4
-"""A stop, an acceleration, a cruise and a deceleration are the most that one move needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class ProfileMove:
-    """Pieces of constant acceleration, in the drive's units.
-
-    Attributes:
-        duration_s: of each piece, SEGMENTS long; unused ones are zero.
-        acceleration: in each piece [counts/s²], signed.
-        target: where the move ends [counts].
-    """
-
-    duration_s: tuple[float, ...]
-    acceleration: tuple[float, ...]
-    target: float
-
-
-def plan(
-    start: float, velocity: float, target: float, speed: float, acceleration: float, deceleration: float
-) -> ProfileMove:
-    """The fastest trapezoid to a target.
-
-    Args:
-        start: position set-point [counts].
-        velocity: of the set-point, signed [counts/s].
-        target: [counts].
-        speed, acceleration, deceleration: profile velocity 6081h, 6083h and 6084h, all positive.
-    """
-    pieces: list[tuple[float, float]] = []
-    if velocity != 0.0:
-        stop_s = abs(velocity) / deceleration
-        stop = start + 0.5 * velocity * stop_s
-        if velocity * (target - stop) < 0.0:
-            # It cannot stop before the target, or runs the other way: stop, then go back from rest.
-            pieces.append((stop_s, math.copysign(deceleration, -velocity)))
-            start, velocity = stop, 0.0
-    sign = math.copysign(1.0, target - start)
-    distance, moving = abs(target - start), abs(velocity)
-    if moving > speed:
-        slow_s = (moving - speed) / deceleration
-        pieces.append((slow_s, -sign * deceleration))
-        distance -= 0.5 * (moving + speed) * slow_s
-        moving = speed
-    # Distance of accelerating from `moving` to the peak p and stopping: (p² − moving²) / 2a + p² / 2d.
-    peak_squared = (2.0 * distance + moving**2 / acceleration) / (1.0 / acceleration + 1.0 / deceleration)
-    peak = max(moving, min(speed, math.sqrt(max(peak_squared, 0.0))))
-    pieces.append(((peak - moving) / acceleration, sign * acceleration))
-    ramps = (peak**2 - moving**2) / (2.0 * acceleration) + peak**2 / (2.0 * deceleration)
-    if peak > 0.0:
-        pieces.append((max(distance - ramps, 0.0) / peak, 0.0))
-        pieces.append((peak / deceleration, -sign * deceleration))
-    return _padded(pieces, target)
-
-
-def ramp_down(start: float, velocity: float, deceleration: float) -> ProfileMove:
-    """Stop on a ramp.
-
-    Args:
-        start: position set-point [counts].
-        velocity: of the set-point, signed [counts/s].
-        deceleration: positive [counts/s²].
-    """
-    stop_s = abs(velocity) / deceleration
-    return _padded([(stop_s, math.copysign(deceleration, -velocity))], start + 0.5 * velocity * stop_s)
-
-
-def _padded(pieces: list[tuple[float, float]], target: float) -> ProfileMove:
-    used = [piece for piece in pieces if piece[0] > 0.0]
-    used += [(0.0, 0.0)] * (SEGMENTS - len(used))
-    return ProfileMove(tuple(p[0] for p in used), tuple(p[1] for p in used), target)
-
-
-FloatArray = NDArray[np.float64]
+"""Largest number of pieces of one move: stop, acceleration, cruise, deceleration."""
 
 LOOP = np.dtype(
     [
@@ -177,7 +58,7 @@ LOOP = np.dtype(
         ("current_a", "f8"),
         ("error_for_s", "f8"),
         ("inside_for_s", "f8"),
-        # what the drive tells; limited is kept for a whole sample period
+        # status bits; limited is kept for a whole sample period
         ("reached", "i8"),
         ("limited", "i8"),
         ("following_error", "i8"),
@@ -185,6 +66,94 @@ LOOP = np.dtype(
     align=True,
 )
 """One record an axis; positions in motor counts, velocities in counts/s, accelerations in counts/s²."""
+
+
+def counts_per_rad(spec: CellSpec) -> FloatArray:
+    """Return the encoder counts per radian of each rotor, shape (n,)."""
+    return np.array([axis.counts_per_revolution for axis in spec.axes]) / (2.0 * np.pi)
+
+
+def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
+    """Return the current per motor acceleration [A per count/s²] to which the loops are tuned, shape (n,).
+
+    It is the geometric mean of the smallest and largest inertia that each motor meets over the postures, signed as the
+    axis is wired.
+    """
+    # The first joint's position changes no inertia; of long chains the joints behind the seventh stay where they are.
+    swept = range(1, min(len(spec.axes), 7))
+    tried = plant.postures(spec.start_rad, POSTURES)
+    inertias = []
+    for posture in itertools.product(*(tried[joint] for joint in swept)):
+        position = spec.start_rad.copy()
+        position[list(swept)] = posture
+        inertias.append(plant.motor_inertia_at(position))
+    inertia = np.sqrt(np.min(inertias, axis=0) * np.max(inertias, axis=0))
+    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    # Joint-side rad/s² of a motor is its own over N; g/N keeps the sign of gear and wiring together.
+    return np.asarray(inertia / (gain * reduction(spec.ratio) * counts_per_rad(spec)))
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileMove:
+    """Set-point of profile position mode: SEGMENTS pieces of constant acceleration.
+
+    Attributes:
+        duration_s: of each piece; zero for a piece that is not needed.
+        acceleration: in each piece [counts/s²], signed.
+        target: end of the move [counts].
+    """
+
+    duration_s: tuple[float, ...]
+    acceleration: tuple[float, ...]
+    target: float
+
+
+def plan(
+    start: float, velocity: float, target: float, speed: float, acceleration: float, deceleration: float
+) -> ProfileMove:
+    """Return the fastest velocity trapezoid from a moving set-point to a target (CiA 402-2).
+
+    Args:
+        start, velocity: position [counts] and signed velocity [counts/s] of the set-point.
+        target: [counts].
+        speed, acceleration, deceleration: objects 6081h, 6083h and 6084h, all positive.
+    """
+    pieces: list[tuple[float, float]] = []
+    if velocity != 0.0:
+        stop_s = abs(velocity) / deceleration
+        stop = start + 0.5 * velocity * stop_s
+        if velocity * (target - stop) < 0.0:
+            # It cannot stop before the target, or runs the other way: stop, then go back from rest.
+            pieces.append((stop_s, math.copysign(deceleration, -velocity)))
+            start, velocity = stop, 0.0
+    sign = math.copysign(1.0, target - start)
+    distance, moving = abs(target - start), abs(velocity)
+    if moving > speed:
+        slow_s = (moving - speed) / deceleration
+        pieces.append((slow_s, -sign * deceleration))
+        distance -= 0.5 * (moving + speed) * slow_s
+        moving = speed
+    # Distance of accelerating from `moving` to the peak p and stopping: (p² − moving²) / 2a + p² / 2d.
+    peak_squared = (2.0 * distance + moving**2 / acceleration) / (1.0 / acceleration + 1.0 / deceleration)
+    peak = max(moving, min(speed, math.sqrt(max(peak_squared, 0.0))))
+    pieces.append(((peak - moving) / acceleration, sign * acceleration))
+    ramps = (peak**2 - moving**2) / (2.0 * acceleration) + peak**2 / (2.0 * deceleration)
+    if peak > 0.0:
+        pieces.append((max(distance - ramps, 0.0) / peak, 0.0))
+        pieces.append((peak / deceleration, -sign * deceleration))
+    return _padded(pieces, target)
+
+
+def ramp_down(start: float, velocity: float, deceleration: float) -> ProfileMove:
+    """Return the move that stops a set-point on a ramp."""
+    stop_s = abs(velocity) / deceleration
+    return _padded([(stop_s, math.copysign(deceleration, -velocity))], start + 0.5 * velocity * stop_s)
+
+
+def _padded(pieces: list[tuple[float, float]], target: float) -> ProfileMove:
+    used = [piece for piece in pieces if piece[0] > 0.0]
+    used += [(0.0, 0.0)] * (SEGMENTS - len(used))
+    return ProfileMove(tuple(p[0] for p in used), tuple(p[1] for p in used), target)
 
 
 @compiled
@@ -196,7 +165,7 @@ def control(
     counts_per_rad: FloatArray,
     step_s: float,
 ) -> None:
-    """One substep of every axis: read the encoder, move the set-point on, compute the current for the next substep.
+    """Run one substep of every axis: read the encoder, move the set-point, compute the current for the next substep.
 
     Args:
         loops: LOOP records, changed in place, shape (n,).
@@ -224,7 +193,7 @@ def control(
 
 @compiled
 def _move_demand(axis: np.void, piece_s: FloatArray, piece_acceleration: FloatArray, step_s: float) -> None:
-    """The set-point is piecewise quadratic and followed exactly, also where a piece ends inside the substep."""
+    """Move the piecewise quadratic set-point, exactly also where a piece ends inside the substep."""
     left = step_s
     while left > 0.0 and axis["piece"] < len(piece_s):
         k = axis["piece"]
@@ -246,7 +215,7 @@ def _move_demand(axis: np.void, piece_s: FloatArray, piece_acceleration: FloatAr
 
 @compiled
 def _follow(axis: np.void, error: float, step_s: float) -> None:
-    """Position P over velocity PI, with velocity and acceleration feed-forward; the error in counts."""
+    """Control the position (P over velocity PI, velocity and acceleration feed-forward); the error in counts."""
     wanted = axis["demand_velocity"] + axis["position_1_s"] * error
     velocity_error = wanted - axis["velocity"]
     wanted_acceleration = axis["velocity_1_s"] * velocity_error + axis["demand_acceleration"]
@@ -257,7 +226,7 @@ def _follow(axis: np.void, error: float, step_s: float) -> None:
     if limited:
         axis["limited"] = 1
         current = limit if current > 0.0 else -limit
-    # No wind-up: at the limit the integral may only come back.
+    # No wind-up: at the limit the integral may only shrink.
     if not limited or push * current < 0.0:
         axis["integral_a"] += push
     axis["current_a"] = current
@@ -265,7 +234,7 @@ def _follow(axis: np.void, error: float, step_s: float) -> None:
 
 @compiled
 def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
-    """Following error window (6065h, 6066h) and target window (6067h, 6068h); the error in counts."""
+    """Monitor the following error (6065h, 6066h) and target window (6067h, 6068h); the error in counts."""
     if abs(error) > axis["error_window"]:
         axis["error_for_s"] += step_s
         if axis["error_for_s"] >= axis["error_time_s"]:
@@ -282,33 +251,33 @@ def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
 
 
 class AmplifierSet:
-    """The loops of the n amplifiers of one cell, and what they measure of themselves.
+    """Loops of the n amplifiers of one cell, and the currents that they report.
 
     Attributes:
         loops: LOOP records, shape (n,).
-        reported_a: current reference that 6074h tells, with its noise [A], shape (n,); renewed once a SYNC.
+        reported_a: current reference with its noise, as in 6074h [A], shape (n,); renewed once a SYNC.
         actual_a: current of the motor at the same moment [A], shape (n,).
     """
 
-    def __init__(self, spec: CellSpec, tuning: LoopTuning, lags: tuple[Lag, ...]) -> None:
+    def __init__(self, spec: CellSpec, inertia_a_s2: FloatArray, lags: tuple[Lag, ...]) -> None:
         n = len(spec.axes)
         period_s = spec.sync_period_us * 1e-6
         self.step_s = period_s / spec.substeps
         self.loops: NDArray[np.void] = np.zeros(n, dtype=LOOP)
-        self.loops["inertia_a_s2"] = tuning.inertia_a_s2
-        self.loops["position_1_s"] = tuning.position_1_s
-        self.loops["velocity_1_s"] = tuning.velocity_1_s
-        self.loops["integral_1_s"] = tuning.integral_1_s
-        self.loops["filter"] = -np.expm1(-self.step_s / tuning.filter_s)
+        self.loops["inertia_a_s2"] = inertia_a_s2
+        self.loops["position_1_s"] = POSITION_BANDWIDTH_RAD_S
+        self.loops["velocity_1_s"] = VELOCITY_BANDWIDTH_RAD_S
+        self.loops["integral_1_s"] = INTEGRAL_BANDWIDTH_RAD_S
+        self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
         self.reported_a = np.zeros(n)
         self.actual_a = np.zeros(n)
-        self._counts_per_rad = tuning.counts_per_rad
+        self._counts_per_rad = counts_per_rad(spec)
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
         self._lags = lags
         self._lagged_a = np.zeros(n)
-        # Every axis has a random stream of its own: another axis' noise level or presence does not change it.
+        # A random stream for each axis: its noise does not depend on the other axes.
         self._random = [np.random.default_rng(np.random.SeedSequence(spec.seed, spawn_key=(i,))) for i in range(n)]
         sigma = np.array([axis.current_noise_a for axis in spec.axes])
         tau = np.array([axis.noise_correlation_s for axis in spec.axes])
@@ -320,13 +289,13 @@ class AmplifierSet:
         self._used = 0
 
     def prime(self, motor_rad: FloatArray) -> None:
-        """Take the encoders' first reading at power-on, so that the position of a resting axis is no jump."""
+        """Read the encoders at power-on, so that the position of a resting axis does not jump."""
         self.loops["counts"] = np.rint(motor_rad * self._counts_per_rad)
         self.loops["demand"] = self.loops["counts"]
         self.loops["target"] = self.loops["counts"]
 
     def control(self, motor_rad: FloatArray) -> None:
-        """One substep; the currents for the next one are then in ``loops["current_a"]``."""
+        """Run one substep; ``loops["current_a"]`` then holds the currents for the next one."""
         control(self.loops, self._piece_s, self._piece_acceleration, motor_rad, self._counts_per_rad, self.step_s)
         if self._lags:
             self._lagged_a[:] = self.loops["current_a"]
@@ -334,7 +303,7 @@ class AmplifierSet:
                 lag.report(self._lagged_a, self.step_s)
 
     def report(self) -> None:
-        """Renew the reported currents; once a SYNC."""
+        """Renew the reported currents, once a SYNC."""
         self.actual_a[:] = self.loops["current_a"]
         if self._used == len(self._block):
             self._block = np.stack([stream.standard_normal(1024) for stream in self._random], axis=1)
@@ -345,7 +314,7 @@ class AmplifierSet:
         np.add(self._lagged_a if self._lags else self.loops["current_a"], self._noise_a, out=self.reported_a)
 
     def enable(self, index: int, on: bool) -> None:
-        """Switch the power stage; the set-point then holds where the axis is."""
+        """Switch the power stage on or off; the set-point then holds the present position."""
         axis = self.loops[index]
         axis["enabled"] = int(on)
         axis["reached"] = 0
@@ -368,10 +337,10 @@ class AmplifierSet:
         axis["inside_for_s"] = 0.0
 
     def stop(self, index: int, deceleration: float) -> None:
-        """Slow down to a stop [counts/s²]."""
+        """Stop with a deceleration [counts/s²]."""
         axis = self.loops[index]
         self.move(index, ramp_down(float(axis["demand"]), float(axis["demand_velocity"]), deceleration))
 
     def moving(self, index: int) -> bool:
-        """Whether the set-point still moves."""
+        """Return whether the set-point still moves."""
         return bool(self.loops[index]["piece"] < SEGMENTS)

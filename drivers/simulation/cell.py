@@ -1,4 +1,4 @@
-"""A whole simulated cell on a CAN bus, or on several: n nodes and one plant that advance in lockstep with SYNC."""
+"""Simulated cell on one or several CAN buses: n nodes and one plant that advance in lockstep with SYNC."""
 
 from __future__ import annotations
 
@@ -13,34 +13,33 @@ import numpy as np
 
 from drivers.canopen.bus import SocketcandBus
 from drivers.errors import BusError
-from drivers.simulation.amplifier import AmplifierSet, tuned
+from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
 from drivers.simulation.drive import ErrorCode, PowerState, Readings, take
 from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
-from drivers.simulation.node import GAIN, STORE, NmtCommand, Node
+from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, SpecInvalid
 from drivers.stream.split_bus import SplitBus
 
-# One plant on several buses: which SYNCs belong to one cycle.
+SYNC_ID = 0x080
+NMT_ID = 0x000
 
+IDLE_S = 0.02
+"""Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time."""
 
 PATIENCE = 3
-"""SYNCs that may wait for another bus's: a busy machine hands on some of one bus before those of the other."""
+"""SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first."""
 
 Cycles = tuple[frozenset[int], ...]
-"""Cycles to run now, each by the buses whose nodes take part in it."""
+"""Cycles to run now, each given by the buses whose nodes take part."""
 
 
 class SyncGate:
-    """Pairs the SYNCs of the buses in their order: a cycle begins when every bus has brought one.
+    """Combines the SYNCs of several buses into cycles: a cycle begins when each bus has received one.
 
-    A bus that brings none is left out, when too many of another bus wait for it, or when the cell's own patience ends
-    (``close``). Its next SYNC comes too late for a cycle of its own: its nodes answer it, time does not move, and the
-    bus is waited for again.
-
-    Args:
-        buses: their number.
+    A bus without SYNC is left out when too many of another bus wait, or when the cell closes the gate after `IDLE_S`.
+    Its next SYNC is late: its nodes answer it, time does not advance, and later cycles include the bus again.
     """
 
     def __init__(self, buses: int) -> None:
@@ -49,23 +48,23 @@ class SyncGate:
 
     @property
     def open(self) -> bool:
-        """Whether a cycle waits for SYNCs."""
+        """Whether a cycle waits for the SYNC of a bus."""
         return any(self._waiting)
 
     def late(self, bus: int) -> bool:
-        """Whether a SYNC on this bus belongs to a cycle that was run without it."""
+        """Return whether a SYNC on this bus belongs to a cycle that was run without it."""
         if bus not in self._absent:
             return False
         self._absent -= {bus}
         return True
 
     def arrive(self, bus: int) -> Cycles:
-        """A SYNC that is not late."""
+        """Count a SYNC that is not late."""
         self._waiting[bus] += 1
         return self.close() if self._waiting[bus] > PATIENCE else self._complete()
 
     def close(self) -> Cycles:
-        """Wait no longer for the buses that bring no SYNC."""
+        """Stop waiting for the buses without SYNC."""
         self._absent |= {bus for bus, count in enumerate(self._waiting) if not count}
         return self._complete()
 
@@ -77,22 +76,14 @@ class SyncGate:
         return (present,) * cycles
 
 
-SYNC_ID = 0x080
-NMT_ID = 0x000
-
-IDLE_S = 0.02
-"""Longest sleep while no frame comes; heartbeats by wall time are as punctual as this."""
-
-
 class SimulatedCell:
-    """A cell that answers on a bus until it is closed.
+    """Cell that answers on a bus until it is closed.
 
-    Each SYNC (COB-ID 80h) moves the plant by one sync period and is answered with the transmit PDOs, so that a run
-    takes as long as its computing takes, and equal frames give equal answers. SDO, NMT and heartbeats need no SYNC.
-    On several buses the plant moves when SYNC has come on all of them, and each node hears its own bus alone.
+    Each SYNC (COB-ID 80h) advances the plant by one sync period and is answered with the transmit PDOs, so equal frames
+    give equal answers. SDO, NMT and heartbeats need no SYNC. On several buses the plant advances when SYNC has come on
+    all of them, and each node receives its own bus only.
 
-    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread. What is
-    mounted is part of the description: for another payload make another cell.
+    As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread.
 
     Attributes:
         plant: its mechanics (read it when the cell is closed, or between answers).
@@ -104,9 +95,8 @@ class SimulatedCell:
         """Build the cell; it is powered on when it begins to serve.
 
         Args:
-            spec: the truth of the cell.
-            bus: any python-can bus that does not receive its own messages, or a split bus of several; it stays the
-                caller's to shut down.
+            spec: description of the cell.
+            bus: any python-can bus that does not receive its own messages, or a split bus; the caller shuts it down.
             clock: seconds, for heartbeats while no SYNC comes.
 
         Raises:
@@ -123,7 +113,7 @@ class SimulatedCell:
         self.plant = Plant(spec)
         self.cycles = 0
         lags = tuple(e for e in (build_effect(effect, len(ids)) for effect in spec.effects) if isinstance(e, Lag))
-        self._amplifiers = AmplifierSet(spec, tuned(spec, self.plant), lags)
+        self._amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, self.plant), lags)
         self._amplifiers.prime(self.plant.motor_rad)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self._readings = take(self._amplifiers, self._rated_a)
@@ -140,19 +130,9 @@ class SimulatedCell:
         _refuse_error_frames(spec.faults, bus)
         self._disturbance = Disturbance(spec.faults)
         for index, node in enumerate(self.nodes):
-            node.obeys_nmt = not self._disturbance.active(FaultKind.REFUSES_NMT, index)
-            if self._disturbance.active(FaultKind.OTHER_SERIAL, index):
-                node.change_serial()
-            if self._disturbance.active(FaultKind.REFUSES_MAPPING, index):
-                node.lock_mapping()
-            if self._disturbance.active(FaultKind.SYNC_PRODUCER, index):
-                node.produce_sync()
-            if self._disturbance.active(FaultKind.NO_GUARD, index):
-                node.lose_guard()
-            if self._disturbance.active(FaultKind.REFUSES_WRITE, index):
-                node.refuse(GAIN)
-            if self._disturbance.active(FaultKind.REFUSES_SAVE, index):
-                node.refuse(STORE)
+            for kind in FaultKind:
+                if self._disturbance.active(kind, index):
+                    node.inject(kind)
         self._by_id = {node.node_id: node for node in self.nodes}
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
@@ -170,24 +150,24 @@ class SimulatedCell:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-        # Where both sides failed, the caller's error is most often only that the cell fell silent.
+        # If both sides failed, the caller's error is usually a consequence of the silent cell.
         if self._failure is not None:
             raise self._failure from error
 
     def check(self) -> None:
-        """Raise what ended the cell's thread, if anything did."""
+        """Raise the error that ended the cell's thread, if any."""
         if self._failure is not None:
             raise self._failure
 
     def stop(self) -> None:
-        """Let ``serve_forever`` return; may be called from any thread."""
+        """Make ``serve_forever`` return; may be called from any thread."""
         self._stopping.set()
 
     def serve_forever(self) -> None:
         """Power on and answer until ``stop`` is called.
 
         Raises:
-            can.CanError, BusError: the bus has gone, or all buses have.
+            can.CanError, BusError: the bus, or every bus, has failed.
             FrictionUnsolved: the plant could not be advanced.
         """
         wall_s = self._clock()
@@ -217,7 +197,7 @@ class SimulatedCell:
             return None
 
     def _goes_on(self) -> bool:
-        """Whether amplifiers are left on a bus when another one has failed."""
+        """Return whether another bus works after one has failed."""
         return isinstance(self._bus, SplitBus) and self._bus.alive
 
     @property
@@ -254,7 +234,7 @@ class SimulatedCell:
                 node.receive_pdo(can_id, data)
 
     def _hearing(self, wire: int) -> tuple[Node, ...]:
-        """Nodes that a frame on one of the buses reaches."""
+        """Return the nodes that receive a frame on one of the buses."""
         if not self._disturbance:
             return self._on_wire[wire]
         return tuple(
@@ -276,7 +256,7 @@ class SimulatedCell:
             self._advance(wires)
 
     def _interfere(self) -> None:
-        """Frames of other masters on this bus."""
+        """Send the frames of other masters."""
         for index, node in enumerate(self.nodes):
             if self._disturbance.active(FaultKind.SDO_MASTER, index):
                 self._send(0x600 + node.node_id, FOREIGN_SDO)
@@ -285,7 +265,7 @@ class SimulatedCell:
             self._send(SYNC_ID, b"")
 
     def _begin_faults(self) -> None:
-        """What begins with this cycle, before the plant moves."""
+        """Apply the faults that begin with this cycle, before the plant moves."""
         for index, node in enumerate(self.nodes):
             node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
         for fault in self._disturbance.beginning():
@@ -309,7 +289,7 @@ class SimulatedCell:
             node.drive.reset()
 
     def _advance(self, wires: Collection[int]) -> None:
-        """One cycle, of which the nodes on these buses got a SYNC."""
+        """Run one cycle; the nodes on these buses received a SYNC."""
         plant, amplifiers = self.plant, self._amplifiers
         synchronised = [node for wire in sorted(wires) for node in self._on_wire[wire]]
         for node in synchronised:
@@ -358,7 +338,7 @@ class SimulatedCell:
 
 
 def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], tuple[frozenset[int], ...]]:
-    """Names of the buses, as received frames have them, and the node ids on each."""
+    """Return the names of the buses, as in received frames, and the node ids on each."""
     if not isinstance(bus, SplitBus):
         return ("",), (frozenset(node_ids),)
     there = tuple(part.node_ids for part in bus.address.parts)
@@ -369,7 +349,7 @@ def _wires(bus: can.BusABC, node_ids: Sequence[int]) -> tuple[tuple[str, ...], t
 
 
 def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
-    """An error frame that a bus cannot carry would end the cell in the middle of somebody's run."""
+    """Refuse error frames that the bus cannot carry: they would end the cell in the middle of a run."""
     hub = (
         any(part.address.interface == "socketcand" for part in bus.address.parts)
         if isinstance(bus, SplitBus)
@@ -384,14 +364,11 @@ def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
 
 
 def _compile(spec: CellSpec) -> None:
-    """Let numba compile on a cell that is thrown away: the first SYNC must not wait for it."""
+    """Compile with numba on a temporary cell: the first SYNC must not wait for it."""
     plant = Plant(spec)
-    amplifiers = AmplifierSet(spec, tuned(spec, plant), ())
+    amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, plant), ())
     plant.step(np.zeros(len(spec.axes)))
     amplifiers.control(plant.motor_rad)
-
-
-# A simulated cell whose payload somebody exchanges between two runs: only while no axis has power.
 
 
 POWERED = (
@@ -402,27 +379,19 @@ POWERED = (
 )
 
 Mounted = Callable[[], CellSpec | None]
-"""The cell as it is mounted now, None where nobody knows better than before."""
+"""Return the cell with its present payload, or None if unchanged."""
 
 
 class MountingCell(SimulatedCell):
-    """As a simulated cell; what is mounted is asked before every frame while all axes are without power.
+    """Simulated cell whose payload is exchanged between runs, while no axis has power.
 
-    So whoever changes it, and then asks the cell anything, finds it changed; and what is changed while an axis has
-    power waits until none has. The loops stay tuned as they were, as those of real drives do.
+    `mounted` is called after each wait for a frame and must be fast; another object is another payload. The loops keep
+    their tuning, as those of real drives do.
     """
 
     def __init__(
         self, spec: CellSpec, bus: can.BusABC, mounted: Mounted, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """As a simulated cell.
-
-        Args:
-            spec: the truth of the cell, as it is mounted at power-on.
-            bus: of it.
-            mounted: tells what is mounted; another object is another mounting. It must not take long.
-            clock: seconds.
-        """
         super().__init__(spec, bus, clock)
         self._mounted, self._spec = mounted, spec
 

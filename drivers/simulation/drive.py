@@ -1,4 +1,4 @@
-"""One simulated amplifier as CiA 402 sees it: power state, set-points, statusword, faults."""
+"""CiA 402 part of one simulated amplifier: power state, set-points, statusword, faults."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from drivers.simulation.amplifier import AmplifierSet, FloatArray, plan
 from drivers.simulation.friction import compiled
-
-# The CiA 402 state machine of one simulated amplifier, pure (the finite state automaton of CiA 402-2).
 
 
 class PowerState(Enum):
@@ -28,10 +26,10 @@ class PowerState(Enum):
 
 
 def next_state(state: PowerState, controlword: int, previous: int, stays_in_quick_stop: bool) -> PowerState:
-    """The state after a controlword.
+    """Return the state after a controlword (finite state automaton of CiA 402-2).
 
     Args:
-        state: before it.
+        state: present state.
         controlword: object 6040h as written.
         previous: controlword before; fault reset acts on the rising edge of bit 7 alone.
         stays_in_quick_stop: quick stop option 605Ah is 5 or 6, the only case in which transition 16 exists.
@@ -59,12 +57,9 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
     return after
 
 
-# What the amplifiers of a cell tell of themselves, in the units of CiA 402; renewed once a SYNC.
-
-
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Integers as they go over the bus, one an axis.
+    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis.
 
     Attributes:
         position: 6064h [counts].
@@ -86,12 +81,7 @@ class Readings:
 
 
 def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:
-    """Round and wrap what the loops hold.
-
-    Args:
-        amplifiers: after a SYNC period.
-        rated_current_a: shape (n,).
-    """
+    """Return the rounded and wrapped state of the loops."""
     readings = np.empty((8, len(rated_current_a)), dtype=np.int64)
     _fill(amplifiers.loops, amplifiers.reported_a, rated_current_a, readings)
     return Readings(*readings.tolist())
@@ -138,7 +128,7 @@ class QuickStop(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Objects that tell a drive how to move; counts, counts/s and counts/s²."""
+    """Objects that define how a drive moves, in counts, counts/s and counts/s²."""
 
     mode: int
     target: int
@@ -153,10 +143,10 @@ class Drive:
     """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet.
 
     Attributes:
-        state: of CiA 402.
-        controlword: as written last.
+        state: CiA 402 power state.
+        controlword: last value written.
         error: code of the active fault.
-        limited: a limit acts that the loops know nothing of.
+        limited: an injected limit is active, in addition to those of the loops.
     """
 
     def __init__(self, index: int, amplifiers: AmplifierSet) -> None:
@@ -170,7 +160,7 @@ class Drive:
         self._waiting: tuple[int, Settings] | None = None
 
     def reset(self) -> None:
-        """Power-on state; the brake closes."""
+        """Return to the power-on state; the brake closes."""
         self._enter(PowerState.SWITCH_ON_DISABLED)
         self.controlword, self.error = 0, ErrorCode.NONE
 
@@ -189,17 +179,13 @@ class Drive:
             self._waiting = None
             self._amplifiers.stop(self._index, settings.deceleration)
         if not controlword & 0x10:
-            # The handshake ends when the master takes the request away, unless a set-point still waits.
+            # The handshake ends when the master clears the request, unless a set-point still waits.
             self._acknowledged = self._waiting is not None
         elif not previous & 0x10 and not controlword & 0x100:
             self._request(controlword, settings, readings)
 
     def monitor(self, readings: Readings, settings: Settings) -> ErrorCode:
-        """After each SYNC period: faults, end of a quick stop, the waiting set-point.
-
-        Returns:
-            the code of a new fault, or NONE.
-        """
+        """Update faults, quick stop and waiting set-point after a SYNC period; return the code of a new fault."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
             if settings.quick_stop < QuickStop.SLOW_DOWN_AND_STAY and not self._amplifiers.moving(self._index):
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
@@ -214,22 +200,22 @@ class Drive:
         return ErrorCode.NONE
 
     def fail(self, code: int) -> None:
-        """Fault reaction: the power stage goes off and the brake closes at once."""
+        """Enter FAULT: the power stage goes off and the brake closes at once."""
         self._enter(PowerState.FAULT)
         self.error = code
 
     @property
     def powered(self) -> bool:
-        """Whether the loops hold the axis."""
+        """Whether the loops control the axis."""
         return self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
     def quick_stop(self, settings: Settings) -> None:
-        """As if the master had asked for it."""
+        """Start a quick stop without a controlword."""
         if self.state is PowerState.OPERATION_ENABLED:
             self._change(PowerState.QUICK_STOP_ACTIVE, settings)
 
     def statusword(self, readings: Readings) -> int:
-        """Object 6041h."""
+        """Return object 6041h."""
         word = self.state.value | 0x0210  # voltage present, remote
         if self.powered:
             word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
@@ -272,7 +258,7 @@ class Drive:
             return
         self._waiting = None
         self._start(target, settings)
-        # Told at once, so that no one takes the end of the last move for the end of this one.
+        # Reported at once, so that a master does not take the end of the last move for the end of this one.
         readings.reached[self._index] = 0
 
     def _start(self, target: int, settings: Settings) -> None:

@@ -1,4 +1,4 @@
-"""One step of the equations of motion up to dry friction: what the speeds would be without it, and how it acts on them.
+"""One step of the equations of motion: speeds without dry friction, its response matrix, and the final update.
 
 With M the inertia of the links, P the motors' directions (τ = Pᵀ τ_m, Ia and motor friction act along its rows) and
 h the step:
@@ -36,10 +36,10 @@ def free_motion(
     free_speed: FloatArray,
     delassus: FloatArray,
 ) -> None:
-    """Fill the four last arguments.
+    """Compute the motion without dry friction and write it to the last four arguments.
 
     Args:
-        mass, bias: of the links, shapes (n, n) and (n,); coordinates after the n-th (motors of their own) have no link.
+        mass, bias: links, shapes (n, n) and (n,); coordinates after the n-th (motors of flexible drives) have no link.
         motor_direction: P, shape (motors, N).
         motor_inertia, motor_viscous, motor_torque: along the rows of P, shape (motors,).
         viscous: on each coordinate, shape (N,).
@@ -129,7 +129,7 @@ def _add_motors(
 
 @compiled
 def _factorise(matrix: FloatArray) -> None:
-    """Cholesky in place, lower triangle: so small a matrix is factorised faster than a library is called."""
+    """Cholesky factorisation in place, lower triangle; for these sizes faster than a library call."""
     for i in range(len(matrix)):
         for j in range(i + 1):
             s = matrix[i, j]
@@ -140,7 +140,7 @@ def _factorise(matrix: FloatArray) -> None:
 
 @compiled
 def _substitute(lower: FloatArray, vector: FloatArray) -> None:
-    """Replace the vector by A⁻¹ vector, A = L Lᵀ."""
+    """Solve A x = vector in place, A = L Lᵀ."""
     size = len(vector)
     for i in range(size):
         s = vector[i]
@@ -185,7 +185,7 @@ def finish_step(
         step_s: h.
         motor: rotor angles per coordinate, shape (n, N).
         position, velocity: state, changed in place, shape (N,).
-        load_torque: what each link asks of its joint, M a + c(q, q̇) [Nm], shape (n,), output.
+        load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
         motor_rad: rotor angles at the end of the step, shape (n,), output.
     """
     n = len(bias)
@@ -220,7 +220,7 @@ def finish_step(
 def _resting(
     impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Coordinates that sticking directions pin, shape (N,)."""
+    """Return the coordinates held at rest by sticking directions, shape (N,)."""
     resting = np.zeros(directions.shape[1], dtype=np.bool_)
     for k in range(len(impulse)):
         if lone[k] >= 0 and abs(impulse[k]) < bound[k]:
@@ -233,7 +233,7 @@ def _resting(
 
 @compiled
 def _rest_with(direction: FloatArray, resting: NDArray[np.bool_]) -> None:
-    """A sticking direction pins its last moving coordinate (a coupled motor's brake, where the other joint rests)."""
+    """Hold the last moving coordinate of a sticking direction (a coupled motor's brake while the other joint rests)."""
     free = 0
     last = 0
     for i in range(len(direction)):

@@ -1,4 +1,4 @@
-"""What goes wrong in a simulated cell, when, and on which axis: part of its truth, frozen."""
+"""Injected faults: their kind, time and axis, and their effect on the frames that a node sends."""
 
 from __future__ import annotations
 
@@ -8,50 +8,38 @@ from enum import Enum
 
 
 class FaultKind(Enum):
-    """One way to fail. Of a kind that lasts, `cycles` tells how long; the others happen once.
+    """Kind of fault."""
 
-    Lasting: SILENT (deaf and mute: no power, cable off), NO_HEARTBEAT, FROZEN (its TPDOs repeat position and current: a
-    dead encoder), STALE (its TPDOs are repeated whole: a processor that hangs behind its bus), LIMIT (statusword bit
-    11), LOST, LATE (TPDOs that come with the next SYNC), DUPLICATE (TPDOs sent twice), SHORT_PDO (TPDOs that lack their
-    last byte), WRONG_COB_ID (TPDOs under the identifier of TPDO4), SHIFTED (TPDOs carry another position than 6064h),
-    SECOND_MASTER (somebody else's SYNC, whole cell), SDO_MASTER (somebody else's SDO requests to the axis),
-    SYNC_PRODUCER (the axis sends a SYNC by itself), BUS_OFF (an error frame of this end; then nobody hears or is heard,
-    whole cell); and from power-on for ever: REFUSES_NMT (it does not go to OPERATIONAL), REFUSES_MAPPING (its TPDOs
-    cannot be mapped), OTHER_SERIAL (an exchanged amplifier), NO_GUARD (it has no 1016h), REFUSES_WRITE (its gain 2003h
-    cannot be written), REFUSES_SAVE (1010h does not store).
-
-    Once: EMERGENCY (an EMCY of the code `value`, and FAULT), FOLLOWING_ERROR, FALLS_BACK (PRE-OPERATIONAL with EMCY
-    8130h), REBOOTS (reset: boot-up message, settings lost), LOSES_POWER (SWITCH ON DISABLED by itself, as STO does),
-    ERROR_PASSIVE (an error frame says that the controller counts too many errors, whole cell).
-    """
-
-    SILENT = "silent"
+    # During `cycles`.
+    SILENT = "silent"  # neither sends nor receives: no power, cable off
     NO_HEARTBEAT = "no-heartbeat"
-    FROZEN = "frozen"
-    STALE = "stale"
-    LIMIT = "limit"
-    LOST = "lost"
-    LATE = "late"
-    DUPLICATE = "duplicate"
-    SHORT_PDO = "short-pdo"
-    WRONG_COB_ID = "wrong-cob-id"
-    SHIFTED = "shifted"
-    REFUSES_NMT = "refuses-nmt"
-    REFUSES_MAPPING = "refuses-mapping"
-    OTHER_SERIAL = "other-serial"
-    NO_GUARD = "no-guard"
-    REFUSES_WRITE = "refuses-write"
-    REFUSES_SAVE = "refuses-save"
-    SECOND_MASTER = "second-master"
-    SDO_MASTER = "sdo-master"
-    SYNC_PRODUCER = "sync-producer"
-    EMERGENCY = "emergency"
+    FROZEN = "frozen"  # TPDOs repeat position and current: a dead encoder
+    STALE = "stale"  # TPDOs are repeated whole: a processor that hangs behind its bus
+    LIMIT = "limit"  # statusword bit 11
+    LOST = "lost"  # no TPDOs
+    LATE = "late"  # TPDOs arrive with the next SYNC
+    DUPLICATE = "duplicate"  # TPDOs are sent twice
+    SHORT_PDO = "short-pdo"  # TPDOs lack their last byte
+    WRONG_COB_ID = "wrong-cob-id"  # TPDOs have the identifier of TPDO4
+    SHIFTED = "shifted"  # TPDOs carry another position than 6064h
+    SECOND_MASTER = "second-master"  # SYNC from another master, whole cell
+    SDO_MASTER = "sdo-master"  # SDO requests from another master
+    BUS_OFF = "bus-off"  # error frame, then no frame passes, whole cell
+    # From power-on.
+    SYNC_PRODUCER = "sync-producer"  # the amplifier sends a SYNC by itself
+    REFUSES_NMT = "refuses-nmt"  # does not go to OPERATIONAL
+    REFUSES_MAPPING = "refuses-mapping"  # transmit PDOs cannot be mapped
+    OTHER_SERIAL = "other-serial"  # an exchanged amplifier
+    NO_GUARD = "no-guard"  # no consumer heartbeat 1016h
+    REFUSES_WRITE = "refuses-write"  # gain 2003h cannot be written
+    REFUSES_SAVE = "refuses-save"  # 1010h does not store
+    # Once, at `at_cycle`.
+    EMERGENCY = "emergency"  # EMCY with the code `value`, then FAULT
     FOLLOWING_ERROR = "following-error"
-    FALLS_BACK = "falls-back"
-    REBOOTS = "reboots"
-    LOSES_POWER = "loses-power"
-    BUS_OFF = "bus-off"
-    ERROR_PASSIVE = "error-passive"
+    FALLS_BACK = "falls-back"  # PRE-OPERATIONAL with EMCY 8130h
+    REBOOTS = "reboots"  # boot-up message, settings lost
+    LOSES_POWER = "loses-power"  # SWITCH ON DISABLED, as after STO
+    ERROR_PASSIVE = "error-passive"  # error frame: the controller counts too many errors, whole cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,10 +47,10 @@ class FaultSpec:
     """One fault.
 
     Attributes:
-        kind: what goes wrong.
+        kind: kind of fault.
         axis: index from 0, or None for all.
-        at_cycle: number of the SYNC since power-on that it comes with; 0 is from power-on.
-        cycles: how many it lasts, None for ever.
+        at_cycle: first SYNC since power-on with the fault; 0 is from power-on.
+        cycles: duration, or None without end.
         value: EMCY code (EMERGENCY).
     """
 
@@ -73,36 +61,29 @@ class FaultSpec:
     value: int = 0
 
     def active(self, cycle: int) -> bool:
-        """Whether it lasts in this cycle."""
+        """Return whether the fault is present in a cycle."""
         return self.at_cycle <= cycle and (self.cycles is None or cycle < self.at_cycle + self.cycles)
 
     def concerns(self, axis: int) -> bool:
-        """Whether it is on this axis."""
+        """Return whether the fault affects an axis."""
         return self.axis is None or self.axis == axis
-
-
-# The faults of a simulated cell between its nodes and its bus: what becomes of every frame.
 
 
 Frame = tuple[int, bytes]
 
 FOREIGN_SDO = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
-"""Somebody reads 6041h."""
+"""SDO request of another master: read 6041h."""
 ERROR_FRAMES = {
     FaultKind.BUS_OFF: (0x040, bytes(8)),
     FaultKind.ERROR_PASSIVE: (0x004, bytes((0, 0x30, 0, 0, 0, 0, 0, 0))),
 }
 """Class and data of an error frame of this end's controller (linux/can/error.h): bus-off; both counters passive."""
 _FROZEN_BYTES = 6
-"""Of a TPDO: position and current; the statusword behind them goes on."""
+"""Bytes of a TPDO that hold position and current; the statusword behind them is not frozen."""
 
 
 class Disturbance:
-    """Asked by the cell in every cycle and for every frame.
-
-    Attributes:
-        cycle: number of the last SYNC, from 0; also before the first one.
-    """
+    """Faults of a cell, applied to each cycle and each frame; `cycle` is the number of the last SYNC, from 0."""
 
     def __init__(self, faults: Sequence[FaultSpec]) -> None:
         self._faults = tuple(faults)
@@ -114,20 +95,20 @@ class Disturbance:
         return bool(self._faults)
 
     def active(self, kind: FaultKind, axis: int) -> bool:
-        """Whether a lasting fault acts on an axis now."""
+        """Return whether a lasting fault affects an axis now."""
         return any(f.kind is kind and f.concerns(axis) and f.active(self.cycle) for f in self._faults)
 
     def beginning(self) -> tuple[FaultSpec, ...]:
-        """Faults whose first cycle this is."""
+        """Return the faults that begin in this cycle."""
         return tuple(fault for fault in self._faults if fault.at_cycle == self.cycle)
 
     def cut_off(self, axis: int) -> bool:
-        """Whether an axis neither hears nor is heard."""
+        """Return whether an axis neither sends nor receives."""
         gone = any(f.kind is FaultKind.BUS_OFF and f.active(self.cycle) for f in self._faults)
         return gone or self.active(FaultKind.SILENT, axis)
 
     def sent(self, axis: int, node_id: int, identifier: int, data: bytes) -> list[Frame]:
-        """What comes onto the bus of a frame that a node sends."""
+        """Return the frames that reach the bus when a node sends one."""
         if self.cut_off(axis):
             return []
         frame = (identifier, data)
@@ -156,6 +137,6 @@ class Disturbance:
         return [frame, frame] if self.active(FaultKind.DUPLICATE, axis) else [frame]
 
     def release(self) -> list[Frame]:
-        """Frames that were held since the SYNC before."""
+        """Return the TPDOs held back since the previous SYNC."""
         held, self._held = self._held, []
         return held

@@ -18,9 +18,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-# Machine code for the inner loops, kept on disk so that only the first run on a machine compiles.
-
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -61,8 +58,8 @@ def solve(
         free: speeds without dry friction [rad/s], shape (m,).
         bound: largest impulse of each direction [Nm s], shape (m,), not negative.
         impulse: λ, start value in and solution out, shape (m,).
-        tolerance: asked of the certificate [rad/s].
-        sweeps: bound on the number of Gauss-Seidel sweeps.
+        tolerance: largest accepted certificate [rad/s].
+        sweeps: largest number of Gauss-Seidel sweeps.
 
     Returns:
         the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s], recomputed after the last
@@ -94,7 +91,7 @@ def solve(
 
 @compiled
 def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, k: int) -> float:
-    """The impulse that direction k would have if the others kept theirs."""
+    """Return the impulse of direction k for given impulses of the others."""
     w = free[k]
     for j in range(len(free)):
         w += delassus[k, j] * impulse[j]
@@ -141,7 +138,7 @@ def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: F
 def _advance(
     lower: FloatArray, inside: NDArray[np.bool_], bound: FloatArray, impulse: FloatArray, step: FloatArray
 ) -> bool:
-    """Finish the substitution, go that way as far as the bounds allow, and tell whether one was met."""
+    """Finish the substitution, step as far as the bounds allow, and return whether a bound was met."""
     m = len(step)
     length = 1.0
     blocking = -1

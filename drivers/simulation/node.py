@@ -1,4 +1,4 @@
-"""One CiA 402 node on a bus: NMT, heartbeat, SDO, PDO and EMCY around one drive."""
+"""CiA 402 node on a bus: NMT, heartbeat, SDO, PDO and EMCY around one drive."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from enum import IntEnum
 
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import Drive, ErrorCode, Readings, Settings
+from drivers.simulation.faults import FaultKind
 from drivers.simulation.objects import (
     LOAD,
     READ_ONLY,
@@ -33,7 +34,7 @@ GAIN, STORE, LOAD_DEFAULTS = 0x2003, 0x1010, 0x1011
 
 
 class NmtState(IntEnum):
-    """As a heartbeat tells it."""
+    """NMT state, coded as in a heartbeat."""
 
     INITIALISING = 0x00
     STOPPED = 0x04
@@ -53,21 +54,14 @@ class NmtCommand(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Stored:
-    """What 1010h stores: every value and the parameters of every PDO."""
+    """Parameters stored by 1010h: every value and the parameters of every PDO."""
 
     values: dict[tuple[int, int], Value]
     pdos: tuple[PdoParameters, ...]
 
 
 class Node:
-    """A node and its object dictionary; all methods are called from the cell's one thread.
-
-    Attributes:
-        node_id: on the bus.
-        nmt: its state.
-        drive: its CiA 402 part.
-        obeys_nmt: whether it goes to OPERATIONAL when it is told to.
-    """
+    """Node and its object dictionary; all methods are called from the cell's one thread."""
 
     def __init__(
         self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, readings: Callable[[], Readings], send: Send
@@ -99,25 +93,23 @@ class Node:
         self._toggle = 0
         self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
         self._refused: set[int] = set()
-        self.obeys_nmt = True
+        self._obeys_nmt = True
 
     @property
     def saved(self) -> Stored:
-        """What it will have after the next power-on."""
+        """Parameters that become valid with the next power-on."""
         return self._saved
 
-    # -- NMT and error control -------------------------------------------------------------------------------------
-
     def boot(self, wall_s: float) -> None:
-        """Power-on: tell it, and be PRE-OPERATIONAL."""
+        """Send the boot-up message and enter PRE-OPERATIONAL."""
         self._apply_settings()
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
         self.nmt = NmtState.PRE_OPERATIONAL
         self._beat_us, self._beat_wall_s = self._now_us, wall_s
 
     def command_nmt(self, command: int, wall_s: float) -> None:
-        """Obey an NMT command; unknown ones are ignored, as the standard wants."""
-        if command == NmtCommand.START and not self.obeys_nmt:
+        """Execute an NMT command; unknown ones are ignored, as CiA 301 requires."""
+        if command == NmtCommand.START and not self._obeys_nmt:
             return
         if command == NmtCommand.START and self.nmt is not NmtState.OPERATIONAL:
             self.nmt = NmtState.OPERATIONAL
@@ -141,12 +133,12 @@ class Node:
             self.boot(wall_s)
 
     def hear_heartbeat(self, producer: int, wall_s: float) -> None:
-        """Somebody's heartbeat; that of the node in 1016h is watched from its first one on."""
+        """Note a heartbeat; that of the node in 1016h is monitored from its first one on."""
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
             self._heard_wall_s = wall_s
 
     def watch(self, wall_s: float) -> None:
-        """Stop by 6007h when the watched node is silent; the time of the plant stands still without its SYNC."""
+        """React by 6007h when the monitored heartbeat is overdue by wall time: without SYNC, plant time is stopped."""
         allowed_ms = self._number(0x1016, 1) & 0xFFFF
         if not allowed_ms:
             self._heard_wall_s = None
@@ -155,37 +147,34 @@ class Node:
             self.fall_back()
 
     def fall_back(self) -> None:
-        """A heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
+        """React to a heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
         self._emergency(ErrorCode.HEARTBEAT_LOST)
         self._connection_lost()
         self.nmt = NmtState.PRE_OPERATIONAL
 
     def fail(self, code: int) -> None:
-        """A fault of the amplifier, told by EMCY."""
+        """Enter FAULT and send an EMCY."""
         self.drive.fail(code)
         self._emergency(code)
 
-    def change_serial(self) -> None:
-        """Become another amplifier of the same kind."""
-        self._values[0x1018, 4] = self._number(0x1018, 4) + 1
-
-    def produce_sync(self) -> None:
-        """Become an amplifier that was left as the bus's SYNC producer (1005h bit 30); the cell sends for it."""
-        self._values[0x1005, 0] = self._number(0x1005) | 1 << 30
-
-    def lock_mapping(self) -> None:
-        """Become an amplifier whose transmit PDOs are what they are."""
-        for pdo in self._transmit:
-            pdo.locked = True
-
-    def lose_guard(self) -> None:
-        """Become an amplifier without consumer heartbeat."""
-        for key in ((0x1016, 0), (0x1016, 1)):
-            del self._dictionary[key]  # its value stays zero: it watches nobody
-
-    def refuse(self, index: int) -> None:
-        """Become an amplifier that lets nobody write an object, as if it were always busy."""
-        self._refused.add(index)
+    def inject(self, kind: FaultKind) -> None:
+        """Inject a fault that lasts from power-on; other kinds have no effect here."""
+        if kind is FaultKind.REFUSES_NMT:
+            self._obeys_nmt = False
+        elif kind is FaultKind.OTHER_SERIAL:
+            self._values[0x1018, 4] = self._number(0x1018, 4) + 1
+        elif kind is FaultKind.REFUSES_MAPPING:
+            for pdo in self._transmit:
+                pdo.locked = True
+        elif kind is FaultKind.SYNC_PRODUCER:
+            self._values[0x1005, 0] = self._number(0x1005) | 1 << 30  # the cell sends the SYNC
+        elif kind is FaultKind.NO_GUARD:
+            for key in ((0x1016, 0), (0x1016, 1)):
+                del self._dictionary[key]  # its value stays zero: no heartbeat is monitored
+        elif kind is FaultKind.REFUSES_WRITE:
+            self._refused.add(GAIN)
+        elif kind is FaultKind.REFUSES_SAVE:
+            self._refused.add(STORE)
 
     def beat(self, now_us: int, wall_s: float) -> None:
         """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
@@ -197,10 +186,8 @@ class Node:
             self._beat_us, self._beat_wall_s = now_us, wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
 
-    # -- SYNC and PDO ----------------------------------------------------------------------------------------------
-
     def receive_pdo(self, can_id: int, data: bytes) -> None:
-        """Take a frame if it is one of this node's receive PDOs: at once if event-driven, else with the next SYNC."""
+        """Accept a receive PDO of this node: at once if event-driven, else with the next SYNC."""
         if self.nmt is not NmtState.OPERATIONAL:
             return
         for number, pdo in enumerate(self._receive):
@@ -214,14 +201,14 @@ class Node:
                     self.send_events()
 
     def begin_cycle(self) -> None:
-        """On SYNC: synchronous receive PDOs take effect."""
+        """Apply the synchronous receive PDOs on SYNC."""
         if self._pending:
             pending, self._pending = self._pending, {}
             for number, data in pending.items():
                 self._unpack(self._receive[number], data)
 
     def end_cycle(self) -> None:
-        """After the plant has moved: see to faults and waiting set-points, and tell that the values are new."""
+        """Update faults, waiting set-points and the toggle bit after the plant has moved."""
         self._toggle ^= self._toggle_mask
         fault = self.drive.monitor(self._readings(), self._settings())
         if fault is not ErrorCode.NONE:
@@ -246,8 +233,6 @@ class Node:
                     if data is not None:
                         self._send(trigger.pdo.can_id, data)
 
-    # -- SDO -------------------------------------------------------------------------------------------------------
-
     def request(self, data: bytes) -> None:
         """Answer an SDO request; a stopped node is silent."""
         if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
@@ -257,7 +242,7 @@ class Node:
             self.send_events()
 
     def read(self, index: int, subindex: int) -> bytes:
-        """An entry as it goes over the bus.
+        """Return the bytes of an entry.
 
         Raises:
             SdoAbort: it does not exist or cannot be read.
@@ -307,8 +292,6 @@ class Node:
             raise SdoAbort(NOT_STORED)
         # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
         self._saved = self._stored() if index == STORE else self._defaults
-
-    # -- inside ----------------------------------------------------------------------------------------------------
 
     def _pdo(self, index: int) -> Pdo | None:
         if not 0x1400 <= index <= 0x1BFF:
@@ -390,12 +373,12 @@ class Node:
         self._loop["error_time_s"] = self._number(0x6066) * 1e-3
         self._loop["target_window"] = self._number(0x6067)
         self._loop["target_time_s"] = self._number(0x6068) * 1e-3
-        # A make without 6073h has the limit that it was built with.
+        # An amplifier without 6073h keeps its peak current.
         if (0x6073, 0) in self._dictionary:
             self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
 
     def _connection_lost(self) -> None:
-        """Abort connection option code 6007h."""
+        """React by the abort connection option code 6007h."""
         option = self._number(0x6007)
         if not self.drive.powered or option == 0:
             return

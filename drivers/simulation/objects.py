@@ -1,4 +1,9 @@
-"""The objects of a simulated CiA 402 amplifier: types, access, defaults (CiA 301 §7.5, CiA 402-2)."""
+"""Object dictionary of a simulated CiA 402 amplifier and its SDO server (CiA 301 §7.2 and §7.5, CiA 402-2).
+
+Amplifiers of a vendor differ only in the objects that a recording reads (current, rated values); states, moves and
+limits are those of CiA 402. Their units are written here from the vendors' manuals, not taken from the drive profiles,
+so that tests detect a wrong scale.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +37,12 @@ class Kind(Enum):
 
     @property
     def bits(self) -> int:
-        """Width; 0 for text, which has none."""
+        """Width in bits; 0 for text."""
         return 0 if self is Kind.TEXT else 8 * struct.calcsize("<" + self.value)
 
 
 class Mappable(Enum):
-    """Into which process data object an entry may be mapped."""
+    """Kind of PDO that an entry may be mapped into."""
 
     NO = ""
     TRANSMIT = "t"
@@ -67,13 +72,13 @@ class Entry:
     highest: int | None = None
 
     def encode(self, value: Value) -> bytes:
-        """As it goes over the bus."""
+        """Return the bytes for the bus."""
         if isinstance(value, str):
             return value.encode("ascii")
         return struct.pack("<" + self.kind.value, value)
 
     def decode(self, data: bytes) -> Value:
-        """From the bus.
+        """Return the value of bytes from the bus.
 
         Raises:
             SdoAbort: wrong length, or outside the range of values.
@@ -98,7 +103,7 @@ LOAD = int.from_bytes(b"load", "little")
 
 
 def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
-    """All entries of an amplifier, PDO parameters (1400h-1BFFh) excepted: pdo.py answers for those."""
+    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh), which are in pdo.py."""
     counts = axis.counts_per_revolution
     peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
     transmit, receive = Mappable.TRANSMIT, Mappable.RECEIVE
@@ -117,7 +122,7 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x1011, 1): Entry(Kind.U32, 1, writable=True),
         (0x1014, 0): Entry(Kind.U32, 0x80 + axis.node_id),
         (0x1016, 0): Entry(Kind.U8, 1),
-        (0x1016, 1): Entry(Kind.U32, writable=True),  # whom to watch: node id << 16 | ms
+        (0x1016, 1): Entry(Kind.U32, writable=True),  # monitored node id << 16 | ms
         (0x1017, 0): Entry(Kind.U16, 100, writable=True),
         (0x1018, 0): Entry(Kind.U8, 4),
         (0x1018, 1): Entry(Kind.U32, axis.vendor_id),
@@ -125,7 +130,7 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x1018, 3): Entry(Kind.U32, axis.revision),
         (0x1018, 4): Entry(Kind.U32, axis.serial),
         (0x1019, 0): Entry(Kind.U8),
-        # The maker's own: the joint drive gain that somebody entered. Nobody reads it but a master.
+        # Manufacturer specific: the entered joint drive gain, for masters only.
         (0x2003, 0): Entry(Kind.U8, 2),
         (0x2003, 1): Entry(Kind.I32, round(1000 * axis.entered_gain_nm_per_a), writable=True),
         (0x2003, 2): Entry(Kind.U32, _REAL32_BITS.unpack(_REAL32.pack(axis.entered_gain_nm_per_a))[0], writable=True),
@@ -147,7 +152,7 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x6073, 0): Entry(Kind.U16, peak_per_mille, writable=True, mappable=receive, highest=peak_per_mille),
         (0x6074, 0): Entry(Kind.I16, mappable=transmit),
         (0x6075, 0): Entry(Kind.U32, round(1000 * axis.rated_current_a)),
-        # Zero until someone enters the motor's name plate: the cell must not tell its true torque constant.
+        # Zero until a master enters the motor's rated torque: the cell must not reveal its true torque constant.
         (0x6076, 0): Entry(Kind.U32, 0, writable=True),
         (0x6077, 0): Entry(Kind.I16, mappable=transmit),
         (0x6078, 0): Entry(Kind.I16, mappable=transmit),
@@ -165,7 +170,7 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
 
 
 def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
-    """The entry.
+    """Return an entry.
 
     Raises:
         SdoAbort: it does not exist.
@@ -176,9 +181,6 @@ def find(dictionary: Dictionary, index: int, subindex: int) -> Entry:
     raise SdoAbort(NO_SUBINDEX if any(known == index for known, _ in dictionary) else NO_OBJECT)
 
 
-# The SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3), bytes in and bytes out.
-
-
 _HEAD = struct.Struct("<BHB")
 
 TOGGLE_NOT_ALTERNATED = 0x05030000
@@ -186,7 +188,7 @@ UNKNOWN_COMMAND = 0x05040001
 
 
 class SdoServer:
-    """One SDO channel; it keeps the transfer that is under way and nothing else."""
+    """SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3)."""
 
     def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
         self._read = read
@@ -197,7 +199,7 @@ class SdoServer:
         self._toggle = 0
 
     def answer(self, request: bytes) -> bytes | None:
-        """The response to a request of 8 bytes; None where the standard wants silence (an abort of the client)."""
+        """Return the response to a request of 8 bytes, or None where none is due (an abort of the client)."""
         if len(request) < 8:
             return None
         command = request[0] >> 5
@@ -270,18 +272,11 @@ class SdoServer:
             raise SdoAbort(TOGGLE_NOT_ALTERNATED)
 
 
-# In which objects and units a simulated amplifier tells its current: the standard's, or those of a make.
-#
-# Only what a recording reads differs (current, rated values); states, moves and limits stay those of CiA 402. The
-# units
-# are written down here from the makes' side, not taken from the drive profiles, so that a wrong scale is found out.
-
-
 _LIMITS = {Kind.I16: (-(2**15), 2**15 - 1), Kind.I32: (-(2**31), 2**31 - 1)}
 
 
 class Signal(Enum):
-    """What of the current loop an object tells."""
+    """Signal of the current loop."""
 
     REFERENCE = "reference"
     ACTUAL = "actual"
@@ -289,7 +284,7 @@ class Signal(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CurrentObject:
-    """An object that tells a current in a unit of its own: current / step, rounded, at most what it can hold."""
+    """Object that reports a current in units of `step_a`, rounded and limited to its data type."""
 
     key: tuple[int, int]
     kind: Kind
@@ -297,7 +292,7 @@ class CurrentObject:
     signal: Signal
 
     def source(self, amplifiers: AmplifierSet, index: int) -> Callable[[], int]:
-        """Its value at any time, of the amplifier of that index."""
+        """Return a function that reads the value of one amplifier."""
         lowest, highest = _LIMITS[self.kind]
         signal_a = amplifiers.reported_a if self.signal is Signal.REFERENCE else amplifiers.actual_a
 
@@ -308,7 +303,7 @@ class CurrentObject:
 
 
 def current_objects(axis: AxisSpec) -> tuple[CurrentObject, ...]:
-    """What an amplifier tells of its current beside, or in place of, 6074h, 6077h and 6078h of the standard."""
+    """Return the current objects in addition to, or in place of, 6074h, 6077h and 6078h of CiA 402."""
     reference, actual = Signal.REFERENCE, Signal.ACTUAL
     by_dialect: dict[Dialect, tuple[CurrentObject, ...]] = {
         Dialect.CIA402: (),
@@ -339,7 +334,7 @@ _ABSENT: dict[Dialect, frozenset[int]] = {
 
 
 def translated(dictionary: Dictionary, axis: AxisSpec) -> Dictionary:
-    """A dictionary of the standard with the objects of a make in it, and without those that the make lacks."""
+    """Return a CiA 402 dictionary with the objects of the vendor added and those that it lacks removed."""
     objects = {key: entry for key, entry in dictionary.items() if key[0] not in _ABSENT[axis.dialect]}
     for current_object in current_objects(axis):
         objects[current_object.key] = Entry(current_object.kind, mappable=Mappable.TRANSMIT)

@@ -1,4 +1,4 @@
-"""One process data object of a simulated node: its parameters, and the rules for changing them (CiA 301 §7.5.2)."""
+"""PDOs of a simulated node: parameters, the rules for changing them, and transmission (CiA 301 §7.5.2)."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ NOT_MAPPABLE = 0x06040041
 PDO_TOO_LONG = 0x06040042
 
 INVALID = 1 << 31
-"""Bit of the COB-ID that says that the PDO does not exist."""
+"""Bit of the COB-ID: the PDO does not exist."""
 
 NO_RTR = 1 << 30
 
 MAX_ENTRIES = 8
 
 EVENT_DRIVEN = 254
-"""Transmission types from here on are sent when something changes, not on SYNC."""
+"""First transmission type that is sent on a change, not on SYNC."""
 
 
 class Direction(Enum):
-    """As seen from the node."""
+    """Direction, seen from the node."""
 
     RECEIVE = Mappable.RECEIVE
     TRANSMIT = Mappable.TRANSMIT
@@ -44,7 +44,7 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Communication and mapping parameters, as they stand in the dictionary.
+    """Communication and mapping parameters.
 
     Attributes:
         cob_id: with bit 31 (invalid) and bit 30 (no RTR).
@@ -64,12 +64,13 @@ class PdoParameters:
 
 
 class Pdo:
-    """One PDO. Its parameters change as the standard allows, and in no other order.
+    """One PDO; its parameters can be changed only in the order that CiA 301 allows.
 
     Attributes:
-        parameters: as written last.
-        layout: struct of the mapped values, and its entries' (index, subindex); empty while the PDO is invalid.
-        locked: its mapping cannot be written.
+        parameters: last values written.
+        layout: struct of the mapped values.
+        mapped: (index, subindex) of each mapped value.
+        locked: the mapping cannot be written.
     """
 
     def __init__(self, direction: Direction, parameters: PdoParameters, dictionary: Dictionary) -> None:
@@ -88,18 +89,18 @@ class Pdo:
 
     @property
     def can_id(self) -> int:
-        """Identifier on the bus."""
+        """CAN identifier."""
         return self.parameters.cob_id & 0x7FF
 
     def restore(self, parameters: PdoParameters) -> None:
-        """Take parameters as a whole (defaults, or saved ones)."""
+        """Replace all parameters by defaults or saved ones."""
         self.parameters = parameters
         entries = parameters.entries[: parameters.count]
         self.mapped = tuple((entry >> 16, entry >> 8 & 0xFF) for entry in entries)
         self.layout = struct.Struct("<" + "".join(self._dictionary[key].kind.value for key in self.mapped))
 
     def read_communication(self, subindex: int) -> bytes:
-        """1400h and 1800h records."""
+        """Return an entry of 1400h or 1800h."""
         values: dict[int, tuple[str, int]] = {
             0: ("<B", 5 if self._direction is Direction.TRANSMIT else 2),
             1: ("<I", self.parameters.cob_id),
@@ -112,7 +113,7 @@ class Pdo:
         return struct.pack(*values[subindex])
 
     def read_mapping(self, subindex: int) -> bytes:
-        """1600h and 1A00h records."""
+        """Return an entry of 1600h or 1A00h."""
         if subindex == 0:
             return bytes([self.parameters.count])
         if subindex > MAX_ENTRIES:
@@ -120,7 +121,7 @@ class Pdo:
         return struct.pack("<I", self.parameters.entries[subindex - 1])
 
     def write_communication(self, subindex: int, data: bytes) -> None:
-        """1400h and 1800h records."""
+        """Write an entry of 1400h or 1800h."""
         old = self.parameters
         if subindex == 0:
             raise SdoAbort(READ_ONLY)
@@ -146,7 +147,7 @@ class Pdo:
             raise SdoAbort(NO_SUBINDEX)
 
     def write_mapping(self, subindex: int, data: bytes) -> None:
-        """1600h and 1A00h records: COB-ID invalid, count 0, entries, count, COB-ID valid, in this order."""
+        """Write an entry of 1600h or 1A00h; the order is COB-ID invalid, count 0, entries, count, COB-ID valid."""
         if self.locked:
             raise SdoAbort(READ_ONLY)
         if self.valid:
@@ -182,7 +183,7 @@ class Pdo:
 
 
 class TransmitTrigger:
-    """When a transmit PDO goes out."""
+    """Decides when a transmit PDO is sent."""
 
     def __init__(self, pdo: Pdo, sources: Callable[[tuple[int, int]], Callable[[], int]]) -> None:
         self.pdo = pdo
@@ -194,11 +195,11 @@ class TransmitTrigger:
         self._last_us: int | None = None
 
     def reset(self) -> None:
-        """Forget what was sent (the node enters OPERATIONAL, or the PDO was changed)."""
+        """Forget the last data sent (the node enters OPERATIONAL, or the PDO was changed)."""
         self._syncs, self._last, self._last_us = 0, b"", None
 
     def on_sync(self, now_us: int) -> bytes | None:
-        """The data to send on this SYNC, or None."""
+        """Return the data to send on this SYNC, or None."""
         kind = self.pdo.parameters.transmission
         if kind >= EVENT_DRIVEN:
             return self.on_event(now_us)
@@ -215,7 +216,7 @@ class TransmitTrigger:
         return data
 
     def on_event(self, now_us: int) -> bytes | None:
-        """The data to send because something may have changed, or None; event-driven types alone."""
+        """Return the data of an event-driven PDO to send after a possible change, or None."""
         parameters = self.pdo.parameters
         if parameters.transmission < EVENT_DRIVEN:
             return None
@@ -237,7 +238,7 @@ class TransmitTrigger:
 
 
 def default_pdos(node_id: int, dictionary: Dictionary) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
-    """Receive and transmit PDOs with the default mapping of CiA 402-2; the first of each exists at power-on."""
+    """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
     receive = ((0x60400010,), (0x60400010, 0x60600008), (0x60400010, 0x607A0020), (0x60400010,))
     transmit = ((0x60410010,), (0x60410010, 0x60610008), (0x60410010, 0x60640020), (0x60410010, 0x606C0020))
     return (

@@ -1,4 +1,4 @@
-"""The mechanics of a simulated cell: links, motors behind their gears, friction that sticks, brakes, effects."""
+"""Mechanics of a simulated cell: links, motors with gears, dry friction, brakes, effects."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from drivers.simulation import dynamics, friction
 from drivers.simulation.effects import Backlash, Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.spec import Body, CellSpec, FrictionUnsolved, SpecInvalid
 
-# Which coordinates a plant has, along which of them motors act, and in which directions dry friction acts.
+FloatArray = NDArray[np.float64]
+
+BRAKE_FACTOR = 2.0
+"""Holding torque of a brake over the peak torque of its motor."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """n motors, N coordinates, m directions of dry friction.
+    """Coordinates of a plant: n motors, N coordinates, m directions of dry friction.
 
     Attributes:
         motor_direction: how each motor turns with the coordinates, shape (n, N).
         directions: of dry friction, shape (m, N); the first n are the joints.
         own_row: the direction that carries each motor's own dry friction and brake, shape (n,).
         lone: coordinate of each direction that has only one, else -1, shape (m,).
-        flexible: drives that part a motor from its joints, in the order of their coordinates.
+        flexible: drives between a motor and its joints, in the order of their coordinates.
     """
 
     motor_direction: FloatArray
@@ -36,11 +39,11 @@ class Layout:
 
 
 def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
-    """Count coordinates and directions, and tell the effects that add some where theirs are.
+    """Assign coordinates and directions, and set them in the effects that add some.
 
     Args:
         rows: r_i of the drive train, shape (n, n).
-        effects: of the plant.
+        effects: effects of the plant.
 
     Raises:
         SpecInvalid: two flexible drives are given for one motor.
@@ -74,11 +77,8 @@ def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
     return Layout(motor_direction, np.array(directions), own_row, np.array(lone, dtype=np.int64), flexible)
 
 
-# The gears of the simulated cell: how motors, joints and directions of dry friction hang together.
-
-
 def reduction(ratio: FloatArray) -> FloatArray:
-    """N of each motor, shape (n,): its own joint's ratio, or its largest where it does not drive that joint.
+    """Return the reduction N of each motor, shape (n,): that of its own joint, or else its largest.
 
     Raises:
         SpecInvalid: the matrix is not square or not invertible.
@@ -93,27 +93,19 @@ def reduction(ratio: FloatArray) -> FloatArray:
 
 
 def motor_rows(ratio: FloatArray) -> FloatArray:
-    """r_i = R_i / N_i, shape (n, n): a motor's torque in joint units acts on the joints along r_i (eq. 24)."""
+    """Return r_i = R_i / N_i, shape (n, n): a motor's torque in joint units acts on the joints along r_i (eq. 24)."""
     return np.asarray(ratio / reduction(ratio)[:, None], dtype=np.float64)
 
 
-FloatArray = NDArray[np.float64]
-
-BRAKE_FACTOR = 2.0
-"""Holding torque of a brake over the peak torque of its motor."""
-
-
 class Plant:
-    """A robot of n joints, revolute or prismatic, and n motors that moves under the currents of its motors.
+    """Robot of n joints, revolute or prismatic, driven by the currents of n motors.
 
-    Of a prismatic joint all quantities are in N for Nm, m for rad and kg for kg m².
-
-    Coordinates are the joints and, behind them, each motor that a flexible drive parts from its joints; torques of
-    motors are in joint units (τ_joint = Σ r_i g_i i_i, see drive_train.py). Power-on: at rest, brakes closed.
+    The coordinates are the joints, then each motor behind a flexible drive. Motor torques are in joint units
+    (τ_joint = Σ r_i g_i i_i). At power-on the robot is at rest with closed brakes.
 
     Attributes:
         position_rad, velocity_rad_s: of the coordinates, shape (N,).
-        load_torque_nm: what the links asked of the joints in the last step, shape (n,).
+        load_torque_nm: torque of the links on the joints in the last step, shape (n,).
         motor_rad: angle of each rotor [rad], shape (n,); zero at joint position zero.
         time_s: since power-on.
     """
@@ -155,7 +147,7 @@ class Plant:
         self._motor_inertia = np.array([a.motor_inertia_kg_m2 for a in axes])
         self._motor_viscous = np.array([a.motor_viscous_nm_s_rad for a in axes])
         self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + added)
-        # The paper's offset stands on the side of what the motor must give (eq. 1), so it pulls the joint back.
+        # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
         self._torque = np.array([-a.offset_nm for a in axes] + added)
         self._directions = layout.directions
         self._own_row = own_row
@@ -198,20 +190,14 @@ class Plant:
                 self._bound[row] += brake_nm
 
     def mount(self, spec: CellSpec) -> None:
-        """Exchange the mounted body for that of another description of the same cell, which then weighs at once.
-
-        Where the joints are, what they are warm from and all else stays.
-        """
+        """Replace the payload by that of another description of the same cell; the state is kept."""
         self._model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
         self._data = self._model.createData()
 
     def postures(self, start_rad: FloatArray, count: int) -> tuple[FloatArray, ...]:
-        """Positions of each joint that show how its inertia varies, so many a joint.
+        """Return `count` positions of each joint that cover its inertia.
 
-        Args:
-            start_rad: where the joints are at power-on, shape (n,).
-            count: of a revolute joint these are angles of one revolution from its start, because inertia repeats over
-                it; of a prismatic one, places along its travel.
+        They are spread over one revolution from the start of a revolute joint, or over the travel of a prismatic one.
         """
         angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
         lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
@@ -221,20 +207,13 @@ class Plant:
         )
 
     def motor_inertia_at(self, position_rad: FloatArray) -> FloatArray:
-        """Inertia that each motor turns while the others stand still, in joint units [kg m²], shape (n,).
-
-        Args:
-            position_rad: of the joints [rad or m], shape (n,).
-        """
+        """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (n,)."""
         to_joint = np.linalg.inv(self._rows)
         links = np.array(pin.crba(self._model, self._data, position_rad))
         return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
-        """Move by one substep.
-
-        Args:
-            current_a: in each motor, shape (n,).
+        """Advance by one substep with the motor currents, shape (n,).
 
         Raises:
             FrictionUnsolved: dry friction was not solved to its tolerance.
@@ -300,13 +279,13 @@ class Plant:
 
 
 def _is_prismatic(model: pin.Model, joint: int) -> bool:
-    """Whether a joint, counted from 0, slides: Pinocchio has a kind of joint for every axis it may slide along."""
+    """Return whether a joint, counted from 0, is prismatic: Pinocchio has a joint type for each sliding axis."""
     kind = str(model.joints[joint + 1].shortname())
     return "Prismatic" in kind or kind.startswith("JointModelP")
 
 
 def _check_stiffness(drive: Elasticity | Backlash, motor_inertia_kg_m2: float, step_s: float) -> None:
-    """Springs are explicit in the step: stable below stiffness h² = 4 inertia; a quarter of that is asked."""
+    """Require a quarter of the stability bound of the explicit spring, stiffness h² = 4 inertia."""
     stiff = (drive.stiffness_nm_per_rad * step_s + drive.damping_nm_s_per_rad) * step_s
     if stiff > motor_inertia_kg_m2:
         raise SpecInvalid(
@@ -316,7 +295,7 @@ def _check_stiffness(drive: Elasticity | Backlash, motor_inertia_kg_m2: float, s
 
 
 def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None) -> pin.Model:
-    """The links of a URDF, with a payload fixed to the last one.
+    """Return the links of a URDF, with a payload fixed to the last one.
 
     Raises:
         SpecInvalid: the text is no URDF, or a joint is neither revolute nor prismatic with limits.

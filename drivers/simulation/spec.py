@@ -1,4 +1,7 @@
-"""Everything that makes up a simulated cell, frozen: its truth. The identification never reads it."""
+"""Description of a simulated cell, its true values and its errors. The identification never reads it.
+
+For a prismatic joint read N for Nm, m for rad and kg for kg m².
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ class Body:
 
 
 class Dialect(Enum):
-    """Whose objects and units an amplifier uses for its current (drivers/simulation/objects.py)."""
+    """Vendor whose objects and units an amplifier uses for its current (see objects.py)."""
 
     CIA402 = "cia402"
     EPOS4 = "epos4"
@@ -42,8 +45,6 @@ class Dialect(Enum):
 @dataclass(frozen=True, slots=True)
 class AxisSpec:
     """One motor, its amplifier, and the joint of the same number.
-
-    Of a prismatic joint, everything that is said at the joint is in N for Nm, m for rad and kg for kg m².
 
     Attributes:
         node_id: CANopen node id.
@@ -58,9 +59,9 @@ class AxisSpec:
         offset_nm: constant torque at the joint.
         current_noise_a: standard deviation of the noise of the current reference [A].
         noise_correlation_s: correlation time of that noise (first-order); 0 is white.
-        dialect: whose objects tell its current.
-        toggle_bit: of statusword 6041h, which it inverts with every SYNC; None for an amplifier without.
-        entered_gain_nm_per_a: what somebody has entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); it is not used.
+        dialect: vendor objects that report its current.
+        toggle_bit: bit of statusword 6041h that is inverted with every SYNC, or None.
+        entered_gain_nm_per_a: gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     """
 
     node_id: int
@@ -87,12 +88,12 @@ class AxisSpec:
 
 @dataclass(frozen=True, slots=True)
 class UndeclaredEffect:
-    """One thing that the plant does and no configuration declares.
+    """Physical effect of the plant that no configuration declares.
 
     Attributes:
-        name: of the physics in drivers/simulation/effects.py.
+        name: key in `effects.EFFECTS`.
         axis: index of the joint, from 0.
-        parameters: of that physics, by name, with units in the names.
+        parameters: by name, with units in the names.
     """
 
     name: str
@@ -111,11 +112,11 @@ class CellSpec:
         axes: one for each motor.
         start_rad: joint positions at power-on [rad or m], shape (n,); encoder counts are zero at joint position zero.
         payload: mounted body, or None.
-        effects: what the plant does beyond the declared model.
-        sync_period_us: one SYNC advances the plant by this much.
+        effects: effects beyond the declared model.
+        sync_period_us: time by which one SYNC advances the plant.
         substeps: control and integration steps in one SYNC period.
-        seed: of every random number of the cell.
-        faults: what goes wrong, and when.
+        seed: seed of the current noise.
+        faults: injected faults.
     """
 
     urdf: str
@@ -131,19 +132,8 @@ class CellSpec:
     faults: tuple[FaultSpec, ...] = ()
 
 
-# What can be wrong with a simulated cell.
-#
-# DriverError
-# └── SimulationError       root of the tree of the simulated cell
-#     ├── SpecInvalid       the cell cannot be built from its description
-#     ├── EffectUnknown     an undeclared effect or a parameter of it does not exist
-#     └── FrictionUnsolved  the dry-friction problem was not solved to its tolerance
-#
-# SdoAbort                  an SDO access that the simulated node refuses: answered on the bus, never raised to a user
-
-
 class SimulationError(DriverError):
-    """Root of the tree of the simulated cell."""
+    """Base of the errors of the simulated cell."""
 
 
 class SpecInvalid(SimulationError):
@@ -169,7 +159,7 @@ class FrictionUnsolved(SimulationError):
 
 
 class SdoAbort(Exception):
-    """An SDO access that the node refuses, with the abort code of CiA 301."""
+    """SDO access that the node refuses with an abort code of CiA 301: answered on the bus, never raised to a user."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"SDO abort {code:#010x}")

@@ -17,6 +17,7 @@ from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission, synchronised_move
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
+from drivers.simulation.faults import FaultKind
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 from tests.faults.cells import CONFIGS, PERIOD_NS, ROOM, let_pass
@@ -46,7 +47,7 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
     )
     if not guarded:
         for node in cell.nodes:
-            node.lose_guard()
+            node.inject(FaultKind.NO_GUARD)
     axes = drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
     with cell:
         network = CanopenNetwork(address, axes, guard_ms=GUARD_MS)

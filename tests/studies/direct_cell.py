@@ -33,7 +33,7 @@ from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
-from drivers.simulation.amplifier import AmplifierSet, tuned
+from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
 from drivers.simulation.drive import Readings, take
 from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.node import NmtCommand, Node
@@ -166,7 +166,7 @@ class DirectStream:
         self._plant.time_s = began_s
         built = (build_effect(effect, n) for effect in spec.effects)
         lags = tuple(effect for effect in built if isinstance(effect, Lag))
-        self._amplifiers = AmplifierSet(spec, tuned(spec, self._plant), lags)
+        self._amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, self._plant), lags)
         self._amplifiers.prime(self._plant.motor_rad)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self._readings = take(self._amplifiers, self._rated_a)

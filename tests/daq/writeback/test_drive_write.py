@@ -369,7 +369,7 @@ def test_what_a_killed_recording_left_is_not_saved(address: BusAddress, listener
         killed.prepare()
         killed.link.close()
         for node in simulation.nodes:
-            node.lose_guard()  # the mapping alone must be enough
+            node.inject(FaultKind.NO_GUARD)  # the mapping alone must be enough
         listener.frames()
         with network_of(cell, address) as network, pytest.raises(ParameterRefused, match="TPDO1: COB-ID 00000181h"):
             _apply(proposal, DriveTarget(cell, network))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.simulation.amplifier import tuned
+from drivers.simulation.amplifier import tuned_inertia_a_s2
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import AxisSpec, Body, CellSpec
 
@@ -107,7 +107,7 @@ def test_the_loops_are_tuned_over_the_travel_of_a_prismatic_joint() -> None:
     assert plant.motor_inertia_at(np.array([0.3, 0.2, 1.1]))[0] == pytest.approx(seen[1])
     counts_per_rad = 65536 / (2 * np.pi)
     expected = np.sqrt(seen[0] * seen[1]) / (40.0 * 100.0 * counts_per_rad)
-    assert tuned(spec, plant).inertia_a_s2[0] == pytest.approx(expected)
+    assert tuned_inertia_a_s2(spec, plant)[0] == pytest.approx(expected)
     # Where it starts is of no account.
     elsewhere = replace(spec, start_rad=np.array([0.0, 0.1, 1.0]))
-    assert tuned(elsewhere, plant).inertia_a_s2 == pytest.approx(tuned(spec, plant).inertia_a_s2)
+    assert tuned_inertia_a_s2(elsewhere, plant) == pytest.approx(tuned_inertia_a_s2(spec, plant))

@@ -29,7 +29,7 @@ def extra_torque_nm(
     load_nm: float = 0.0,
     time_s: float = 0.0,
 ) -> FloatArray:
-    """What the effect adds to the torque on each joint in one step, from the change of velocity that it makes."""
+    """Return the torque that the effect adds on each joint in one step, from its change of velocity."""
     after = []
     for effects in ((), (effect,)):
         plant = Plant(clean_cell(effects=effects))
@@ -169,7 +169,7 @@ def test_coupling_rubs_on_the_sum_of_two_joints() -> None:
 
 
 def held_twist_rad(effect: UndeclaredEffect, current_a: float) -> float:
-    """How far motor 1 stands from its joint when its brake is open, joint 1 free of load, and a current pushes."""
+    """Return the twist between motor 1, driven by a current with its brake open, and its unloaded joint."""
     spec = clean_cell(effects=(effect,))
     # A joint that does not move under this current: the twist is the drive's alone.
     axes = (replace(spec.axes[0], coulomb_nm=500.0, offset_nm=0.0), *spec.axes[1:])

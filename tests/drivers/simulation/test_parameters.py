@@ -1,4 +1,4 @@
-"""What a simulated amplifier keeps: a gain that somebody entered, stored by 1010h, there again after power-on."""
+"""Stored parameters of a simulated amplifier: an entered gain is stored by 1010h and restored at power-on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureReq
     with running(replace(spec, axes=axes), request.node.name) as (_, master):
         assert master.read(1, GAIN, 1, "i") == -11520
         assert struct.unpack("<f", struct.pack("<I", master.read(1, GAIN, 2, "I")))[0] == pytest.approx(-11.52)
-        assert master.read(2, GAIN, 1, "i") == 0  # nobody has entered it, and the cell does not tell its truth
+        assert master.read(2, GAIN, 1, "i") == 0  # not entered, and the cell does not reveal its true gain
 
 
 def test_what_was_stored_comes_back_with_the_power(request: pytest.FixtureRequest) -> None:
