@@ -27,7 +27,7 @@ VERBS = (
     Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
     Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
     Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
-    Listed("plan", "daq.cli.plan:PLAN", "Choose moves that excite every parameter."),
+    Listed("plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
     Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
     Listed("info", "daq.cli.logs:INFO", "Show what is in a log."),
     Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),

@@ -198,7 +198,7 @@ def save_pictures(fitted: Fit, calibration: Calibration, folder: Path) -> None:
         OutputFailed: the file system refuses.
     """
     from daq.cli.terminal import writing
-    from daq.report.fit_plots import draw_fit
+    from daq.report.plots import draw_fit
 
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""`drivegain record`: execute a plan and log every sample. This moves the robot."""
+"""`drivegain plan` and `drivegain record`: plan the moves of a recording, make them, and log them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import typer
 
 from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError
+from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
 from drivers.errors import DriverError, SampleLost
 
 if TYPE_CHECKING:
@@ -204,3 +205,60 @@ RECORD = Verb(
     record_verb,
     "drivegain record cells/demo.yaml plan.yaml --out loaded.mcap --payload disc --mass 4.59 --enable-motion",
 )
+
+
+def plan_verb(
+    cell: CellArgument,
+    out: Annotated[Path, typer.Option("--out", help="Plan to write (YAML).")],
+    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.", min=0)] = 1,
+    duration: Annotated[float, typer.Option(help="Duration of the run [s].", min=5.0, max=3600.0)] = 40.0,
+    payload: Annotated[str | None, typer.Option(help="Payload that will be mounted; the cell's first one.")] = None,
+    exchanges: Annotated[int, typer.Option(help="Changes to try; 0 gives random moves.", min=0)] = EXCHANGES,
+    speed: Annotated[
+        float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
+    ] = 1.0,
+    condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
+    sigma: Annotated[
+        float, typer.Option(help="Largest standard deviation predicted for a gain [%].", min=0.01)
+    ] = LARGEST_STD_PERCENT,
+    json: JsonOption = False,
+) -> None:
+    """Choose point-to-point moves that identify the worst gain as precisely as the time allows.
+
+    The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
+    these moves made once without load and once with the payload.
+    """
+    from daq.cli.terminal import check_output, progress_bar, writing
+    from daq.config.cell_file import load_cell
+    from daq.report.plan import plan_document, plan_text
+    from daq.workflow.experiment import RUNS, experiment_of, paths_of
+    from daq.workflow.plan import extra_moves, plan
+    from daq.workflow.plan_file import save_plan
+    from ident.planning.verdict import verdicts
+
+    check_output(out, (cell,), "drivegain-plan")
+    declared = load_cell(cell)
+    experiment = experiment_of(declared, payload)
+    with progress_bar("planning") as report_progress:
+        made = plan(
+            declared,
+            seed=seed,
+            duration_s=duration,
+            exchanges=exchanges,
+            speed=speed,
+            largest_condition=condition,
+            largest_std_percent=sigma,
+            experiment=experiment,
+            progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
+        )
+    with writing(out):
+        save_plan(made, out)
+    excitation, _ = experiment.excitation(paths_of(declared, made.moves))
+    judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))
+    if json:
+        print_json(plan_document(out, declared, experiment, made, judged))
+    else:
+        typer.echo(plan_text(out, declared, experiment, made, judged))
+
+
+PLAN = Verb("plan", plan_verb, "drivegain plan cells/demo.yaml --out plan.yaml --seed 1 --duration 40")

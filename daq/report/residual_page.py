@@ -12,11 +12,10 @@ from daq.errors import OutputFailed
 from daq.files import replace_file
 from daq.report.effect_names import effect_text, placed_name, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
-from daq.report.fit_plots import draw_effect, draw_torques
 from daq.report.gains import partial_note, plot_gain_changes, with_deviation
+from daq.report.plots import Bar, draw_effect, draw_torques, plot_ranking
 from daq.report.residual import WHEN, ErrorRow, error_rows, summary
 from daq.report.residual_document import FORMAT, VERSION, residual_document
-from daq.report.residual_plots import Bar, plot_ranking
 from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.report import paper_tables
-from daq.report.fit_plots import plot_torques
+from daq.report.plots import plot_torques
 from daq.report.text import percent_text, plain_table, printable, terminal_text
 from daq.workflow.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun
 from daq.workflow.fit import DOUBTFUL_PERCENT

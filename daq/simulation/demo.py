@@ -19,7 +19,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
-from daq.report.fit_plots import draw_fit
+from daq.report.plots import draw_fit
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.calibration_file import as_document, save
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit

@@ -17,8 +17,8 @@ from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.model.bodies import Body
 from ident.model.model import Model
-from ident.physical.inertia_prior import InertiaPrior, inertia_prior
 from ident.physical.physical import PhysicalParameters, physical_parameters
+from ident.physical.programme import InertiaPrior, inertia_prior
 from ident.physical.regrouping import random_motion, regroup
 from ident.prediction import placed_effect
 

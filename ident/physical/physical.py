@@ -11,8 +11,7 @@ from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import pseudo_inertia
 from ident.model.model import Model
-from ident.physical.inertia_prior import InertiaPrior
-from ident.physical.programme import MARGIN, NotPhysical, Programme, relative_to_prior
+from ident.physical.programme import MARGIN, InertiaPrior, NotPhysical, Programme, relative_to_prior
 
 FloatArray = NDArray[np.float64]
 

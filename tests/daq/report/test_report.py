@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.console import Console
 
-from daq.report.fit_plots import plot_torques
 from daq.report.gains import gain_table, plot_gains, with_deviation
 from daq.report.picture import thinned
-from daq.report.residual_plots import plot_residual
+from daq.report.plots import plot_residual, plot_torques
 from tests.daq.calibrations import AXES, demo_calibration
 
 FloatArray = NDArray[np.float64]
@@ -143,7 +142,7 @@ def test_a_value_is_rounded_by_its_uncertainty(value: float, std: float, text: s
 
 
 def test_pictures_need_no_screen_and_no_global_state() -> None:
-    modules = "daq.report.fit_plots, daq.report.residual_plots, daq.report.gains"
+    modules = "daq.report.plots, daq.report.plots, daq.report.gains"
     code = f"import sys, {modules}; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"

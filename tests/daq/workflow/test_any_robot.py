@@ -19,7 +19,7 @@ from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, PositionImplausible, SchemaMismatch
 from daq.log.conversion import check_limits, scaling
 from daq.log.metadata import AxisReadback, Readback
-from daq.report.fit_plots import plot_torques
+from daq.report.plots import plot_torques
 from daq.simulation.simulation_file import load_simulation
 from ident.model.model import DriveTrain
 from ident.model.robot import JointKind

@@ -28,7 +28,7 @@ from ident.model.base import base_parameters
 from ident.model.bodies import Body
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import robot_from_urdf
-from ident.physical.inertia_prior import urdf_links
+from ident.physical.programme import urdf_links
 from ident.physical.regrouping import random_motion
 from tests.ident.arms import GANTRY
 

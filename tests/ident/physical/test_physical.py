@@ -17,9 +17,8 @@ from ident.model.bodies import body_of, link_parameters, pseudo_inertia
 from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import robot_from_urdf
-from ident.physical.inertia_prior import DEFAULT_MASS_KG, inertia_prior
 from ident.physical.physical import SLACK, PhysicalParameters, physical_parameters
-from ident.physical.programme import MARGIN, NotPhysical
+from ident.physical.programme import DEFAULT_MASS_KG, MARGIN, NotPhysical, inertia_prior
 from ident.physical.regrouping import random_motion, regroup
 from tests.ident.arms import ARMS, GANTRY, GRAVITIES, TX40, Arm
 from tests.ident.recordings import RATIO
