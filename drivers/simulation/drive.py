@@ -263,14 +263,6 @@ class Drive:
 
     def _start(self, target: int, settings: Settings) -> None:
         axis = self._amplifiers.loops[self._index]
-        self._amplifiers.move(
-            self._index,
-            plan(
-                float(axis["demand"]),
-                float(axis["demand_velocity"]),
-                float(target),
-                float(settings.speed),
-                float(settings.acceleration),
-                float(settings.deceleration),
-            ),
-        )
+        demand, velocity = float(axis["demand"]), float(axis["demand_velocity"])
+        ramps = (float(settings.acceleration), float(settings.deceleration))
+        self._amplifiers.move(self._index, plan(demand, velocity, float(target), float(settings.speed), *ramps))

@@ -56,7 +56,14 @@ def free_motion(
     m = len(directions)
     inertia = np.zeros((total, total))
     momentum = np.zeros(total)
-    _assemble_links(mass, bias, viscous, torque, velocity, step_s, inertia, momentum)
+    for i in range(len(bias)):
+        for j in range(len(bias)):
+            inertia[i, j] = mass[i, j]
+            momentum[i] += mass[i, j] * velocity[j]
+        momentum[i] -= step_s * bias[i]
+    for i in range(total):
+        momentum[i] += step_s * torque[i]
+        inertia[i, i] += step_s * viscous[i]
     _add_motors(motor_direction, motor_inertia, motor_viscous, motor_torque, velocity, step_s, inertia, momentum)
     _factorise(inertia)
     _substitute(inertia, momentum)
@@ -77,28 +84,6 @@ def free_motion(
             for i in range(total):
                 s += directions[k, i] * response[i, j]
             delassus[k, j] = s
-
-
-@compiled
-def _assemble_links(
-    mass: FloatArray,
-    bias: FloatArray,
-    viscous: FloatArray,
-    torque: FloatArray,
-    velocity: FloatArray,
-    step_s: float,
-    inertia: FloatArray,
-    momentum: FloatArray,
-) -> None:
-    n = len(bias)
-    for i in range(n):
-        for j in range(n):
-            inertia[i, j] = mass[i, j]
-            momentum[i] += mass[i, j] * velocity[j]
-        momentum[i] -= step_s * bias[i]
-    for i in range(len(velocity)):
-        momentum[i] += step_s * torque[i]
-        inertia[i, i] += step_s * viscous[i]
 
 
 @compiled

@@ -61,7 +61,11 @@ class Stored:
 
 
 class Node:
-    """Node and its object dictionary; all methods are called from the cell's one thread."""
+    """Node and its object dictionary; all methods are called from the cell's one thread.
+
+    Attributes:
+        saved: parameters that become valid with the next power-on.
+    """
 
     def __init__(
         self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, readings: Callable[[], Readings], send: Send
@@ -81,8 +85,8 @@ class Node:
         self._values: dict[tuple[int, int], Value] = {key: entry.default for key, entry in self._dictionary.items()}
         self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary)
         self._triggers = tuple(TransmitTrigger(pdo, self._source) for pdo in self._transmit)
-        self._saved = self._stored()
-        self._defaults = self._saved
+        self.saved = self._stored()
+        self._defaults = self.saved
         self._pending: dict[int, bytes] = {}
         self._history: list[int] = []
         self._kept_settings: Settings | None = None
@@ -94,11 +98,6 @@ class Node:
         self._toggle_mask = 0 if axis.toggle_bit is None else 1 << axis.toggle_bit
         self._refused: set[int] = set()
         self._obeys_nmt = True
-
-    @property
-    def saved(self) -> Stored:
-        """Parameters that become valid with the next power-on."""
-        return self._saved
 
     def boot(self, wall_s: float) -> None:
         """Send the boot-up message and enter PRE-OPERATIONAL."""
@@ -124,12 +123,12 @@ class Node:
             self.nmt = NmtState.PRE_OPERATIONAL
         elif command == NmtCommand.RESET_NODE:
             self.drive.reset()
-            self._restore(self._saved, first=0x1000, last=0x9FFF)
+            self._restore(self.saved, first=0x1000, last=0x9FFF)
             self._history.clear()
             self.boot(wall_s)
         elif command == NmtCommand.RESET_COMMUNICATION:
             self._connection_lost()
-            self._restore(self._saved, first=0x1000, last=0x1FFF)
+            self._restore(self.saved, first=0x1000, last=0x1FFF)
             self.boot(wall_s)
 
     def hear_heartbeat(self, producer: int, wall_s: float) -> None:
@@ -291,7 +290,7 @@ class Node:
         if value != (SAVE if index == STORE else LOAD):
             raise SdoAbort(NOT_STORED)
         # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
-        self._saved = self._stored() if index == STORE else self._defaults
+        self.saved = self._stored() if index == STORE else self._defaults
 
     def _pdo(self, index: int) -> Pdo | None:
         if not 0x1400 <= index <= 0x1BFF:
@@ -353,20 +352,17 @@ class Node:
 
     def _settings(self) -> Settings:
         if self._kept_settings is None:
-            self._kept_settings = self._read_settings()
+            number = self._number
+            self._kept_settings = Settings(
+                mode=number(0x6060),
+                target=number(0x607A),
+                speed=number(0x6081),
+                acceleration=number(0x6083),
+                deceleration=number(0x6084),
+                quick_stop_deceleration=number(0x6085),
+                quick_stop=number(0x605A),
+            )
         return self._kept_settings
-
-    def _read_settings(self) -> Settings:
-        number = self._number
-        return Settings(
-            mode=number(0x6060),
-            target=number(0x607A),
-            speed=number(0x6081),
-            acceleration=number(0x6083),
-            deceleration=number(0x6084),
-            quick_stop_deceleration=number(0x6085),
-            quick_stop=number(0x605A),
-        )
 
     def _apply_settings(self) -> None:
         self._loop["error_window"] = self._number(0x6065)

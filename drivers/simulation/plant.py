@@ -130,8 +130,7 @@ class Plant:
         for drive in layout.flexible:
             _check_stiffness(drive, spec.axes[drive.axis].motor_inertia_kg_m2, step_s)
         m, total = layout.directions.shape
-        own_row, added = layout.own_row, [0.0] * len(layout.flexible)
-        axes = spec.axes
+        axes, added = spec.axes, [0.0] * len(layout.flexible)
         self.time_s = 0.0
         self.position_rad = np.concatenate([spec.start_rad, [drive.row @ spec.start_rad for drive in layout.flexible]])
         self.velocity_rad_s = np.zeros(total)
@@ -150,11 +149,11 @@ class Plant:
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
         self._torque = np.array([-a.offset_nm for a in axes] + added)
         self._directions = layout.directions
-        self._own_row = own_row
+        self._own_row = layout.own_row
         self._lone = layout.lone
         self._free_bound = np.zeros(m)
         self._free_bound[:n] = [a.coulomb_nm for a in axes]
-        for row, axis in zip(own_row, axes, strict=True):
+        for row, axis in zip(layout.own_row, axes, strict=True):
             self._free_bound[row] += axis.motor_coulomb_nm
         self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
         self._bound = self._free_bound.copy()
