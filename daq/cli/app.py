@@ -22,7 +22,7 @@ from drivers.errors import DriverError
 from ident.errors import IdentificationError
 
 VERBS = (
-    Listed("demo", "daq.cli.demo:DEMO", "Run the whole calibration on a simulated six-axis cell."),
+    Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
     Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
     Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
     Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),

@@ -11,7 +11,7 @@ import pytest
 from daq.errors import ConfigurationInconsistent, SchemaMismatch, UsageError
 from daq.simulation.simulation_file import load_simulation
 
-READERS = {"daq/cli/simulate.py", "daq/cli/demo.py", "daq/simulation/demo.py"}
+READERS = {"daq/cli/simulate.py", "daq/simulation/demo.py"}
 
 
 def test_the_truth_is_read(checkout: Path) -> None:
