@@ -216,21 +216,18 @@ class Node:
     def send_sync(self, now_us: int) -> None:
         """Send the transmit PDOs of this SYNC."""
         self._now_us = now_us
-        if self.nmt is NmtState.OPERATIONAL:
-            for trigger in self._triggers:
-                if trigger.pdo.valid:
-                    data = trigger.on_sync(now_us)
-                    if data is not None:
-                        self._send(trigger.pdo.can_id, data)
+        self._transmit_pdos(TransmitTrigger.on_sync)
 
     def send_events(self) -> None:
         """Send the event-driven transmit PDOs whose values changed."""
+        self._transmit_pdos(TransmitTrigger.on_event)
+
+    def _transmit_pdos(self, due: Callable[[TransmitTrigger, int], bytes | None]) -> None:
         if self.nmt is NmtState.OPERATIONAL:
             for trigger in self._triggers:
-                if trigger.pdo.valid:
-                    data = trigger.on_event(self._now_us)
-                    if data is not None:
-                        self._send(trigger.pdo.can_id, data)
+                data = due(trigger, self._now_us) if trigger.pdo.valid else None
+                if data is not None:
+                    self._send(trigger.pdo.can_id, data)
 
     def request(self, data: bytes) -> None:
         """Answer an SDO request; a stopped node is silent."""
