@@ -24,7 +24,7 @@ def test_no_output_over_an_input_or_another_file(
     recording = copied_log.read_bytes()
     fixed = ["fit", str(copied_log), "--gains", "fixed", "--out"]
     assert main([*fixed, str(copied_log)]) == ExitCode.USAGE
-    assert "one of the files to read" in capsys.readouterr().err
+    assert "one of the input files" in capsys.readouterr().err
     assert copied_log.read_bytes() == recording
     notes = tmp_path / "notes.txt"
     notes.write_text("mine")

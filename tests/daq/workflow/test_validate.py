@@ -59,7 +59,9 @@ def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytes
     assert (tmp_path / "new" / "folder" / "tx40.png").read_bytes().startswith(b"\x89PNG")
     (tmp_path / "occupied").write_text("", encoding="utf-8")
     assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "occupied")]) == 1
-    assert "tx40.png" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert f"error:    {tmp_path / 'occupied'}\n" in error
+    assert "expected: a folder" in error
 
 
 def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, Path]) -> None:
