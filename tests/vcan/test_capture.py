@@ -32,7 +32,7 @@ SPARE = "vcan9"
 PERIOD_US = 20_000
 HOLDER = """
 import sys, time
-from drivers.socketcan import open_socketcan
+from drivers.stream.socketcan import open_socketcan
 bus = open_socketcan(sys.argv[1])
 print(bus.capture_pid, flush=True)
 while True:
