@@ -44,7 +44,7 @@ from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
 SEED = 0
-"""Of the significance test of the loop: that of `drivegain residual`."""
+"""Seed of the loop's significance test, the same as in `drivegain residual`."""
 
 
 class Loop(Enum):

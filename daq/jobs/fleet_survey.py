@@ -181,7 +181,7 @@ def _name_errors(address: str) -> Iterator[None]:
 
 
 HEAD_BYTES = 4 * 2**20
-"""Of a log in an object store, to begin with: its configuration files and first samples are within, as a rule."""
+"""First read of a log in an object store; it usually holds the configuration files and the first samples."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from ident.planning.excitation import (
 )
 
 LINK_RADIUS = 0.08
-"""Of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
+"""Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
 POSTURES = 400
 ALWAYS = 0.03
 """Two capsules that are apart in a smaller share of random postures belong together, as at a shared joint."""

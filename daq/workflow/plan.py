@@ -128,7 +128,7 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
 FloatArray = NDArray[np.float64]
 
 SECONDS = 5.0
-"""Of each kind of extra moves, so that they can be compared."""
+"""Duration of the extra moves of each kind, so that the kinds can be compared."""
 POSTURES = 300
 POSITION_MARGIN = 0.03
 SLOW = 0.2

@@ -183,6 +183,12 @@ def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> Non
         if len(bad):
             first = f"the first in sample {bad[0][0]}, axis {bad[0][1] + 1}"
             raise DataUnfit(run.name, f"{label} holds {len(bad)} non-finite values, {first}")
+    if run.payload is not None and "m" in run.payload.known:
+        mass_kg = run.payload.known["m"]
+        if not 0.0 < mass_kg < np.inf:  # a negative mass would reverse the sign of every gain
+            raise DataUnfit(
+                run.name, f"payload {run.payload.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg"
+            )
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
         raise DataUnfit(run.name, f"{speeds} standstill speeds for {count} joints; give one a joint")
