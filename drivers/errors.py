@@ -24,8 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-WHILE = "while "
-"""Prefix of the notes that report what a stop, or the closing of a network, could not confirm."""
+WHILE = "while "  #: Prefix of the notes that report what a stop, or the closing of a network, could not confirm
 
 
 class NamedNode(Protocol):

@@ -16,20 +16,13 @@ from ident.estimators.identify import Identification
 
 @dataclass(frozen=True, slots=True)
 class Gain:
-    """One joint drive gain g = N·Gt·Kt (paper eq. 4).
+    """One joint drive gain g = N·Gt·Kt (paper eq. 4)."""
 
-    Attributes:
-        axis: name of the axis.
-        value, std: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed.
-        unit: Nm at the joint per unit of the current-loop reference.
-        nameplate: the manufacturer's a priori gain [unit].
-    """
-
-    axis: str
-    value: float
-    std: float
-    unit: str
-    nameplate: float
+    axis: str  #: name of the axis
+    value: float  #: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed
+    std: float  #: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed
+    unit: str  #: Nm at the joint per unit of the current-loop reference
+    nameplate: float  #: the manufacturer's a priori gain [unit]
 
     @property
     def std_percent(self) -> float:
@@ -59,50 +52,33 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedEffect:
-    """An effect that the declared model lacked and that held-out data asked for.
+    """An effect that the declared model lacked and that held-out data asked for."""
 
-    Attributes:
-        name: family, as in ident/effects/.
-        axis: name of the axis, or of all together.
-        settings: the searched (non-linear) parameters by name, units in the names.
-        coefficients: the linear parameters, identified.
-        error_before_percent, error_after_percent: of the axis, or in total for an effect on all motors, without and
-            with the effect, on data that the fit did not use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or
-            where these say nothing of it ‖e‖/‖v‖ of the motor that feels it most, on moves left out in turn.
-        ambiguity: families whose held-out score does not differ from this one's.
-    """
-
-    name: str
-    axis: str
-    settings: dict[str, float]
-    coefficients: tuple[Parameter, ...]
+    name: str  #: family, as in ident/effects/
+    axis: str  #: name of the axis, or of all together
+    settings: dict[str, float]  #: the searched (non-linear) parameters by name, units in the names
+    coefficients: tuple[Parameter, ...]  #: the linear parameters, identified
+    #: Of the axis, or in total for an effect on all motors, without and with the effect, on data that the fit did not
+    #: use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or where these say nothing of it ‖e‖/‖v‖ of the motor
+    #: that feels it most, on moves left out in turn.
     error_before_percent: float
-    error_after_percent: float
-    ambiguity: tuple[str, ...] = ()
+    error_after_percent: float  #: see `error_before_percent`
+    ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One log that the calibration rests on.
+    """One log that the calibration rests on."""
 
-    Attributes:
-        name: of the log.
-        sha256: its digest.
-        role: in the fit.
-        partial: it is what was saved of a recording that was never finished, or one with losses; nothing of
-            it may reach a controller.
-        payload: name of what was mounted; None without load, and in calibrations of earlier versions.
-        mass_kg: of it, as fitted; None where it was not declared.
-        recording: how the log was made; None in calibrations of earlier versions.
-    """
-
-    name: str
-    sha256: str
-    role: str
+    name: str  #: of the log
+    sha256: str  #: its digest
+    role: str  #: in the fit
+    #: It is what was saved of a recording that was never finished, or one with losses; nothing of it may reach a
+    #: controller.
     partial: bool = False
-    payload: str | None = None
-    mass_kg: float | None = None
-    recording: Recording | None = None
+    payload: str | None = None  #: name of what was mounted; None without load, and in calibrations of earlier versions
+    mass_kg: float | None = None  #: of it, as fitted; None where it was not declared
+    recording: Recording | None = None  #: how the log was made; None in calibrations of earlier versions
 
 
 @dataclass(frozen=True, slots=True)

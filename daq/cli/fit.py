@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from daq.workflow.fit import Fit
     from ident.calibration import Calibration
 
-CALIBRATION, TABLES = "drivegain-calibration", "drivegain-fit-tables"
-"""Formats of the files that `fit` writes."""
+CALIBRATION, TABLES = "drivegain-calibration", "drivegain-fit-tables"  #: Formats of the files that `fit` writes
 
 
 class Gains(Enum):

@@ -23,11 +23,9 @@ if TYPE_CHECKING:
     from daq.ledger.ledger import Ledger, Verification
     from daq.ledger.watch import Series
 
-_SHOWN = 5
-"""Sentences of a kind in an error; --json has all."""
+_SHOWN = 5  #: Sentences of a kind in an error; --json has all
 
-_PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}
-"""Suffixes of pictures, and how such a file begins."""
+_PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}  #: Suffixes of pictures, and how such a file begins
 
 
 def history_verb(

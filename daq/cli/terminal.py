@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 _HEAD_BYTES = 4096
 
-ProgressCallback = Callable[[int, int, str], None]
-"""Called with the number done, the total, and a remark."""
+ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
@@ -178,8 +177,7 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-GRACE_S = 10.0
-"""Longer than a stop of all axes takes."""
+GRACE_S = 10.0  #: Longer than a stop of all axes takes
 
 
 @contextmanager

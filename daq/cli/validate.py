@@ -13,8 +13,7 @@ from daq.errors import CalibrationMissing
 if TYPE_CHECKING:
     from ident.calibration import Calibration
 
-TABLES = "drivegain-validation-tables"
-"""Format of the page of tables."""
+TABLES = "drivegain-validation-tables"  #: Format of the page of tables
 
 
 def validate_verb(

@@ -25,17 +25,11 @@ CalibrationArgument = Annotated[Path, typer.Argument(help="calibration.yaml writ
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """One verb.
+    """One verb."""
 
-    Attributes:
-        name: on the command line.
-        function: takes its arguments as typer parses them; its docstring is the help.
-        example: a command line that works, shown at the end of the help.
-    """
-
-    name: str
-    function: Callable[..., None]
-    example: str
+    name: str  #: on the command line
+    function: Callable[..., None]  #: takes its arguments as typer parses them; its docstring is the help
+    example: str  #: a command line that works, shown at the end of the help
 
     def command(self) -> Any:
         """Click command of this verb."""
@@ -55,13 +49,9 @@ class Verb:
 
 @dataclass(frozen=True, slots=True)
 class VerbGroup(Verb):
-    """Verb of several kinds, each with its own arguments: `drivegain export urdf …`.
+    """Verb of several kinds, each with its own arguments: `drivegain export urdf …`."""
 
-    Attributes:
-        kinds: in the order of the help.
-    """
-
-    kinds: tuple[Verb, ...]
+    kinds: tuple[Verb, ...]  #: in the order of the help
 
     def command(self) -> Any:
         """Click group of the kinds; the docstring of `function`, which takes no arguments, is the help."""
@@ -79,17 +69,11 @@ def _app(**settings: Any) -> typer.Typer:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """Entry of the list of verbs, before the verb is imported.
+    """Entry of the list of verbs, before the verb is imported."""
 
-    Attributes:
-        name: on the command line.
-        place: where its `Verb` is defined, as module:name.
-        summary: one line for the list.
-    """
-
-    name: str
-    place: str
-    summary: str
+    name: str  #: on the command line
+    place: str  #: where its `Verb` is defined, as module:name
+    summary: str  #: one line for the list
 
     def load(self) -> Verb:
         """Import the verb."""

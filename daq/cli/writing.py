@@ -31,15 +31,10 @@ ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator
 
 @dataclass(frozen=True, slots=True)
 class Applier:
-    """The operator.
+    """The operator."""
 
-    Attributes:
-        name: as given, or the login.
-        login: of the operating system.
-    """
-
-    name: str
-    login: str
+    name: str  #: as given, or the login
+    login: str  #: of the operating system
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -30,17 +30,12 @@ SETPOINTS = 4
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """Load of a recording on one bus, as shares of its capacity.
+    """Load of a recording on one bus, as shares of its capacity."""
 
-    Attributes:
-        mean: SYNC, answers, heartbeats, and the set-points of one move per second, with usual stuffing.
-        worst: SYNC and answers alone, with maximal stuffing.
-        start: the cycle in which all axes start, with usual stuffing. Above 1 it takes longer than a period, and
-            answers may be late.
-    """
-
-    mean: float
-    worst: float
+    mean: float  #: SYNC, answers, heartbeats, and the set-points of one move per second, with usual stuffing
+    worst: float  #: SYNC and answers alone, with maximal stuffing
+    #: The cycle in which all axes start, with usual stuffing. Above 1 it takes longer than a period, and answers may be
+    #: late.
     start: float
 
     @property

@@ -29,19 +29,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class JointUnit:
-    """Unit in which people read a joint. Inside, everything is in SI.
+    """Unit in which people read a joint. Inside, everything is in SI."""
 
-    Attributes:
-        name: unit of positions; speeds are per second.
-        si: one unit, in rad or m.
-        si_name: rad or m.
-        force: Nm or N; a drive gain is that per unit of the current reference.
-    """
-
-    name: str
-    si: float
-    si_name: str
-    force: str
+    name: str  #: unit of positions; speeds are per second
+    si: float  #: one unit, in rad or m
+    si_name: str  #: rad or m
+    force: str  #: Nm or N; a drive gain is that per unit of the current reference
 
     def spell(self, value: float) -> str:
         """Format a position (or, with "/s" appended, a speed) given in SI: `12.5 deg`."""
@@ -97,17 +90,11 @@ class Sync:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a joint, in SI: rad, or m for a prismatic joint.
+    """Limits of a joint, in SI: rad, or m for a prismatic joint."""
 
-    Attributes:
-        position: lower and upper end [rad or m].
-        velocity: largest speed [rad/s or m/s].
-        acceleration: largest acceleration [rad/s² or m/s²].
-    """
-
-    position: tuple[float, float]
-    velocity: float
-    acceleration: float
+    position: tuple[float, float]  #: lower and upper end [rad or m]
+    velocity: float  #: largest speed [rad/s or m/s]
+    acceleration: float  #: largest acceleration [rad/s² or m/s²]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,18 +129,13 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class WeighedPayload:
-    """A body that can be mounted.
+    """A body that can be mounted."""
 
-    Attributes:
-        name, mounting: the body, and the one way in which it is mounted.
-        mass_kg, mass_tolerance_kg: as weighed [kg].
-        known: further inertial parameters, from its drawing, by their names in ident.model.bodies.LINK_PARAMETERS.
-    """
-
-    name: str
-    mounting: str
-    mass_kg: float
-    mass_tolerance_kg: float
+    name: str  #: the body, and the one way in which it is mounted
+    mounting: str  #: the body, and the one way in which it is mounted
+    mass_kg: float  #: as weighed [kg]
+    mass_tolerance_kg: float  #: as weighed [kg]
+    #: Further inertial parameters, from its drawing, by their names in ident.model.bodies.LINK_PARAMETERS.
     known: dict[str, float]
 
     @property
@@ -170,8 +152,7 @@ class WeighedPayload:
 class MotionPolicy(Enum):
     """Permission that a recording needs to move the axes."""
 
-    ASK = "ask"
-    """The operator's, every time: --enable-motion."""
+    ASK = "ask"  #: The operator's, every time: --enable-motion
     ALLOWED = "allowed"
     """None: a fenced cell whose safety chain does not depend on this program, for scheduled recordings."""
 

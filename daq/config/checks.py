@@ -23,10 +23,8 @@ from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, robot_from_urdf
 
-LARGEST_CONDITION = 1e8
-"""Largest condition number of R; above it, joint positions do not follow from motor positions."""
-LARGEST_TOLERANCE = 0.1
-"""Largest tolerance, as a share of the payload's mass: a wrong weight scales all gains alike."""
+LARGEST_CONDITION = 1e8  #: Largest condition number of R; above it, joint positions do not follow from motor positions
+LARGEST_TOLERANCE = 0.1  #: Largest tolerance, as a share of the payload's mass: a wrong weight scales all gains alike
 
 
 def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str, DriveProfile]) -> None:
@@ -143,17 +141,12 @@ def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
 
 @dataclass(frozen=True, slots=True)
 class _Plausible:
-    """Positions that a joint can have, in its unit.
+    """Positions that a joint can have, in its unit."""
 
-    Attributes:
-        farthest, too_far: largest position, and the most likely unit of a larger one.
-        shortest, too_short: smallest range, and the most likely unit of a smaller one.
-    """
-
-    farthest: float
-    too_far: str
-    shortest: float
-    too_short: str
+    farthest: float  #: largest position, and the most likely unit of a larger one
+    too_far: str  #: largest position, and the most likely unit of a larger one
+    shortest: float  #: smallest range, and the most likely unit of a smaller one
+    too_short: str  #: smallest range, and the most likely unit of a smaller one
 
 
 _PLAUSIBLE = {
@@ -295,8 +288,7 @@ def _urdf_limits(urdf: str) -> list[tuple[float, float] | None]:
     return limits
 
 
-SIMULATED_INTERFACES = ("virtual", "socketcand")
-"""Interfaces of simulated cells; any other may have a machine on it."""
+SIMULATED_INTERFACES = ("virtual", "socketcand")  #: Interfaces of simulated cells; any other may have a machine on it
 
 
 def _bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
@@ -400,8 +392,7 @@ def _path(model: CellModel, index: int) -> Location:
     return ("bus", index) if isinstance(model.bus, tuple) else ("bus",)
 
 
-KERNEL_INTERFACE = "socketcan"
-"""Only SocketCAN's broadcast manager sends SYNC from the kernel."""
+KERNEL_INTERFACE = "socketcan"  #: Only SocketCAN's broadcast manager sends SYNC from the kernel
 
 
 def _producer_faults(model: CellModel) -> Iterator[Fault]:

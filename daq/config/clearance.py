@@ -19,19 +19,12 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Clearance:
-    """The room around the arm, in the types of `ident.planning.clearance`.
+    """The room around the arm, in the types of `ident.planning.clearance`."""
 
-    Attributes:
-        workspace: box for everything on the last link, None if it is not declared.
-        minimum_m: smallest distance [m].
-        capsules: shape of the arm; empty if it is not declared.
-        obstacles: boxes in the base frame.
-    """
-
-    workspace: Box | None
-    minimum_m: float
-    capsules: tuple[Capsule, ...]
-    obstacles: tuple[Box, ...]
+    workspace: Box | None  #: box for everything on the last link, None if it is not declared
+    minimum_m: float  #: smallest distance [m]
+    capsules: tuple[Capsule, ...]  #: shape of the arm; empty if it is not declared
+    obstacles: tuple[Box, ...]  #: boxes in the base frame
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,20 +35,13 @@ class GainObject:
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """Destination of the gains.
+    """Destination of the gains."""
 
-    Attributes:
-        file: the controller file, relative to the cell file; None if the gains go only to the drives.
-        gains: key of each axis's number in the file; empty without a file.
-        factors: number in the file = gain × factor, one for each of `gains`.
-        format: format of the file; None to derive it from the suffix.
-        objects: objects of the drives, one for each axis; empty if the drives are not written.
-    """
-
-    file: str | None
-    gains: tuple[str, ...]
-    factors: tuple[float, ...] = ()
-    format: ControllerFormat | None = None
+    file: str | None  #: the controller file, relative to the cell file; None if the gains go only to the drives
+    gains: tuple[str, ...]  #: key of each axis's number in the file; empty without a file
+    factors: tuple[float, ...] = ()  #: number in the file = gain × factor, one for each of `gains`
+    format: ControllerFormat | None = None  #: format of the file; None to derive it from the suffix
+    #: Objects of the drives, one for each axis; empty if the drives are not written.
     objects: tuple[GainObject, ...] = ()
 
 

@@ -48,19 +48,12 @@ class TimeUnit(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Layout of the files.
+    """Layout of the files."""
 
-    Attributes:
-        delimiter: between fields; " " means any white space.
-        decimal: point or comma.
-        skip_rows: lines before the header.
-        header: whether a line of names precedes the numbers.
-    """
-
-    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","
-    decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."
-    skip_rows: Annotated[int, Field(ge=0)] = 0
-    header: bool = True
+    delimiter: Annotated[str, Field(min_length=1, max_length=1)] = ","  #: between fields; " " means any white space
+    decimal: Annotated[str, Field(pattern=r"^[.,]$")] = "."  #: point or comma
+    skip_rows: Annotated[int, Field(ge=0)] = 0  #: lines before the header
+    header: bool = True  #: whether a line of names precedes the numbers
 
     @model_validator(mode="after")
     def _check_delimiter(self) -> Table:
@@ -99,28 +92,19 @@ class TimeColumn:
 
 
 class ImportDescription(StrictModel):
-    """A whole import description.
+    """A whole import description."""
 
-    Attributes:
-        name: name of the recording.
-        cell: cell file, relative to this one.
-        table: layout of the files.
-        position, current: the columns.
-        rate_hz, time: sampling rate [Hz], or the time column; exactly one of the two.
-        payload, mounting: mounted payload, named as in the cell; None without load.
-        operator: person who recorded it.
-    """
-
-    name: Name
-    cell: FileName
-    table: Table = Table()
-    position: PositionColumns
-    current: CurrentColumns
+    name: Name  #: name of the recording
+    cell: FileName  #: cell file, relative to this one
+    table: Table = Table()  #: layout of the files
+    position: PositionColumns  #: the columns
+    current: CurrentColumns  #: the columns
+    #: Sampling rate [Hz], or the time column; exactly one of the two.
     rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
-    time: TimeColumn | None = None
-    payload: Name | None = None
-    mounting: Name | None = None
-    operator: str = ""
+    time: TimeColumn | None = None  #: sampling rate [Hz], or the time column; exactly one of the two
+    payload: Name | None = None  #: mounted payload, named as in the cell; None without load
+    mounting: Name | None = None  #: mounted payload, named as in the cell; None without load
+    operator: str = ""  #: person who recorded it
 
 
 def load_import(path: Path) -> ImportDescription:

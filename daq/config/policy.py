@@ -18,10 +18,8 @@ _Percent = Annotated[float, Field(ge=0)]
 class AppliedBy(Enum):
     """Who applies the result of a scheduled job."""
 
-    PERSON = "person"
-    """The job proposes; a named person applies."""
-    JOB = "job"
-    """The job itself, if every gate passes."""
+    PERSON = "person"  #: The job proposes; a named person applies
+    JOB = "job"  #: The job itself, if every gate passes
 
 
 class HoldOut(Enum):
@@ -33,34 +31,23 @@ class HoldOut(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ApplyPolicy:
-    """Bounds of the write-back.
+    """Bounds of the write-back."""
 
-    Attributes:
-        max_change_percent: change from the gain in the controller file [%].
-        max_nameplate_percent: change from the manufacturer's gain [%].
-        max_std_percent: relative standard deviation of the identified gain [%].
-        max_error_percent: relative error of all torques, on held-out data where available [%].
-        max_axis_error_percent: the same for each axis [%].
-        max_age_days: age of the oldest log [days]; None to ignore it, as for imported logs, which have no time.
-        max_saturated_percent: share of an axis's samples in which a limit was active [%].
-        by: who applies the result of a scheduled job.
-        signatures: number of signers who must have signed the calibration, not counting the operator who applies it.
-        signers: public key (minisign) of each person who may sign, by name.
-        holdout: whether held-out data are required; None means required if the job itself applies.
-        max_change: largest change from the gain in the controller file, by axis name [unit of the gain].
-    """
-
-    max_change_percent: _Percent = 35.0
-    max_nameplate_percent: _Percent = 50.0
-    max_std_percent: _Percent = 3.0
-    max_error_percent: _Percent = 25.0
-    max_axis_error_percent: _Percent = 50.0
+    max_change_percent: _Percent = 35.0  #: change from the gain in the controller file [%]
+    max_nameplate_percent: _Percent = 50.0  #: change from the manufacturer's gain [%]
+    max_std_percent: _Percent = 3.0  #: relative standard deviation of the identified gain [%]
+    max_error_percent: _Percent = 25.0  #: relative error of all torques, on held-out data where available [%]
+    max_axis_error_percent: _Percent = 50.0  #: the same for each axis [%]
+    #: Age of the oldest log [days]; None to ignore it, as for imported logs, which have no time.
     max_age_days: Annotated[float, Field(gt=0)] | None = 30.0
-    max_saturated_percent: _Percent = 2.0
-    by: AppliedBy = AppliedBy.PERSON
+    max_saturated_percent: _Percent = 2.0  #: share of an axis's samples in which a limit was active [%]
+    by: AppliedBy = AppliedBy.PERSON  #: who applies the result of a scheduled job
+    #: Number of signers who must have signed the calibration, not counting the operator who applies it.
     signatures: Annotated[int, Field(ge=0)] = 0
+    #: Public key (minisign) of each person who may sign, by name.
     signers: Mapping[str, str] = field(default_factory=dict)
-    holdout: HoldOut | None = None
+    holdout: HoldOut | None = None  #: whether held-out data are required; None means required if the job itself applies
+    #: Largest change from the gain in the controller file, by axis name [unit of the gain].
     max_change: Mapping[str, Annotated[float, Field(ge=0)]] = field(default_factory=dict)
 
     @property
@@ -105,12 +92,7 @@ class HistorySection:
 
 @dataclass(frozen=True, slots=True)
 class HistoryPlace:
-    """Files of a cell's history, absolute.
+    """Files of a cell's history, absolute."""
 
-    Attributes:
-        store: SQLite file with every calibration.
-        audit: hash-chained record of all write actions.
-    """
-
-    store: Path
-    audit: Path
+    store: Path  #: SQLite file with every calibration
+    audit: Path  #: hash-chained record of all write actions

@@ -14,36 +14,24 @@ FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]
 RunName = Annotated[str, Field(max_length=40, pattern=r"^[a-z0-9][a-z0-9_-]*$")]
 Seconds = Annotated[float, Field(gt=0, le=24 * 3600)]
 Hours = Annotated[float, Field(ge=0, le=100_000)]
-RESERVED = ("warm-up",)
-"""Names of logs that are not runs of the fit."""
+RESERVED = ("warm-up",)  #: Names of logs that are not runs of the fit
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A program of the cell.
+    """A program of the cell."""
 
-    Attributes:
-        command: program and arguments; no shell is involved.
-        timeout_s: time after which the program is killed and counts as failed [s].
-    """
-
-    command: Arguments
-    timeout_s: Seconds = 900.0
+    command: Arguments  #: program and arguments; no shell is involved
+    timeout_s: Seconds = 900.0  #: time after which the program is killed and counts as failed [s]
 
 
 @dataclass(frozen=True, slots=True)
 class InterlockFile:
-    """A file that the gateway of a safety controller renews while the cell is closed.
+    """A file that the gateway of a safety controller renews while the cell is closed."""
 
-    Attributes:
-        path: absolute.
-        says: first line of the file while the robot may move.
-        max_age_s: an older file releases nothing [s].
-    """
-
-    path: Path
-    says: str
-    max_age_s: float
+    path: Path  #: absolute
+    says: str  #: first line of the file while the robot may move
+    max_age_s: float  #: an older file releases nothing [s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,71 +44,43 @@ class Interlock:
 
 @dataclass(frozen=True, slots=True)
 class PlannedRun:
-    """One recording of a session.
+    """One recording of a session."""
 
-    Attributes:
-        name: name of its log.
-        payload: mounted payload, None without load.
-        mass_kg: mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without load.
-        plan_file: approved moves, absolute; None if they are planned from a seed.
-        seed: seed of the planned moves.
-        duration_s: duration of the planned moves [s].
-        holdout: the run is held out of the fit.
-    """
-
-    name: str
-    payload: str | None
+    name: str  #: name of its log
+    payload: str | None  #: mounted payload, None without load
+    #: Mass of the payload as weighed for this job, beside that in `payloads` [kg]; None without load.
     mass_kg: float | None
-    plan_file: Path | None
-    seed: int
-    duration_s: float
-    holdout: bool
+    plan_file: Path | None  #: approved moves, absolute; None if they are planned from a seed
+    seed: int  #: seed of the planned moves
+    duration_s: float  #: duration of the planned moves [s]
+    holdout: bool  #: the run is held out of the fit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Bounds:
-    """Keys that mean the same in the file and in the program.
+    """Keys that mean the same in the file and in the program."""
 
-    Attributes:
-        mount: called before each run with the payload's name, or "none", as last argument.
-        warm_up_min: duration of the moves before the first run, which are not logged [min].
-        every_h: nothing is due while the last good calibration is younger [h].
-        max_duration_min: longest duration of a job [min].
-        resume_within_h: largest age of a session that is resumed [h].
-        retries: further attempts of a run that its recorder marked invalid.
-        min_free_mb: free space on the disk required at the start [MB].
-        keep_sessions: number of ended sessions whose logs are kept.
-        seed: seed of the significance test.
-    """
-
-    mount: Command
+    mount: Command  #: called before each run with the payload's name, or "none", as last argument
+    #: Duration of the moves before the first run, which are not logged [min].
     warm_up_min: Annotated[float, Field(ge=0, le=240)] = 10.0
-    every_h: Hours = 144.0
-    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0
-    resume_within_h: Hours = 12.0
-    retries: Annotated[int, Field(ge=0, le=5)] = 1
-    min_free_mb: Annotated[float, Field(ge=0)] = 1000.0
-    keep_sessions: Annotated[int, Field(ge=1)] = 20
-    seed: Annotated[int, Field(ge=0)] = 0
+    every_h: Hours = 144.0  #: nothing is due while the last good calibration is younger [h]
+    max_duration_min: Annotated[float, Field(gt=0, le=24 * 60)] = 120.0  #: longest duration of a job [min]
+    resume_within_h: Hours = 12.0  #: largest age of a session that is resumed [h]
+    retries: Annotated[int, Field(ge=0, le=5)] = 1  #: further attempts of a run that its recorder marked invalid
+    min_free_mb: Annotated[float, Field(ge=0)] = 1000.0  #: free space on the disk required at the start [MB]
+    keep_sessions: Annotated[int, Field(ge=1)] = 20  #: number of ended sessions whose logs are kept
+    seed: Annotated[int, Field(ge=0)] = 0  #: seed of the significance test
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recalibration(_Bounds):
-    """A scheduled recalibration.
+    """A scheduled recalibration."""
 
-    Attributes:
-        folder: parent of its sessions, each with logs, state and report; absolute.
-        runs: in the order of their recording.
-        interlock: checked before each run.
-        metrics: folder of Prometheus' textfile collector, None without one.
-        working_folder: folder in which commands run: that of the cell file.
-    """
-
-    folder: Path
-    runs: tuple[PlannedRun, ...]
-    interlock: Interlock
-    metrics: Path | None
-    working_folder: Path
+    folder: Path  #: parent of its sessions, each with logs, state and report; absolute
+    runs: tuple[PlannedRun, ...]  #: in the order of their recording
+    interlock: Interlock  #: checked before each run
+    metrics: Path | None  #: folder of Prometheus' textfile collector, None without one
+    working_folder: Path  #: folder in which commands run: that of the cell file
 
 
 # The file writes three parts differently: file names are relative to the cell file, the interlock is one mapping, and

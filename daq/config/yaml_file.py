@@ -24,18 +24,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
 
 Location = tuple[str | int, ...]
-MAX_BYTES = 4 * 2**20
-"""Largest configuration [bytes]."""
-MAX_DEPTH = 40
-"""Deepest nesting; more takes time and memory beyond the size of the file."""
-MAX_VALUES = 50_000
-"""Largest number of keys and values; the largest shipped configuration has a hundredth of that."""
-MAX_BITS = 64
-"""Longest integer: no object of an amplifier is longer."""
-MAX_EXPLAINED = 100
-"""Faults for which the nearest known key is searched; a hostile file has tens of thousands."""
-MAX_SHOWN = 8
-"""Faults listed in one message."""
+MAX_BYTES = 4 * 2**20  #: Largest configuration [bytes]
+MAX_DEPTH = 40  #: Deepest nesting; more takes time and memory beyond the size of the file
+MAX_VALUES = 50_000  #: Largest number of keys and values; the largest shipped configuration has a hundredth of that
+MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
+MAX_EXPLAINED = 100  #: Faults for which the nearest known key is searched; a hostile file has tens of thousands
+MAX_SHOWN = 8  #: Faults listed in one message
 _NOT_IN_FILE = "\0"
 
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
@@ -54,17 +48,11 @@ Model = TypeVar("Model", bound=StrictModel)
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A parsed file.
+    """A parsed file."""
 
-    Attributes:
-        name: name in messages.
-        tree: mappings, lists and scalars.
-        lines: line number of every value, from 1, by its path.
-    """
-
-    name: str
-    tree: Any
-    lines: dict[Location, int]
+    name: str  #: name in messages
+    tree: Any  #: mappings, lists and scalars
+    lines: dict[Location, int]  #: line number of every value, from 1, by its path
 
     def where(self, path: Location) -> str:
         """Return 'FILE:LINE: axes[3].limits', with the line of the nearest ancestor that is in the file."""

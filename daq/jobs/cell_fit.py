@@ -43,8 +43,7 @@ from drivers.errors import DriverError
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
 
-SEED = 0
-"""Seed of the loop's significance test, the same as in `drivegain residual`."""
+SEED = 0  #: Seed of the loop's significance test, the same as in `drivegain residual`
 
 
 class Loop(Enum):
@@ -56,45 +55,28 @@ class Loop(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why a cell has no calibration.
+    """Why a cell has no calibration."""
 
-    Attributes:
-        kind: name of the error's class.
-        text: found, expected and to do, as a single fit would say it.
-        exit_code: that a single fit would have ended with.
-    """
-
-    kind: str
-    text: str
-    exit_code: int
+    kind: str  #: name of the error's class
+    text: str  #: found, expected and to do, as a single fit would say it
+    exit_code: int  #: that a single fit would have ended with
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """Result of a worker; small, whatever the size of the logs.
+    """Result of a worker; small, whatever the size of the logs."""
 
-    Attributes:
-        summary: of the calibration.
-        content: of its file, found to say the same.
-        seconds: that it took, reading included.
-    """
-
-    summary: Summary
-    content: bytes
-    seconds: float
+    summary: Summary  #: of the calibration
+    content: bytes  #: of its file, found to say the same
+    seconds: float  #: that it took, reading included
 
 
 @dataclass(frozen=True, slots=True)
 class Unfitted:
-    """Result of a worker for a cell that cannot be fitted.
+    """Result of a worker for a cell that cannot be fitted."""
 
-    Attributes:
-        failure: why not.
-        seconds: that it took to find out.
-    """
-
-    failure: Failure
-    seconds: float
+    failure: Failure  #: why not
+    seconds: float  #: that it took to find out
 
 
 def fit_cell(
@@ -181,15 +163,10 @@ FORMAT = "drivegain-fleet-state"
 
 @dataclass(frozen=True, slots=True)
 class CalibrationCache:
-    """A calibration file a cell, and beside each a small JSON file that says what it was made of.
+    """A calibration file a cell, and beside each a small JSON file that says what it was made of."""
 
-    Attributes:
-        folder: made already.
-        loop: what is wanted of every cell.
-    """
-
-    folder: Path
-    loop: Loop
+    folder: Path  #: made already
+    loop: Loop  #: what is wanted of every cell
 
     def file(self, cell: CellLogs) -> Path:
         """Calibration file of a cell: its name in safe characters, and the first digits of its digest."""

@@ -30,25 +30,15 @@ from drivers.errors import MotionRefused
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, account
 
-CLOCK_SLACK = timedelta(minutes=1)
-"""A time service sets a clock back by less."""
+CLOCK_SLACK = timedelta(minutes=1)  #: A time service sets a clock back by less
 
 
 @dataclass(frozen=True, slots=True)
 class Tools:
-    """Functions that a job calls; tests replace those whose result they know.
+    """Functions that a job calls; tests replace those whose result they know."""
 
-    Attributes:
-        save_report: writes the report of a fit into a folder.
-        drives: checks the drives before anything moves.
-        run: runs a command of the cell.
-        free: free bytes of a folder's disk.
-        now: wall clock with time zone.
-        monotonic_s: clock for durations [s].
-    """
-
-    save_report: Callable[[Fit, Account, Calibration, Path], None]
-    drives: Callable[[Cell, SignalBlocker], None] = check_drives
+    save_report: Callable[[Fit, Account, Calibration, Path], None]  #: writes the report of a fit into a folder
+    drives: Callable[[Cell, SignalBlocker], None] = check_drives  #: checks the drives before anything moves
     plan: Callable[..., Plan] = plan
     record: Callable[..., Recorded] = record
     fit: Callable[..., Fit] = fit
@@ -57,50 +47,34 @@ class Tools:
     account: Callable[..., Account] = account
     propose: Callable[..., Proposal[FileEdit]] = propose
     apply: Callable[..., Written | None] = apply
-    run: Runner = run_command
-    free: FreeBytes = free_bytes
-    now: Callable[[], datetime] = lambda: datetime.now(UTC)
-    monotonic_s: Callable[[], float] = time.monotonic
+    run: Runner = run_command  #: runs a command of the cell
+    free: FreeBytes = free_bytes  #: free bytes of a folder's disk
+    now: Callable[[], datetime] = lambda: datetime.now(UTC)  #: wall clock with time zone
+    monotonic_s: Callable[[], float] = time.monotonic  #: clock for durations [s]
 
 
 @dataclass(frozen=True, slots=True)
 class GainTarget:
-    """Controller file that a job writes, and the history of its cell.
+    """Controller file that a job writes, and the history of its cell."""
 
-    Attributes:
-        controller: its declaration in the cell file.
-        file: absolute path.
-        history: files of history and audit.
-    """
-
-    controller: Controller
-    file: Path
-    history: HistoryPlace
+    controller: Controller  #: its declaration in the cell file
+    file: Path  #: absolute path
+    history: HistoryPlace  #: files of history and audit
 
 
 @dataclass(frozen=True, slots=True)
 class JobContext:
-    """Everything that the steps of a job share.
+    """Everything that the steps of a job share."""
 
-    Attributes:
-        file, cell, section: the cell file, the cell, and its `recalibration`.
-        target: controller file that the gains are compared with and written to.
-        tools: functions that the job calls.
-        journal: log of the job, labelled with session and step.
-        who: name of the job in audit and logs.
-        began_s: start of the job on the monotonic clock [s].
-        block_signals: keeps signals away while the axes are stopped.
-    """
-
-    file: Path
-    cell: Cell
-    section: Recalibration
-    target: GainTarget
-    tools: Tools
-    journal: Journal
-    who: str
-    began_s: float = 0.0
-    block_signals: SignalBlocker = nullcontext
+    file: Path  #: the cell file, the cell, and its `recalibration`
+    cell: Cell  #: the cell file, the cell, and its `recalibration`
+    section: Recalibration  #: the cell file, the cell, and its `recalibration`
+    target: GainTarget  #: controller file that the gains are compared with and written to
+    tools: Tools  #: functions that the job calls
+    journal: Journal  #: log of the job, labelled with session and step
+    who: str  #: name of the job in audit and logs
+    began_s: float = 0.0  #: start of the job on the monotonic clock [s]
+    block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
 
     def within(self, *, session: str | None = None, step: str | None = None) -> JobContext:
         """The same context, with a journal that names the session or the step."""

@@ -32,19 +32,12 @@ from ident.drift.change import FALSE_ALARM
 
 @dataclass(slots=True)
 class GainHistory:
-    """History of a cell while a job uses it.
+    """History of a cell while a job uses it."""
 
-    Attributes:
-        ledger: open.
-        controller: file whose gains are in force.
-        now: wall clock.
-        digest: of the session's calibration, once it is entered.
-    """
-
-    ledger: Ledger
-    controller: Path
-    now: Callable[[], datetime]
-    digest: str = ""
+    ledger: Ledger  #: open
+    controller: Path  #: file whose gains are in force
+    now: Callable[[], datetime]  #: wall clock
+    digest: str = ""  #: of the session's calibration, once it is entered
 
     @property
     def target(self) -> str:

@@ -19,28 +19,17 @@ from daq.jobs.workers import WorkerPool
 
 @dataclass(frozen=True, slots=True)
 class FleetRow:
-    """Result of one cell: a summary, or the failure.
+    """Result of one cell: a summary, or the failure."""
 
-    Attributes:
-        cell: its name; that of the log where the cell is unknown.
-        configuration_sha256: of its configuration; empty where it is unknown.
-        fit, holdout: names of the logs.
-        result: summary of the calibration, or the failure.
-        seconds: that it took.
-        configurations: in how many different ones the cell's logs were made; each has a row.
-        file: of the calibration, where it is kept.
-        kept: it was cached, and its logs are unchanged.
-    """
-
-    cell: str
-    configuration_sha256: str
-    fit: tuple[str, ...]
-    holdout: tuple[str, ...]
-    result: Summary | Failure
-    seconds: float
-    configurations: int = 1
-    file: Path | None = None
-    kept: bool = False
+    cell: str  #: its name; that of the log where the cell is unknown
+    configuration_sha256: str  #: of its configuration; empty where it is unknown
+    fit: tuple[str, ...]  #: names of the logs
+    holdout: tuple[str, ...]  #: names of the logs
+    result: Summary | Failure  #: summary of the calibration, or the failure
+    seconds: float  #: that it took
+    configurations: int = 1  #: in how many different ones the cell's logs were made; each has a row
+    file: Path | None = None  #: of the calibration, where it is kept
+    kept: bool = False  #: it was cached, and its logs are unchanged
 
     @property
     def fitted(self) -> bool:
@@ -51,11 +40,9 @@ class FleetRow:
 SURVEYED = 16
 """Logs whose heads one task reads: a cell's logs lie together, and share a configuration that is read once."""
 
-LOOK_S = 30.0
-"""Time without a result after which the workers are checked; a cell may well take longer."""
+LOOK_S = 30.0  #: Time without a result after which the workers are checked; a cell may well take longer
 
-ProgressCallback = Callable[[int, int, str], None]
-"""Done, total, and a remark."""
+ProgressCallback = Callable[[int, int, str], None]  #: Done, total, and a remark
 Work = TypeVar("Work")
 Made = TypeVar("Made")
 

@@ -27,15 +27,10 @@ PIECE_BYTES = 2**20
 
 @dataclass(frozen=True, slots=True)
 class StoredLog:
-    """One log of a fleet, by name; any process that sees the same store can open it.
+    """One log of a fleet, by name; any process that sees the same store can open it."""
 
-    Attributes:
-        address: path, or address in an object store.
-        name: below the folder that was given, for people.
-    """
-
-    address: str
-    name: str
+    address: str  #: path, or address in an object store
+    name: str  #: below the folder that was given, for people
 
     @property
     def remote(self) -> bool:
@@ -186,52 +181,32 @@ HEAD_BYTES = 4 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class SeenLog:
-    """A log and its cell.
+    """A log and its cell."""
 
-    Attributes:
-        log: by name.
-        fingerprint: changes when the log does.
-        cell: name in the configuration that the log carries.
-        configuration_sha256: digest of that configuration.
-        mounting: of the payload; None without load.
-        started_ns: Unix time of its start [ns].
-    """
-
-    log: StoredLog
-    fingerprint: str
-    cell: str
-    configuration_sha256: str
-    mounting: str | None
-    started_ns: int
+    log: StoredLog  #: by name
+    fingerprint: str  #: changes when the log does
+    cell: str  #: name in the configuration that the log carries
+    configuration_sha256: str  #: digest of that configuration
+    mounting: str | None  #: of the payload; None without load
+    started_ns: int  #: Unix time of its start [ns]
 
 
 @dataclass(frozen=True, slots=True)
 class UnknownLog:
-    """A log whose cell is unknown.
+    """A log whose cell is unknown."""
 
-    Attributes:
-        log: by name.
-        error: why not.
-    """
-
-    log: StoredLog
-    error: BaseException
+    log: StoredLog  #: by name
+    error: BaseException  #: why not
 
 
 @dataclass(frozen=True, slots=True)
 class CellLogs:
-    """The logs of one cell in one configuration.
+    """The logs of one cell in one configuration."""
 
-    Attributes:
-        cell, configuration_sha256: of all of them.
-        fit: logs of the fit, in the order in which they were made.
-        holdout: logs that the fit must not see.
-    """
-
-    cell: str
-    configuration_sha256: str
-    fit: tuple[SeenLog, ...]
-    holdout: tuple[SeenLog, ...]
+    cell: str  #: of all of them
+    configuration_sha256: str  #: of all of them
+    fit: tuple[SeenLog, ...]  #: logs of the fit, in the order in which they were made
+    holdout: tuple[SeenLog, ...]  #: logs that the fit must not see
 
 
 def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
@@ -317,21 +292,13 @@ def _unfinished_head(path: Path) -> LogHead:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Summary of one calibration, small enough to be sent.
+    """Summary of one calibration, small enough to be sent."""
 
-    Attributes:
-        gains: one an axis.
-        effects: family and axis of each accepted effect.
-        error_percent: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%].
-        held_out: whether it is that of a run held out.
-        partial: it rests on a log that was never finished, or with losses.
-    """
-
-    gains: tuple[Gain, ...]
-    effects: tuple[tuple[str, str], ...]
-    error_percent: float
-    held_out: bool
-    partial: bool
+    gains: tuple[Gain, ...]  #: one an axis
+    effects: tuple[tuple[str, str], ...]  #: family and axis of each accepted effect
+    error_percent: float  #: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%]
+    held_out: bool  #: whether it is that of a run held out
+    partial: bool  #: it rests on a log that was never finished, or with losses
 
     @property
     def worst(self) -> Gain:

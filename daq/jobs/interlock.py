@@ -24,32 +24,24 @@ from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
 from drivers.profiles.cia402 import POWERLESS, State, decode
 
-MAX_OUTPUT_CHARACTERS = 400
-"""Characters of what a program said that are shown."""
-_KEPT_BYTES = 4 * MAX_OUTPUT_CHARACTERS
-"""As many as those characters may take in UTF-8."""
+MAX_OUTPUT_CHARACTERS = 400  #: Characters of what a program said that are shown
+_KEPT_BYTES = 4 * MAX_OUTPUT_CHARACTERS  #: As many as those characters may take in UTF-8
 _READ_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """How a program ended.
+    """How a program ended."""
 
-    Attributes:
-        code: exit code; negative for the signal that ended it; None where it never ran, or ran too long.
-        said: the end of what it said, or why it did not run.
-    """
-
-    code: int | None
-    said: str
+    code: int | None  #: exit code; negative for the signal that ended it; None where it never ran, or ran too long
+    said: str  #: the end of what it said, or why it did not run
 
     def __str__(self) -> str:
         ended = "no exit code" if self.code is None else f"exit code {self.code}"
         return f"{ended}{f' ({self.said})' if self.said else ''}"
 
 
-Runner = Callable[[Command, tuple[str, ...], Path], Finished]
-"""Runs a command with further arguments in a folder."""
+Runner = Callable[[Command, tuple[str, ...], Path], Finished]  #: Runs a command with further arguments in a folder
 
 
 def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Finished:
@@ -114,8 +106,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.stdout.close()
 
 
-NOTHING = "none"
-"""Argument of the mount command for a run without load."""
+NOTHING = "none"  #: Argument of the mount command for a run without load
 _LOOK_BYTES = 4096
 
 
@@ -191,8 +182,7 @@ def _held(subject: str, found: str, expected: str) -> NotReleased:
 
 
 FAULTS = (State.FAULT, State.FAULT_REACTION_ACTIVE)
-IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)
-"""Without power in the motor, and without a request for it."""
+IDLE = (*POWERLESS, State.READY_TO_SWITCH_ON)  #: Without power in the motor, and without a request for it
 
 LEFT_BEHIND = (
     " (so a recorder that was killed leaves a drive to which no SYNC comes any more: `drivegain record` takes it over, "
@@ -224,8 +214,7 @@ def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
                 raise StateRefused(axis, "no power before a job begins", f"{state}{left}", statusword)
 
 
-AGAIN_S = 1.0
-"""After an alarm that came while the axes were being stopped for another reason."""
+AGAIN_S = 1.0  #: After an alarm that came while the axes were being stopped for another reason
 
 
 @contextmanager

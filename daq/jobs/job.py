@@ -75,15 +75,10 @@ def recalibrate(
 
 @dataclass(frozen=True, slots=True)
 class Preview:
-    """Steps that a job would take now.
+    """Steps that a job would take now."""
 
-    Attributes:
-        steps: in words, in order; empty where nothing is due.
-        remark: why there are none, or which session is resumed.
-    """
-
-    steps: tuple[str, ...]
-    remark: str
+    steps: tuple[str, ...]  #: in words, in order; empty where nothing is due
+    remark: str  #: why there are none, or which session is resumed
 
 
 def preview(

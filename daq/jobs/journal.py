@@ -31,30 +31,20 @@ class Level(IntEnum):
 class Form(Enum):
     """Who reads the lines."""
 
-    TEXT = "text"
-    """A person at a terminal."""
-    JSON = "json"
-    """A program."""
-    JOURNAL = "journal"
-    """systemd-journald, which takes the priority off."""
+    TEXT = "text"  #: A person at a terminal
+    JSON = "json"  #: A program
+    JOURNAL = "journal"  #: systemd-journald, which takes the priority off
 
 
 @dataclass(frozen=True, slots=True)
 class Journal:
-    """Where events go.
+    """Where events go."""
 
-    Attributes:
-        stream: that lines are written to.
-        form: of the lines.
-        now: wall clock with time zone.
-        session, step: of what is said from here on.
-    """
-
-    stream: TextIO
-    form: Form
-    now: Callable[[], datetime]
-    session: str = ""
-    step: str = ""
+    stream: TextIO  #: that lines are written to
+    form: Form  #: of the lines
+    now: Callable[[], datetime]  #: wall clock with time zone
+    session: str = ""  #: of what is said from here on
+    step: str = ""  #: of what is said from here on
 
     def within(self, *, session: str | None = None, step: str | None = None) -> Journal:
         """The same journal, in a session or a step of it."""

@@ -32,23 +32,15 @@ SUMMARY_TEXT, SUMMARY_JSON = "summary.txt", "summary.json"
 
 @dataclass(frozen=True, slots=True)
 class Conclusion:
-    """How a job ended.
+    """How a job ended."""
 
-    Attributes:
-        outcome: of the job.
-        exit_code: of the command.
-        session: with its final state; None where none was begun.
-        remark: reason, in one sentence.
-    """
-
-    outcome: Outcome
-    exit_code: int
-    session: Session | None
-    remark: str
+    outcome: Outcome  #: of the job
+    exit_code: int  #: of the command
+    session: Session | None  #: with its final state; None where none was begun
+    remark: str  #: reason, in one sentence
 
 
-CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}
-"""Exit codes of outcomes without an error; the others are OK."""
+CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}  #: Exit codes of outcomes without an error; the others are OK
 
 
 def report_success(context: JobContext, session: Session) -> Conclusion:
@@ -273,24 +265,16 @@ _Gauges = Callable[..., Gauge]
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Figures that the metrics of a job are made of.
+    """Figures that the metrics of a job are made of."""
 
-    Attributes:
-        cell: name.
-        outcome, exit_code, ended, duration_s: of this job.
-        last_good: start of the last good session, None where there was none.
-        state: of this session if it has a calibration, else of the last good one.
-        calibration: of the same session, None where there is none.
-    """
-
-    cell: str
-    outcome: Outcome
-    exit_code: int
-    ended: datetime
-    duration_s: float
-    last_good: datetime | None
-    state: SessionState | None
-    calibration: Calibration | None
+    cell: str  #: name
+    outcome: Outcome  #: of this job
+    exit_code: int  #: of this job
+    ended: datetime  #: of this job
+    duration_s: float  #: of this job
+    last_good: datetime | None  #: start of the last good session, None where there was none
+    state: SessionState | None  #: of this session if it has a calibration, else of the last good one
+    calibration: Calibration | None  #: of the same session, None where there is none
 
 
 def registry_of(figures: Figures) -> CollectorRegistry:

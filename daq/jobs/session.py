@@ -31,21 +31,14 @@ _NAME = re.compile(r"[0-9]{8}T[0-9]{6}Z(?:-[0-9]{2})?")
 class Outcome(Enum):
     """How a job ended."""
 
-    NOT_DUE = "not due"
-    """The last good calibration is recent enough; no session was begun."""
+    NOT_DUE = "not due"  #: The last good calibration is recent enough; no session was begun
     APPLIED = "applied"
-    UNCHANGED = "unchanged"
-    """No gain differs significantly from the controller's."""
-    PROPOSED = "proposed"
-    """An operator has to apply it."""
-    REFUSED = "refused"
-    """A check of the write-back failed."""
-    UNFIT = "unfit"
-    """The recordings cannot be used."""
-    STOPPED = "stopped"
-    """An error ended the job; the next job resumes the session."""
-    INTERRUPTED = "interrupted"
-    """Like STOPPED, by a signal."""
+    UNCHANGED = "unchanged"  #: No gain differs significantly from the controller's
+    PROPOSED = "proposed"  #: An operator has to apply it
+    REFUSED = "refused"  #: A check of the write-back failed
+    UNFIT = "unfit"  #: The recordings cannot be used
+    STOPPED = "stopped"  #: An error ended the job; the next job resumes the session
+    INTERRUPTED = "interrupted"  #: Like STOPPED, by a signal
 
     @property
     def good(self) -> bool:

@@ -15,8 +15,7 @@ from daq.errors import ExitCode, UsageError
 
 MARK = "# Made by `drivegain install-units`, which may replace this file."
 """First line of what is ours; a file of that name without it is not ours."""
-STOP_S = 30
-"""Time for the axes to stop and the session to be saved, after SIGTERM [s]."""
+STOP_S = 30  #: Time for the axes to stop and the session to be saved, after SIGTERM [s]
 CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}
 _NEEDS_LITTLE = """\
 NoNewPrivileges=yes
@@ -44,21 +43,13 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Installation:
-    """For whom the units are made.
+    """For whom the units are made."""
 
-    Attributes:
-        cell_file: absolute.
-        program: path of `drivegain`, absolute.
-        schedule: calendar expression of systemd.time(7), such as weekly or `Sun 03:00`.
-        user: whether it is a service of one user, and not of the system.
-        owner: of the cell file, in whose name the system's service runs.
-    """
-
-    cell_file: Path
-    program: Path
-    schedule: str
-    user: bool
-    owner: str
+    cell_file: Path  #: absolute
+    program: Path  #: path of `drivegain`, absolute
+    schedule: str  #: calendar expression of systemd.time(7), such as weekly or `Sun 03:00`
+    user: bool  #: whether it is a service of one user, and not of the system
+    owner: str  #: of the cell file, in whose name the system's service runs
 
 
 def units_of(cell: Cell, section: Recalibration, wanted: Installation) -> tuple[Unit, Unit]:

@@ -15,23 +15,16 @@ from daq.errors import ConfigurationMissing, UsageError
 HERE = "127.0.0.1"
 TRIMMING = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
 """By which dask lets its workers give memory back after every use: a fit would spend a fifth of its time on that."""
-CONNECT_S = 10
-"""How long a scheduler may take to answer [s]."""
+CONNECT_S = 10  #: How long a scheduler may take to answer [s]
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerPool:
-    """Running workers.
+    """Running workers."""
 
-    Attributes:
-        executor: runs functions.
-        workers: tasks that it does at the same time; no more are ever given to it.
-        present: whether any worker is left.
-    """
-
-    executor: Executor
-    workers: int
-    present: Callable[[], bool]
+    executor: Executor  #: runs functions
+    workers: int  #: tasks that it does at the same time; no more are ever given to it
+    present: Callable[[], bool]  #: whether any worker is left
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +76,10 @@ class Processes:
 
 @dataclass(frozen=True, slots=True)
 class Scheduler:
-    """The workers of a dask scheduler that runs already, here or on other machines.
+    """The workers of a dask scheduler that runs already, here or on other machines."""
 
-    Attributes:
-        address: tcp://HOST:PORT.
-        workers: None for as many tasks as it has threads.
-    """
-
-    address: str
-    workers: int | None
+    address: str  #: tcp://HOST:PORT
+    workers: int | None  #: None for as many tasks as it has threads
 
     @contextmanager
     def start_pool(self) -> Iterator[WorkerPool]:

@@ -56,8 +56,7 @@ __all__ = [
     "verify",
 ]
 
-_TRIES, _PAUSE_S = 100, 0.05
-"""For the lock, which is held for one line."""
+_TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 _LOG = logging.getLogger("drivegain")
 _NOT_WRITTEN = (OSError, AuditUnusable)
 _Done = TypeVar("_Done")
@@ -139,17 +138,11 @@ def find_write_entry(path: Path, subject: str, sha256_after: str) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class AuditRecorder:
-    """Record writes to controllers: that one begins, before anything is replaced, and how it ended.
+    """Record writes to controllers: that one begins, before anything is replaced, and how it ended."""
 
-    Attributes:
-        audit: file of the audit log; None records nothing.
-        who: the person or the job.
-        at: time with its zone.
-    """
-
-    audit: Path | None
-    who: str
-    at: datetime
+    audit: Path | None  #: file of the audit log; None records nothing
+    who: str  #: the person or the job
+    at: datetime  #: time with its zone
 
     def record_write(
         self,

@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-FIRST = "0" * 64
-"""Previous digest of the first entry."""
+FIRST = "0" * 64  #: Previous digest of the first entry
 
-_BEGINNING = b'{"action":"'
-"""Begin of every line: the keys are sorted."""
+_BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
 
 
 class AuditAction(Enum):
@@ -27,8 +25,7 @@ class AuditAction(Enum):
     ROLLBACK_BEGUN = "rollback begun"
     ROLLED_BACK = "rolled back"
     FAILED = "failed"
-    NOTHING_TO_DO = "nothing to do"
-    """A write was asked for, and the target had this content already."""
+    NOTHING_TO_DO = "nothing to do"  #: A write was asked for, and the target had this content already
     RECALIBRATION_BEGUN = "recalibration begun"
     RECALIBRATION_ENDED = "recalibration ended"
     ACKNOWLEDGED = "acknowledged"
@@ -42,27 +39,16 @@ class AuditAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AuditEntry:
-    """One entry.
+    """One entry."""
 
-    Attributes:
-        number: from 1, without gaps.
-        at: ISO 8601 time with its zone.
-        who: the person or the job.
-        action: kind of entry.
-        subject: for a write, the controller file with symbolic links followed, or the drives.
-        details: plain JSON; see docs/reference/audit-and-history.md.
-        previous: `sha256` of the entry before, `FIRST` for the first.
-        sha256: of the canonical JSON of all of the above, hexadecimal.
-    """
-
-    number: int
-    at: str
-    who: str
-    action: AuditAction
-    subject: str
-    details: dict[str, object]
-    previous: str
-    sha256: str
+    number: int  #: from 1, without gaps
+    at: str  #: ISO 8601 time with its zone
+    who: str  #: the person or the job
+    action: AuditAction  #: kind of entry
+    subject: str  #: for a write, the controller file with symbolic links followed, or the drives
+    details: dict[str, object]  #: plain JSON; see docs/reference/audit-and-history.md
+    previous: str  #: `sha256` of the entry before, `FIRST` for the first
+    sha256: str  #: of the canonical JSON of all of the above, hexadecimal
 
     @property
     def holds(self) -> bool:
@@ -149,8 +135,7 @@ def _digest(content: dict[str, object]) -> str:
 
 
 _BEGUN = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
-GONE = "gone"
-"""Takes the place of a missing file's digest."""
+GONE = "gone"  #: Takes the place of a missing file's digest
 _ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
 
 
@@ -166,17 +151,11 @@ class Flaw(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AuditFlaw:
-    """One place where the audit log is not what was written.
+    """One place where the audit log is not what was written."""
 
-    Attributes:
-        line: in the file, from 1; of a removed line, the line that is in its place.
-        flaw: its kind, as far as the chain shows it.
-        says: the same as a sentence.
-    """
-
-    line: int
-    flaw: Flaw
-    says: str
+    line: int  #: in the file, from 1; of a removed line, the line that is in its place
+    flaw: Flaw  #: its kind, as far as the chain shows it
+    says: str  #: the same as a sentence
 
 
 class Content(Enum):
@@ -190,32 +169,20 @@ class Content(Enum):
 
 @dataclass(frozen=True, slots=True)
 class OpenWrite:
-    """A write without an entry that ends it: its writer was killed.
+    """A write without an entry that ends it: its writer was killed."""
 
-    Attributes:
-        begun: the entry.
-        content: of the file afterwards: as the next write found it, or, where there was none, as it is now.
-    """
-
-    begun: AuditEntry
-    content: Content
+    begun: AuditEntry  #: the entry
+    content: Content  #: of the file afterwards: as the next write found it, or, where there was none, as it is now
 
 
 @dataclass(frozen=True, slots=True)
 class AuditVerdict:
-    """Result of checking a chain.
+    """Result of checking a chain."""
 
-    Attributes:
-        entries: all of them, in the order of the file.
-        flaws: by their lines; empty for an intact chain.
-        torn: lines, from 1, that a killed writer left unfinished; they are no flaw.
-        open_writes: begun and not ended.
-    """
-
-    entries: tuple[AuditEntry, ...]
-    flaws: tuple[AuditFlaw, ...]
-    torn: tuple[int, ...]
-    open_writes: tuple[OpenWrite, ...]
+    entries: tuple[AuditEntry, ...]  #: all of them, in the order of the file
+    flaws: tuple[AuditFlaw, ...]  #: by their lines; empty for an intact chain
+    torn: tuple[int, ...]  #: lines, from 1, that a killed writer left unfinished; they are no flaw
+    open_writes: tuple[OpenWrite, ...]  #: begun and not ended
 
     @property
     def holds(self) -> bool:

@@ -25,62 +25,36 @@ class WriteAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A write to a controller.
+    """A write to a controller."""
 
-    Attributes:
-        digest: of the calibration whose gains the controller had afterwards; None for a rollback to gains of no
-            calibration.
-        action: its kind.
-        at: when, UTC.
-        who: the person or the job.
-        target: the controller's file, or the drives.
-        audit: SHA-256 of its entry in the audit log, None where none was given.
-        sha256_after: of the target's content afterwards, None where none was given.
-    """
-
+    #: Of the calibration whose gains the controller had afterwards; None for a rollback to gains of no calibration.
     digest: str | None
-    action: WriteAction
-    at: datetime
-    who: str
-    target: str
-    audit: str | None = None
-    sha256_after: str | None = None
+    action: WriteAction  #: its kind
+    at: datetime  #: when, UTC
+    who: str  #: the person or the job
+    target: str  #: the controller's file, or the drives
+    audit: str | None = None  #: SHA-256 of its entry in the audit log, None where none was given
+    sha256_after: str | None = None  #: of the target's content afterwards, None where none was given
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One calibration.
+    """One calibration."""
 
-    Attributes:
-        digest: SHA-256 of its file.
-        created: when it was fitted, UTC; when it was entered where its own time cannot be read.
-        recorded: when the newest log of its fit was recorded, UTC; as `created` where no log has a time.
-        logs: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings.
-        entered: when it was entered, UTC.
-        cell: name of the cell.
-        configuration_sha256: of the cell configuration that its logs carry.
-        method: of the fit.
-        software: that made it.
-        error_percent, holdout_percent: relative error of the fit, and on held-out data [%]; None where there was none.
-        rows: of the observation.
-        gains: one an axis, in the order of the axes.
-        events: writes after which a controller had its gains, oldest first.
-    """
-
-    digest: str
-    created: datetime
-    recorded: datetime
-    logs: str
-    entered: datetime
-    cell: str
-    configuration_sha256: str
-    method: str
-    software: str
-    error_percent: float
-    holdout_percent: float | None
-    rows: int
-    gains: tuple[Gain, ...]
-    events: tuple[Event, ...]
+    digest: str  #: SHA-256 of its file
+    created: datetime  #: when it was fitted, UTC; when it was entered where its own time cannot be read
+    recorded: datetime  #: when the newest log of its fit was recorded, UTC; as `created` where no log has a time
+    logs: str  #: digest of the logs of its fit, as a set; calibrations with the same one rest on the same recordings
+    entered: datetime  #: when it was entered, UTC
+    cell: str  #: name of the cell
+    configuration_sha256: str  #: of the cell configuration that its logs carry
+    method: str  #: of the fit
+    software: str  #: that made it
+    error_percent: float  #: relative error of the fit, and on held-out data [%]; None where there was none
+    holdout_percent: float | None  #: relative error of the fit, and on held-out data [%]; None where there was none
+    rows: int  #: of the observation
+    gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
+    events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first
 
     @property
     def applied(self) -> bool:
@@ -90,23 +64,14 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """A change that a person has explained; a new baseline begins.
+    """A change that a person has explained; a new baseline begins."""
 
-    Attributes:
-        axis: whose gain changed.
-        since: calibrations from this time on make the new baseline, UTC.
-        at: when it was acknowledged, UTC.
-        who: the person.
-        why: what had happened.
-        audit: SHA-256 of its entry in the audit log.
-    """
-
-    axis: str
-    since: datetime
-    at: datetime
-    who: str
-    why: str
-    audit: str
+    axis: str  #: whose gain changed
+    since: datetime  #: calibrations from this time on make the new baseline, UTC
+    at: datetime  #: when it was acknowledged, UTC
+    who: str  #: the person
+    why: str  #: what had happened
+    audit: str  #: SHA-256 of its entry in the audit log
 
 
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:

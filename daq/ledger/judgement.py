@@ -44,16 +44,12 @@ def digests_in_force(events: Iterable[Event]) -> frozenset[str]:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Figures of a history that a change is judged by; empty without a history.
+    """Figures of a history that a change is judged by; empty without a history."""
 
-    Attributes:
-        stds: σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken
-            as exact: a person entered that number, or the history does not have it.
-        dispersions: scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a
-            missing one.
-    """
-
+    #: Σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken as
+    #: exact: a person entered that number, or the history does not have it.
     stds: Mapping[str, float] = field(default_factory=dict)
+    #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for a missing one.
     dispersions: Mapping[str, float] = field(default_factory=dict)
 
 

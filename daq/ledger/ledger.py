@@ -40,21 +40,13 @@ _LOG = logging.getLogger("drivegain")
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Result of checking audit log and history.
+    """Result of checking audit log and history."""
 
-    Attributes:
-        place: of both files.
-        verdict: on the audit log.
-        broken: what is broken in the history, and where its rows are not what the audit log says.
-        unknown: writes that the history lacks.
-        late: whether the history has a later write than one of these.
-    """
-
-    place: HistoryPlace
-    verdict: AuditVerdict
-    broken: tuple[str, ...]
-    unknown: tuple[AuditedWrite, ...] = ()
-    late: bool = False
+    place: HistoryPlace  #: of both files
+    verdict: AuditVerdict  #: on the audit log
+    broken: tuple[str, ...]  #: what is broken in the history, and where its rows are not what the audit log says
+    unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
+    late: bool = False  #: whether the history has a later write than one of these
 
     @property
     def complete(self) -> bool:
@@ -225,19 +217,13 @@ def _has(entry: AuditEntry, digest: str, cell: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Rebuilt:
-    """Content of a history after `rebuild`.
+    """Content of a history after `rebuild`."""
 
-    Attributes:
-        calibrations, writes, acknowledgements: how many.
-        kept: the history that was replaced, None where there was none.
-        trusted: whether what only the old history had was entered in the audit log: not where it was broken.
-    """
-
-    calibrations: int
-    writes: int
-    acknowledgements: int
-    kept: Path | None
-    trusted: bool
+    calibrations: int  #: how many
+    writes: int  #: how many
+    acknowledgements: int  #: how many
+    kept: Path | None  #: the history that was replaced, None where there was none
+    trusted: bool  #: whether what only the old history had was entered in the audit log: not where it was broken
 
 
 def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: Collection[str] = ()) -> Rebuilt:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from daq.errors import HistoryUnreadable
 
-APPLICATION_ID = 0x64726776
-"""In the header of every history (PRAGMA application_id); read as text it says drgv."""
+APPLICATION_ID = 0x64726776  #: In the header of every history (PRAGMA application_id); read as text it says drgv
 VERSION = 1
 
 _TABLES = """

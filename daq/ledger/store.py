@@ -38,8 +38,7 @@ from daq.ledger.entry import (
 from daq.workflow.calibration_file import encode
 from ident.calibration import Calibration, Gain
 
-BUSY_S = 20.0
-"""How long to wait for another process' transaction: each is a few rows."""
+BUSY_S = 20.0  #: How long to wait for another process' transaction: each is a few rows
 
 _NOT_WRITABLE = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN")
 

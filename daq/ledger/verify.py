@@ -24,16 +24,12 @@ _NEVER = datetime.min.replace(tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class AuditedWrite:
-    """A successful write, as the audit log reports it.
+    """A successful write, as the audit log reports it."""
 
-    Attributes:
-        begun: the entry before the write, with its details; None where the audit log has none. Of a write that was
-            found later, the entry of the finding.
-        ended: the entry after it.
-    """
-
+    #: The entry before the write, with its details; None where the audit log has none. Of a write that was found later,
+    #: the entry of the finding.
     begun: AuditEntry | None
-    ended: AuditEntry
+    ended: AuditEntry  #: the entry after it
 
     @property
     def action(self) -> WriteAction:
@@ -195,17 +191,11 @@ def catch_up(
 
 @dataclass(frozen=True, slots=True)
 class EnteredCalibration:
-    """A calibration in the audit log.
+    """A calibration in the audit log."""
 
-    Attributes:
-        digest: SHA-256 of its file.
-        at: when it was entered in the history, UTC.
-        document: the file as drivegain spells it.
-    """
-
-    digest: str
-    at: datetime
-    document: bytes
+    digest: str  #: SHA-256 of its file
+    at: datetime  #: when it was entered in the history, UTC
+    document: bytes  #: the file as drivegain spells it
 
 
 def entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | None:

@@ -17,30 +17,19 @@ from ident.drift.chart import CHART, Alarm, AlarmKind, Chart, Drift, cusum
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One gain of one calibration.
+    """One gain of one calibration."""
 
-    Attributes:
-        entry: the calibration.
-        gain: identified, with σ.
-        change: from the one before; None for the first.
-    """
-
-    entry: Entry
-    gain: Gain
-    change: Change | None
+    entry: Entry  #: the calibration
+    gain: Gain  #: identified, with σ
+    change: Change | None  #: from the one before; None for the first
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Calibrations with one baseline.
+    """Calibrations with one baseline."""
 
-    Attributes:
-        began: index of the first of them in the points of its series.
-        drift: of the gain within.
-    """
-
-    began: int
-    drift: Drift
+    began: int  #: index of the first of them in the points of its series
+    drift: Drift  #: of the gain within
 
     @property
     def ended(self) -> int:
@@ -50,24 +39,16 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One gain over time.
+    """One gain over time."""
 
-    Attributes:
-        axis, unit: of the gain.
-        dispersion: scatter of repeated calibrations over their σ; it is in every σ of this series.
-        points: oldest recording first, one for the same logs, without calibrations that held the gain fixed.
-        stretches: between changes that were explained, oldest first.
-        watching: whether the last of them goes on; not where no calibration came since the last explanation.
-        acknowledged: changes that were explained, oldest first.
-    """
-
-    axis: str
-    unit: str
-    dispersion: float
+    axis: str  #: of the gain
+    unit: str  #: of the gain
+    dispersion: float  #: scatter of repeated calibrations over their σ; it is in every σ of this series
+    #: Oldest recording first, one for the same logs, without calibrations that held the gain fixed.
     points: tuple[Point, ...]
-    stretches: tuple[Stretch, ...]
-    watching: bool
-    acknowledged: tuple[Acknowledgement, ...]
+    stretches: tuple[Stretch, ...]  #: between changes that were explained, oldest first
+    watching: bool  #: whether the last of them goes on; not where no calibration came since the last explanation
+    acknowledged: tuple[Acknowledgement, ...]  #: changes that were explained, oldest first
 
     @property
     def began(self) -> int:

@@ -37,10 +37,8 @@ from daq.log.message import (
 from drivers.stream.sample import CellEvent
 
 MAGIC = b"\x89MCAP0\r\n"
-UNFINISHED = ".part"
-"""Suffix of a log that is being written, or whose recorder has died."""
-LARGEST_RECORD = 64 * 2**20
-"""[bytes]; our chunks hold 200 ms."""
+UNFINISHED = ".part"  #: Suffix of a log that is being written, or whose recorder has died
+LARGEST_RECORD = 64 * 2**20  #: [bytes]; our chunks hold 200 ms
 LARGEST_CHUNK = 64 * 2**20
 LARGEST_RATIO = 200
 """Largest ratio of unpacked bytes to the size of the file, to bound the memory; our logs have 2 to 20."""

@@ -21,31 +21,21 @@ from ident.model.bodies import Payload
 
 _LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
-LIMIT_MARGIN = 0.05
-"""Largest excursion beyond the limits, as a share of the joint's range."""
-LARGEST_SATURATED = 0.1
-"""Largest share of an axis's samples with an active limit; these samples are masked."""
+LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
+LARGEST_SATURATED = 0.1  #: Largest share of an axis's samples with an active limit; these samples are masked
 STEP_TOLERANCE = 0.5
 """Largest deviation of a time step, as a share of the period. From half a period on it could be another cycle."""
-RATE_TOLERANCE = 0.01
-"""Largest relative difference between the requested rate and that of the time stamps."""
+RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate and that of the time stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scaling:
-    """Factors from raw numbers to SI.
+    """Factors from raw numbers to SI."""
 
-    Attributes:
-        rad_per_count: motor angle of a count [rad], shape (n,).
-        to_joint: R⁻¹, shape (n, n).
-        offset_rad: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,).
-        current_per_unit: unit of the current reference (A) per raw unit, shape (n,).
-    """
-
-    rad_per_count: FloatArray
-    to_joint: FloatArray
-    offset_rad: FloatArray
-    current_per_unit: FloatArray
+    rad_per_count: FloatArray  #: motor angle of a count [rad], shape (n,)
+    to_joint: FloatArray  #: R⁻¹, shape (n, n)
+    offset_rad: FloatArray  #: joint position where R⁻¹ q_motor is zero [rad; m of a prismatic joint], shape (n,)
+    current_per_unit: FloatArray  #: unit of the current reference (A) per raw unit, shape (n,)
 
     def joint_position(self, counts: NDArray[np.integer]) -> FloatArray:
         """Return joint positions [rad or m] of motor counts, shape (..., n): q = R⁻¹ q_motor + offset (paper eq. 24)"""

@@ -33,8 +33,7 @@ _LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 LARGEST_RAW = 2**31 - 1
-SMALLEST_MOTION = 0.02
-"""Smallest motion of at least one joint, as a share of its range."""
+SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 LARGEST_OUTLIER = 1000.0
 """Largest current, in multiples of the 99th percentile of its column; a real peak is some ten times that."""
 SPEED_MARGIN = 3.0
@@ -43,8 +42,7 @@ SPEED_PERCENTILE = 99.9
 """Percentile of a run's speeds that is compared with the limit: a few outliers do not mean a wrong rate."""
 SLOW_SHARE = 0.1
 """Share of the velocity limits; if no joint is ever faster, the real rate may be ten times the declared one."""
-TIME_TOLERANCE = 0.5
-"""Largest deviation of a time stamp, as a share of the period."""
+TIME_TOLERANCE = 0.5  #: Largest deviation of a time stamp, as a share of the period
 
 
 def import_csv(
@@ -306,21 +304,13 @@ def _check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
 
 @dataclass(frozen=True, slots=True)
 class TableFile:
-    """A CSV file as lines.
+    """A CSV file as lines."""
 
-    Attributes:
-        path: path of the file.
-        table: its layout.
-        names: column names from the header; empty without one.
-        rows: lines of numbers.
-        first_line: line number of the first row, from 1.
-    """
-
-    path: Path
-    table: Table
-    names: tuple[str, ...]
-    rows: tuple[str, ...]
-    first_line: int
+    path: Path  #: path of the file
+    table: Table  #: its layout
+    names: tuple[str, ...]  #: column names from the header; empty without one
+    rows: tuple[str, ...]  #: lines of numbers
+    first_line: int  #: line number of the first row, from 1
 
     def fields(self, row: str) -> list[str]:
         """Split a line into fields without quotes and white space."""

@@ -23,8 +23,7 @@ from daq.log.conversion import moves, scaling
 from daq.log.reader import LogReader, SampleBlock
 from drivers.stream.sample import CellEvent
 
-Columns = dict[str, NDArray[Any]]
-"""Columns of equal length by name, in order."""
+Columns = dict[str, NDArray[Any]]  #: Columns of equal length by name, in order
 Write = Callable[[Columns], None]
 
 
@@ -37,21 +36,13 @@ class TableFormat(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Result of an export.
+    """Result of an export."""
 
-    Attributes:
-        columns: names of the columns.
-        rows: number of rows.
-        partial: the log was never finished.
-        valid: whether the recorder marked the run valid.
-        reason: why not.
-    """
-
-    columns: tuple[str, ...]
-    rows: int
-    partial: bool
-    valid: bool
-    reason: str
+    columns: tuple[str, ...]  #: names of the columns
+    rows: int  #: number of rows
+    partial: bool  #: the log was never finished
+    valid: bool  #: whether the recorder marked the run valid
+    reason: str  #: why not
 
 
 def require_format(kind: TableFormat) -> None:

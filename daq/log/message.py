@@ -18,8 +18,7 @@ from drivers.stream.sample import CellEvent, EventKind, Sample
 SAMPLES_TOPIC, EVENTS_TOPIC, JOINTS_TOPIC = "/cell/samples", "/cell/events", "/joint_states"
 SAMPLES_SCHEMA, EVENTS_SCHEMA = "drivegain_msgs/msg/AxisSamples", "drivegain_msgs/msg/CellEvent"
 JOINTS_SCHEMA = "sensor_msgs/msg/JointState"
-LARGEST_AXES = 32
-"""Number of bits in `missing`."""
+LARGEST_AXES = 32  #: Number of bits in `missing`
 
 _SEPARATOR = "=" * 80 + "\n"
 _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"

@@ -15,12 +15,9 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 
 RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.json"
 """Names of two metadata records and an attachment."""
-LARGEST_COUNT = 2**64
-"""Largest number of cycles, which are uint64 in the log."""
-VERSION = "1"
-"""Version of the log contract; a reader refuses any other."""
-SEAL = "crc32"
-"""Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum."""
+LARGEST_COUNT = 2**64  #: Largest number of cycles, which are uint64 in the log
+VERSION = "1"  #: Version of the log contract; a reader refuses any other
+SEAL = "crc32"  #: Entry with the checksum of the others. Outside chunks, a log without its end has no other checksum.
 
 
 class Role(Enum):
@@ -32,33 +29,20 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """Facts known when a recording starts.
+    """Facts known when a recording starts."""
 
-    Attributes:
-        run_id: unique identifier.
-        rate_hz: sampling rate as requested of SYNC, exactly [Hz].
-        payload: mounted payload, None without load.
-        operator: person responsible for the recording.
-        software: name and version of the recorder.
-        started_wall_ns: Unix time of the start [ns].
-        started_monotonic_ns: the monotonic clock at the same moment [ns]; the difference reveals a clock jump.
-        origin: "recorded", or the sources of an import.
-        speed: speed of the moves as a share of the plan's; 1 except for a first run.
-        entered_kg: mass of the payload as weighed for this recording [kg]; None if it was not entered.
-        controller_sha256: digest of the controller's file at the start; None without one.
-    """
-
-    run_id: str
-    rate_hz: float
-    payload: Payload | None
-    operator: str
-    software: str
-    started_wall_ns: int
-    started_monotonic_ns: int
-    origin: str = "recorded"
-    speed: float = 1.0
+    run_id: str  #: unique identifier
+    rate_hz: float  #: sampling rate as requested of SYNC, exactly [Hz]
+    payload: Payload | None  #: mounted payload, None without load
+    operator: str  #: person responsible for the recording
+    software: str  #: name and version of the recorder
+    started_wall_ns: int  #: Unix time of the start [ns]
+    started_monotonic_ns: int  #: the monotonic clock at the same moment [ns]; the difference reveals a clock jump
+    origin: str = "recorded"  #: "recorded", or the sources of an import
+    speed: float = 1.0  #: speed of the moves as a share of the plan's; 1 except for a first run
+    #: Mass of the payload as weighed for this recording [kg]; None if it was not entered.
     entered_kg: float | None = None
-    controller_sha256: str | None = None
+    controller_sha256: str | None = None  #: digest of the controller's file at the start; None without one
 
     @property
     def role(self) -> Role:
@@ -73,25 +57,16 @@ class RunInfo:
 
 @dataclass(frozen=True, slots=True)
 class RunStatistics:
-    """Facts known when a recording ends.
+    """Facts known when a recording ends."""
 
-    Attributes:
-        samples: number of cycles in the log.
-        lost_cycles: number of cycles missing from it.
-        missing: number of samples without an answer, for each axis.
-        valid: whether the recorder considers the run usable.
-        reason: why not.
-        partial: the log was salvaged from a recording that was never finished.
-        wall_minus_monotonic_ns: difference of the two clocks at the end [ns]; compared with the start it reveals a
-            changed wall clock. None in salvaged and imported logs.
-    """
-
-    samples: int
-    lost_cycles: int
-    missing: tuple[int, ...]
-    valid: bool
-    reason: str = ""
-    partial: bool = False
+    samples: int  #: number of cycles in the log
+    lost_cycles: int  #: number of cycles missing from it
+    missing: tuple[int, ...]  #: number of samples without an answer, for each axis
+    valid: bool  #: whether the recorder considers the run usable
+    reason: str = ""  #: why not
+    partial: bool = False  #: the log was salvaged from a recording that was never finished
+    #: Difference of the two clocks at the end [ns]; compared with the start it reveals a changed wall clock. None in
+    #: salvaged and imported logs.
     wall_minus_monotonic_ns: int | None = None
 
 
@@ -240,18 +215,13 @@ def _number(value: object) -> float:
 
 @dataclass(frozen=True, slots=True)
 class AxisReadback:
-    """Answers of the amplifier of one axis.
+    """Answers of the amplifier of one axis."""
 
-    Attributes:
-        name: name of the axis.
-        current_per_unit: unit of the reference (A) per raw unit, from the profile's formula and objects.
-        position_rad_per_count: motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
-        drive: identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
-    """
-
-    name: str
-    current_per_unit: float
+    name: str  #: name of the axis
+    current_per_unit: float  #: unit of the reference (A) per raw unit, from the profile's formula and objects
+    #: Motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
     position_rad_per_count: float | None = None
+    #: Identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
     drive: dict[str, Any] = field(default_factory=dict)
 
 

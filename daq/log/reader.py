@@ -30,43 +30,28 @@ from daq.log.metadata import (
 )
 from drivers.stream.sample import CellEvent
 
-BLOCK_SAMPLES = 4096
-"""Samples of a block; at most these and one chunk are in memory."""
+BLOCK_SAMPLES = 4096  #: Samples of a block; at most these and one chunk are in memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SampleBlock:
-    """Samples of k cycles, in the order of the log.
+    """Samples of k cycles, in the order of the log."""
 
-    Attributes:
-        cycle: number of the SYNC, shape (k,), uint64.
-        time_ns: time of the SYNC [ns], shape (k,), int64.
-        position_counts, current_raw: shape (k, n), int32.
-        statusword: shape (k, n), uint16.
-        missing: bit i for axis i, shape (k,), uint32.
-    """
-
-    cycle: NDArray[np.uint64]
-    time_ns: NDArray[np.int64]
-    position_counts: NDArray[np.int32]
-    current_raw: NDArray[np.int32]
-    statusword: NDArray[np.uint16]
-    missing: NDArray[np.uint32]
+    cycle: NDArray[np.uint64]  #: number of the SYNC, shape (k,), uint64
+    time_ns: NDArray[np.int64]  #: time of the SYNC [ns], shape (k,), int64
+    position_counts: NDArray[np.int32]  #: shape (k, n), int32
+    current_raw: NDArray[np.int32]  #: shape (k, n), int32
+    statusword: NDArray[np.uint16]  #: shape (k, n), uint16
+    missing: NDArray[np.uint32]  #: bit i for axis i, shape (k,), uint32
 
 
 @dataclass(frozen=True, slots=True)
 class LogHead:
-    """Everything before the samples.
+    """Everything before the samples."""
 
-    Attributes:
-        run: facts about the recording.
-        readback: answers of the amplifiers.
-        files: all attachments by name, with the cell's bundle.
-    """
-
-    run: RunInfo
-    readback: Readback
-    files: Mapping[str, bytes]
+    run: RunInfo  #: facts about the recording
+    readback: Readback  #: answers of the amplifiers
+    files: Mapping[str, bytes]  #: all attachments by name, with the cell's bundle
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,21 +33,13 @@ _HARMLESS = (
 
 @dataclass(frozen=True, slots=True)
 class Salvaged:
-    """Result of a salvage.
+    """Result of a salvage."""
 
-    Attributes:
-        log: the new file.
-        statistics: of the new file; partial, and valid as far as samples and events show.
-        duration_s: duration of the samples [s].
-        left_out_bytes: size of the damaged file from the first damaged byte.
-        damage: description of the damage; empty if only the end of the file is missing.
-    """
-
-    log: Path
-    statistics: RunStatistics
-    duration_s: float
-    left_out_bytes: int
-    damage: str
+    log: Path  #: the new file
+    statistics: RunStatistics  #: of the new file; partial, and valid as far as samples and events show
+    duration_s: float  #: duration of the samples [s]
+    left_out_bytes: int  #: size of the damaged file from the first damaged byte
+    damage: str  #: description of the damage; empty if only the end of the file is missing
 
 
 def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _samples: None) -> Salvaged:

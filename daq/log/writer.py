@@ -49,25 +49,17 @@ FLUSH_NS = 150_000_000
 """Time between two flushes, recorded or wall time, whichever ends first [ns]. A kill may cost 200 ms: the rest is
 for the cycle on the bus and the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000
-CHUNK_BYTES = 4 * 2**20
-"""Never reached between two flushes; a chunk ends with one."""
+CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
 
 
 @dataclass(frozen=True, slots=True)
 class LogContent:
-    """Start of a log.
+    """Start of a log."""
 
-    Attributes:
-        run: facts about the recording.
-        files: the cell's bundle: configuration, drive profiles, URDF.
-        readback: answers of the amplifiers.
-        joint_names: for viewers, one for each axis.
-    """
-
-    run: RunInfo
-    files: Mapping[str, bytes]
-    readback: Readback
-    joint_names: tuple[str, ...]
+    run: RunInfo  #: facts about the recording
+    files: Mapping[str, bytes]  #: the cell's bundle: configuration, drive profiles, URDF
+    readback: Readback  #: answers of the amplifiers
+    joint_names: tuple[str, ...]  #: for viewers, one for each axis
 
 
 class LogWriter:

@@ -15,8 +15,7 @@ from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import GainChange
 
 _SIGMAS = 2.0
-_BESIDE = 0.12
-"""Offset of the points before and after, in units of the distance between axes."""
+_BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes
 
 
 def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> None:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 _SIGMAS = 2.0
 _COLUMNS = 2
-_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999
-"""1 January 1 and 31 December 9999: matplotlib draws no dates beyond."""
+_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
 
 
 def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:

@@ -27,8 +27,7 @@ SKY = "#56B4E9"
 BLACK = "#000000"
 GREY = "#7F7F7F"
 
-QUANTITY = {"Nm": "torque", "N": "force"}
-"""Quantity of a joint, by its unit: N where it is prismatic."""
+QUANTITY = {"Nm": "torque", "N": "force"}  #: Quantity of a joint, by its unit: N where it is prismatic
 
 DPI = 130
 _PANEL_IN = (5.6, 2.0)

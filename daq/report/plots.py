@@ -271,19 +271,12 @@ _LOOK = {_PASSED: (BLUE, ""), _RIVAL: (ORANGE, "//"), _FAILED: (GREY, "")}
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One candidate.
+    """One candidate."""
 
-    Attributes:
-        name: effect and axis.
-        fall: fall of the squared error on left-out moves, in noise variances.
-        passed: whether it passes every gate.
-        rival: not distinguishable from the added one (or, where none was added, from the best).
-    """
-
-    name: str
-    fall: float
-    passed: bool
-    rival: bool
+    name: str  #: effect and axis
+    fall: float  #: fall of the squared error on left-out moves, in noise variances
+    passed: bool  #: whether it passes every gate
+    rival: bool  #: not distinguishable from the added one (or, where none was added, from the best)
 
 
 def plot_ranking(path: Path | None, bars: Sequence[Bar], *, title: str) -> bytes:

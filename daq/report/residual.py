@@ -22,12 +22,10 @@ from ident.effects.effect import PlacedEffect, Side
 from ident.effects.timing import TimeSkew
 from ident.estimators.estimate import RelativeError
 
-_SHOWN = 6
-"""Findings listed for each turn; the JSON has them all."""
+_SHOWN = 6  #: Findings listed for each turn; the JSON has them all
 _SHOWN_RIVALS = 3
 
-ErrorRow = tuple[str, RelativeError]
-"""Name of the error and of the data it is measured on, and the error [%]."""
+ErrorRow = tuple[str, RelativeError]  #: Name of the error and of the data it is measured on, and the error [%]
 WHEN = ("before", "after")
 
 

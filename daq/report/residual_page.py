@@ -130,8 +130,7 @@ def _spelled(text: str) -> str:
     return escape(shown)
 
 
-SHOWN = 10
-"""Candidates of a turn that are drawn; residual.json has them all."""
+SHOWN = 10  #: Candidates of a turn that are drawn; residual.json has them all
 PAGE, DOCUMENT = "report.html", "residual.json"
 MARKS = {PAGE: f'<meta name="generator" content="{GENERATOR}">', DOCUMENT: f'"format": "{FORMAT}"'}
 """Text at the beginning of each file of a report, by which an earlier report is recognised."""

@@ -36,8 +36,7 @@ from ident.calibration import Calibration
 from ident.estimators.identify import Identification
 
 MARK = ".drivegain-demo"
-RETRIES = 2
-"""Of a run that came out invalid."""
+RETRIES = 2  #: Of a run that came out invalid
 PLANS = ("a", "b", "c")
 RUNS = (
     ("bare-1", None, "a"),
@@ -51,58 +50,35 @@ RUNS = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of a demonstration.
+    """Settings of a demonstration."""
 
-    Attributes:
-        out: folder that it fills; files of an earlier demonstration in it are replaced.
-        simulation: file of the simulated cell.
-        seed: of plans, noise and significance test.
-        duration_s: of each run [s].
-    """
-
-    out: Path
-    simulation: Path
-    seed: int
-    duration_s: float
+    out: Path  #: folder that it fills; files of an earlier demonstration in it are replaced
+    simulation: Path  #: file of the simulated cell
+    seed: int  #: of plans, noise and significance test
+    duration_s: float  #: of each run [s]
 
 
 @dataclass(frozen=True, slots=True)
 class ProgressReporter:
-    """Receivers of the progress.
+    """Receivers of the progress."""
 
-    Attributes:
-        step: a new step begins, in words.
-        progress: done, total and a remark within it.
-    """
-
-    step: Callable[[str], None]
-    progress: Callable[[int, int, str], None]
+    step: Callable[[str], None]  #: a new step begins, in words
+    progress: Callable[[int, int, str], None]  #: done, total and a remark within it
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """All that the demonstration found.
+    """All that the demonstration found."""
 
-    Attributes:
-        cell: declared.
-        nodes: found on the bus.
-        plans: made.
-        recorded: logs.
-        fitted: with the effects that were found.
-        calibration: as saved.
-        truth: true gain by axis.
-        proposal, written: what the controller file would get, and what its copy got.
-    """
-
-    cell: Cell
-    nodes: tuple[FoundNode, ...]
-    plans: tuple[Plan, ...]
-    recorded: tuple[Recorded, ...]
-    fitted: Fit
-    calibration: Calibration
-    truth: dict[str, float]
-    proposal: Proposal[FileEdit]
-    written: Written | None
+    cell: Cell  #: declared
+    nodes: tuple[FoundNode, ...]  #: found on the bus
+    plans: tuple[Plan, ...]  #: made
+    recorded: tuple[Recorded, ...]  #: logs
+    fitted: Fit  #: with the effects that were found
+    calibration: Calibration  #: as saved
+    truth: dict[str, float]  #: true gain by axis
+    proposal: Proposal[FileEdit]  #: what the controller file would get, and what its copy got
+    written: Written | None  #: what the controller file would get, and what its copy got
 
 
 def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> Outcome:

@@ -21,13 +21,11 @@ from drivers.simulation.spec import AxisSpec, Body, CellSpec, Dialect, Undeclare
 # What goes wrong in a simulated cell, and when: `faults` of a simulation file, or a scenario file of faults alone.
 
 
-AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]
-"""J3, or 3."""
+AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]  #: J3, or 3
 
 
 LONGEST_S = 1e6
-LAST_CYCLE = 10**12
-"""No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them."""
+LAST_CYCLE = 10**12  #: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
 
 
 class FaultModel(StrictModel):

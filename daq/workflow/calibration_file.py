@@ -90,8 +90,7 @@ class CalibrationDocument(StrictModel):
     software: str
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
-    recording_configuration_sha256: str | None = None
-    """Files of earlier versions lack these three."""
+    recording_configuration_sha256: str | None = None  #: Files of earlier versions lack these three
 
 
 def _parameter(entry: ParameterEntry) -> Parameter:

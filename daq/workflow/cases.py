@@ -26,21 +26,13 @@ from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One way of identifying.
+    """One way of identifying."""
 
-    Attributes:
-        name: of its calibration file.
-        title: over its column of a table.
-        method: estimator.
-        known: of the payload.
-        gains_fixed: hold the gains at their nameplate values.
-    """
-
-    name: str
-    title: str
-    method: Method
-    known: Known
-    gains_fixed: bool = False
+    name: str  #: of its calibration file
+    title: str  #: over its column of a table
+    method: Method  #: estimator
+    known: Known  #: of the payload
+    gains_fixed: bool = False  #: hold the gains at their nameplate values
 
 
 CASES = (
@@ -56,36 +48,23 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class ReducedLogs:
-    """Logs of one cell, read once; what is known of a payload is chosen afterwards.
+    """Logs of one cell, read once; what is known of a payload is chosen afterwards."""
 
-    Attributes:
-        cell: as the logs describe it, or as given.
-        logs, holdout: of the fit, and those that it has not seen.
-        sources: the same, with digests and roles.
-        used, unseen: their rows, reduced.
-    """
-
-    cell: Cell
-    logs: tuple[Path, ...]
-    holdout: tuple[Path, ...]
-    sources: tuple[Source, ...]
-    used: Reduction
-    unseen: Reduction
+    cell: Cell  #: as the logs describe it, or as given
+    logs: tuple[Path, ...]  #: of the fit, and those that it has not seen
+    holdout: tuple[Path, ...]  #: of the fit, and those that it has not seen
+    sources: tuple[Source, ...]  #: the same, with digests and roles
+    used: Reduction  #: their rows, reduced
+    unseen: Reduction  #: their rows, reduced
 
 
 @dataclass(frozen=True, slots=True)
 class CaseFit:
-    """A fit, and the payloads as they were declared to it.
+    """A fit, and the payloads as they were declared to it."""
 
-    Attributes:
-        fitted: without effects.
-        payloads: one for each mounting, as the fit took them.
-        essential: how its base parameters were chosen, None where all of them stay.
-    """
-
-    fitted: Fit
-    payloads: tuple[Payload, ...]
-    essential: Essential | None
+    fitted: Fit  #: without effects
+    payloads: tuple[Payload, ...]  #: one for each mounting, as the fit took them
+    essential: Essential | None  #: how its base parameters were chosen, None where all of them stay
 
 
 def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None) -> ReducedLogs:

@@ -27,25 +27,17 @@ from ident.prediction import standard_parameters
 
 FloatArray = NDArray[np.float64]
 
-MANUFACTURER = "manufacturer"
-"""Label of the nameplate gains."""
+MANUFACTURER = "manufacturer"  #: Label of the nameplate gains
 
 
 @dataclass(frozen=True, slots=True)
 class Mass:
-    """A payload's mass found with one set of gains.
+    """A payload's mass found with one set of gains."""
 
-    Attributes:
-        mass_kg: found [kg].
-        std_percent: σ from the scatter of the moves, the gains taken as exact [% of the mass].
-        std_with_gains_percent: the same with the σ of the gains.
-        error_percent: |found − weighed|/weighed [%], None where it was not weighed.
-    """
-
-    mass_kg: float
-    std_percent: float
-    std_with_gains_percent: float
-    error_percent: float | None
+    mass_kg: float  #: found [kg]
+    std_percent: float  #: σ from the scatter of the moves, the gains taken as exact [% of the mass]
+    std_with_gains_percent: float  #: the same with the σ of the gains
+    error_percent: float | None  #: |found − weighed|/weighed [%], None where it was not weighed
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,23 +49,16 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class CheckedRun:
-    """One run under every calibration.
+    """One run under every calibration."""
 
-    Attributes:
-        log: where it was read.
-        run: its name.
-        condition: of its weighted observation matrix, None where the run alone does not show the base parameters.
-        errors: ‖ρ‖/‖Y‖ by label of the calibration; calibrations that cannot predict the run are not in it.
-        left_out: why some of them cannot, empty where all can.
-        seen_by: labels of calibrations whose fit has seen it.
-    """
-
-    log: Path
-    run: str
+    log: Path  #: where it was read
+    run: str  #: its name
+    #: Of its weighted observation matrix, None where the run alone does not show the base parameters.
     condition: float | None
+    #: ‖ρ‖/‖Y‖ by label of the calibration; calibrations that cannot predict the run are not in it.
     errors: dict[str, RelativeError]
-    left_out: str
-    seen_by: tuple[str, ...]
+    left_out: str  #: why some of them cannot, empty where all can
+    seen_by: tuple[str, ...]  #: labels of calibrations whose fit has seen it
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +74,14 @@ class WeighedRun:
 
 @dataclass(frozen=True, slots=True)
 class CrossValidation:
-    """All figures of the tables of §4.3.
+    """All figures of the tables of §4.3."""
 
-    Attributes:
-        axes: their names.
-        calibrations: by label.
-        runs: in the order of the logs.
-        weighed: those with a payload.
-        with_bare_runs: the payloads were found together with the robot, from runs without load.
-        validations: of the first calibration, for the runs that it can predict.
-    """
-
-    axes: tuple[str, ...]
-    calibrations: dict[str, Calibration]
-    runs: tuple[CheckedRun, ...]
-    weighed: tuple[WeighedRun, ...]
-    with_bare_runs: bool
-    validations: tuple[Validation, ...]
+    axes: tuple[str, ...]  #: their names
+    calibrations: dict[str, Calibration]  #: by label
+    runs: tuple[CheckedRun, ...]  #: in the order of the logs
+    weighed: tuple[WeighedRun, ...]  #: those with a payload
+    with_bare_runs: bool  #: the payloads were found together with the robot, from runs without load
+    validations: tuple[Validation, ...]  #: of the first calibration, for the runs that it can predict
 
 
 def cross_validate(

@@ -39,16 +39,11 @@ ALWAYS = 0.03
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedScene:
-    """A scene with what must be said of it.
+    """A scene with what must be said of it."""
 
-    Attributes:
-        checker: answers whether a way is clear.
-        guessed: the arm's shape is a guess.
-        together: names of pairs that are not checked, because they touch in nearly every posture.
-    """
-
-    checker: Checker
-    guessed: bool
+    checker: Checker  #: answers whether a way is clear
+    guessed: bool  #: the arm's shape is a guess
+    #: Names of pairs that are not checked, because they touch in nearly every posture.
     together: tuple[tuple[str, str], ...]
 
     @property
@@ -137,33 +132,21 @@ BoolArray = NDArray[np.bool_]
 NOISE_SHARE = 0.006
 """Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
 current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
-LAG_ONE = 0.67
-"""Correlation of the residual from row to row, as measured on real recordings."""
-RUNS: tuple[int | None, ...] = (None, 0)
-"""What is mounted while the moves are made: nothing, then the payload."""
+LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
+RUNS: tuple[int | None, ...] = (None, 0)  #: What is mounted while the moves are made: nothing, then the payload
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Experiment:
-    """Everything needed to judge moves before they are made.
+    """Everything needed to judge moves before they are made."""
 
-    Attributes:
-        cell: of the arm.
-        design: unknowns and information.
-        scene: what must keep apart.
-        payload: that will be mounted.
-        row_s: time between two rows of the observation [s].
-        edge_s: how long after a standstill rows begin to count [s].
-        remarks: what was assumed, in words.
-    """
-
-    cell: Cell
-    design: Design
-    scene: CheckedScene
-    payload: WeighedPayload
-    row_s: float
-    edge_s: float
-    remarks: tuple[str, ...]
+    cell: Cell  #: of the arm
+    design: Design  #: unknowns and information
+    scene: CheckedScene  #: what must keep apart
+    payload: WeighedPayload  #: that will be mounted
+    row_s: float  #: time between two rows of the observation [s]
+    edge_s: float  #: how long after a standstill rows begin to count [s]
+    remarks: tuple[str, ...]  #: what was assumed, in words
 
     def excitation(self, paths: Sequence[Trapezoid], thinning: int = 1) -> tuple[Excitation, tuple[slice, ...]]:
         """Rows of several moves, one after the other, and which of them belong to which move.
@@ -279,18 +262,12 @@ def _rows(cell: Cell) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class PlannedMove:
-    """One synchronised point-to-point move.
+    """One synchronised point-to-point move."""
 
-    Attributes:
-        target_rad: joint positions at its end [rad; m of a prismatic joint], shape (n,).
-        velocity, acceleration: share of the joints' limits, above 0 up to 1.
-        dwell_s: rest after it [s].
-    """
-
-    target_rad: tuple[float, ...]
-    velocity: float
-    acceleration: float
-    dwell_s: float
+    target_rad: tuple[float, ...]  #: joint positions at its end [rad; m of a prismatic joint], shape (n,)
+    velocity: float  #: share of the joints' limits, above 0 up to 1
+    acceleration: float  #: share of the joints' limits, above 0 up to 1
+    dwell_s: float  #: rest after it [s]
 
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:

@@ -255,13 +255,11 @@ def _contradicting_run(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs
     return ""
 
 
-ALL_AXES = "all axes"
-"""Where an effect is that acts on every motor alike."""
+ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 LARGEST_TOTAL_PERCENT = 50.0
 LARGEST_AXIS_PERCENT = 100.0
 """Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
-DOUBTFUL_PERCENT = 25.0
-"""In total; the default limit of `apply`."""
+DOUBTFUL_PERCENT = 25.0  #: In total; the default limit of `apply`
 
 
 def check_explained(error: RelativeError, axes: tuple[str, ...]) -> None:

@@ -22,27 +22,19 @@ from ident.planning.verdict import ExtraMoves
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A run's moves.
+    """A run's moves."""
 
-    Attributes:
-        cell: name of the cell it was made for.
-        seed: it was made from.
-        condition: of the weighted observation matrix that these moves give.
-        predicted_std_percent: standard deviation of each gain [% of it] when the moves are made once without load and
-            once with the cell's payload, as predicted from nominal parameters; empty in plans of earlier versions.
-        duration_s: from the first target to the end of the last dwell [s]; how long the way to the first target takes
-            depends on the robot's position.
-        moves: in order.
-        units: in which people read the targets, one a joint.
-    """
-
-    cell: str
-    seed: int
-    condition: float
+    cell: str  #: name of the cell it was made for
+    seed: int  #: it was made from
+    condition: float  #: of the weighted observation matrix that these moves give
+    #: Standard deviation of each gain [% of it] when the moves are made once without load and once with the cell's
+    #: payload, as predicted from nominal parameters; empty in plans of earlier versions.
     predicted_std_percent: tuple[float, ...]
+    #: From the first target to the end of the last dwell [s]; how long the way to the first target takes depends on the
+    #: robot's position.
     duration_s: float
-    moves: tuple[PlannedMove, ...]
-    units: tuple[JointUnit, ...]
+    moves: tuple[PlannedMove, ...]  #: in order
+    units: tuple[JointUnit, ...]  #: in which people read the targets, one a joint
 
 
 def units_of(cell: Cell) -> tuple[JointUnit, ...]:
@@ -127,14 +119,11 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
 
 FloatArray = NDArray[np.float64]
 
-SECONDS = 5.0
-"""Duration of the extra moves of each kind, so that the kinds can be compared."""
+SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
 POSTURES = 300
 POSITION_MARGIN = 0.03
-SLOW = 0.2
-"""Share of the speed limit at which gravity excites more than inertia."""
-STROKES = (1.0, 0.7, 0.4)
-"""Shares of the range that are tried until the way is clear."""
+SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
+STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
 
 
 def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:

@@ -18,8 +18,7 @@ from daq.workflow.plan import Plan, units_of
 from ident.planning.clearance import Checker
 
 LONGEST_S = 3600.0
-Velocity = Annotated[float, Field(ge=0.01, le=1)]
-"""Slower than a hundredth of its limits a move would hardly end."""
+Velocity = Annotated[float, Field(ge=0.01, le=1)]  #: Slower than a hundredth of its limits a move would hardly end
 Acceleration = Annotated[float, Field(ge=0.0001, le=1)]
 """A hundredth of the speed on the same ways is a ten-thousandth of the acceleration."""
 

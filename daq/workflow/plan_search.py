@@ -22,25 +22,18 @@ from ident.planning.clearance import Obstruction
 
 FloatArray = NDArray[np.float64]
 
-POSITION_MARGIN = 0.03
-"""Share of a joint's range that targets keep from its limits."""
+POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
 DWELL_S = 0.1
-NEAR = 0.15
-"""Standard deviation of a near target, as a share of the joint's range."""
-ROUND = 8
-"""Proposals whose regressors are made at once."""
-THINNING = 2
-"""Every second row is enough to compare proposals by."""
+NEAR = 0.15  #: Standard deviation of a near target, as a share of the joint's range
+ROUND = 8  #: Proposals whose regressors are made at once
+THINNING = 2  #: Every second row is enough to compare proposals by
 SHARPNESS = 8.0
 """The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
 MIN_MOVES = 5
-MAX_TRIES = 100
-"""Random postures or ways that are tried from one place before it counts as shut in."""
+MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
 MAX_RETREATS = 30
-MAX_STARTS = 10
-"""Random plans that are begun before the run counts as too short."""
-PLACES = 3
-"""Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says."""
+MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
+PLACES = 3  #: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
 
 
 class Kind(Enum):
@@ -60,16 +53,11 @@ CHANCES = (0.2, 0.25, 0.2, 0.15, 0.1, 0.1)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Draft:
-    """Moves with the ways between them and the information of each way.
+    """Moves with the ways between them and the information of each way."""
 
-    Attributes:
-        moves: the first only says where the run starts.
-        paths, informations: of moves[1:].
-    """
-
-    moves: tuple[PlannedMove, ...]
-    paths: tuple[Trapezoid, ...]
-    informations: tuple[FloatArray, ...]
+    moves: tuple[PlannedMove, ...]  #: the first only says where the run starts
+    paths: tuple[Trapezoid, ...]  #: of moves[1:]
+    informations: tuple[FloatArray, ...]  #: of moves[1:]
 
     @property
     def duration_s(self) -> float:

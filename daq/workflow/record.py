@@ -63,10 +63,8 @@ ALLOWANCE_S = 10.0
 """Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
 LATE_LOSSES_S = 0.25
 """After the last sample: the interface's own counters are read five times a second (drivers/stream/capture.py)."""
-SPACE_CHECK_S = 0.1
-"""Of recorded time, between two looks at the room on the disk."""
-ROUNDING = 1.001
-"""Whole counts may ask a drive for this much more than a limit."""
+SPACE_CHECK_S = 0.1  #: Of recorded time, between two looks at the room on the disk
+ROUNDING = 1.001  #: Whole counts may ask a drive for this much more than a limit
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,7 @@ from ident.model.model import DriveTrain
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
 MODE = 0o644
-VIRTUAL = "virtual"
-"""python-can's bus within one process: a bus of that name in another process is another bus."""
+VIRTUAL = "virtual"  #: python-can's bus within one process: a bus of that name in another process is another bus
 
 
 @contextmanager
@@ -156,18 +155,14 @@ def _is_at(descriptor: int, path: Path) -> bool:
     return False
 
 
-FreeBytes = Callable[[Path], int]
-"""Room left for this user on the disk of a folder [bytes]."""
+FreeBytes = Callable[[Path], int]  #: Room left for this user on the disk of a folder [bytes]
 
 RESERVE_BYTES = 64 * 2**20
 """Never used: others write to the same disk, and the stop of the axes and the end of the log need some too."""
-INDEX_BYTES = 16
-"""Index entry of a message, behind its chunk."""
+INDEX_BYTES = 16  #: Index entry of a message, behind its chunk
 MESSAGE_HEAD_BYTES = 31
-CHUNKS_BYTES_S = 4096.0
-"""Heads and indexes of the chunks of one second."""
-ENDS_BYTES = 2**16
-"""Definitions and metadata, at the start and again at the end."""
+CHUNKS_BYTES_S = 4096.0  #: Heads and indexes of the chunks of one second
+ENDS_BYTES = 2**16  #: Definitions and metadata, at the start and again at the end
 
 
 def free_bytes(folder: Path) -> int:
@@ -275,8 +270,7 @@ def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, .
     return grouped if note is None else (note, *grouped)
 
 
-_ROUNDING_KG = 1e-9
-"""Two spellings of one number are one number."""
+_ROUNDING_KG = 1e-9  #: Two spellings of one number are one number
 
 
 def tolerance_kg(payloads: Iterable[WeighedPayload], name: str) -> float:
@@ -319,8 +313,7 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
         )
 
 
-NEVER = 2**31 - 1
-"""Searches of the middle generation before one of everything."""
+NEVER = 2**31 - 1  #: Searches of the middle generation before one of everything
 
 
 @contextmanager

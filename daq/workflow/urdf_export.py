@@ -34,32 +34,21 @@ about a third of their limits, and uniform states one of 0.58 of theirs."""
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """One base parameter that had to move.
+    """One base parameter that had to move."""
 
-    Attributes:
-        name: leading name of the base parameter.
-        identified, realised: before and after.
-        deviations: the change in standard deviations of the fit.
-    """
-
-    name: str
-    identified: float
-    realised: float
-    deviations: float
+    name: str  #: leading name of the base parameter
+    identified: float  #: before and after
+    realised: float  #: before and after
+    deviations: float  #: the change in standard deviations of the fit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhysicalRobot:
-    """Bodies of the robot, from a calibration.
+    """Bodies of the robot, from a calibration."""
 
-    Attributes:
-        parameters: with their certificate.
-        prior: what was believed of the links beforehand.
-        shifts: of base parameters, largest first; none where the identified ones are those of a possible robot.
-    """
-
-    parameters: PhysicalParameters
-    prior: InertiaPrior
+    parameters: PhysicalParameters  #: with their certificate
+    prior: InertiaPrior  #: what was believed of the links beforehand
+    #: Of base parameters, largest first; none where the identified ones are those of a possible robot.
     shifts: tuple[Shift, ...]
 
 
@@ -119,52 +108,34 @@ def cell_limits(cell: Cell) -> FloatArray:
     return np.array([ends.mean(axis=1), 0.5 * (ends[:, 1] - ends[:, 0]), speed, acceleration])
 
 
-MAX_BYTES = 16 * 2**20
-"""No URDF is larger; meshes are files of their own."""
-MAX_DEPTH = 64
-"""Elements in elements; a URDF has five or so, and readers that recurse end at some depth."""
+MAX_BYTES = 16 * 2**20  #: No URDF is larger; meshes are files of their own
+MAX_DEPTH = 64  #: Elements in elements; a URDF has five or so, and readers that recurse end at some depth
 _TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=>/]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*(/?)>")
 
 
 @dataclass(slots=True)
 class Element:
-    """One element at or below the level of links and joints.
+    """One element at or below the level of links and joints."""
 
-    Attributes:
-        name: of its tag.
-        attributes: as given.
-        start, tag_end, end: offsets of '<', behind the start tag, and behind the whole element.
-        empty: written as <name/>.
-        children: one level further down.
-    """
-
-    name: str
-    attributes: dict[str, str]
-    start: int
-    tag_end: int
-    empty: bool
-    end: int = -1
-    children: list[Element] = field(default_factory=list)
+    name: str  #: of its tag
+    attributes: dict[str, str]  #: as given
+    start: int  #: offsets of '<', behind the start tag, and behind the whole element
+    tag_end: int  #: offsets of '<', behind the start tag, and behind the whole element
+    empty: bool  #: written as <name/>
+    end: int = -1  #: offsets of '<', behind the start tag, and behind the whole element
+    children: list[Element] = field(default_factory=list)  #: one level further down
 
 
 @dataclass(frozen=True, slots=True)
 class Markup:
-    """The elements of a URDF.
+    """The elements of a URDF."""
 
-    Attributes:
-        file: what messages call it.
-        root: <robot>.
-        head_comments: start and end of comments before it.
-        links, joints: by their names.
-        fixed: links that fixed joints hold to a link, by its name.
-    """
-
-    file: str
-    root: Element
-    head_comments: tuple[tuple[int, int], ...]
-    links: Mapping[str, Element]
-    joints: Mapping[str, Element]
-    fixed: Mapping[str, tuple[str, ...]]
+    file: str  #: what messages call it
+    root: Element  #: <robot>
+    head_comments: tuple[tuple[int, int], ...]  #: start and end of comments before it
+    links: Mapping[str, Element]  #: by their names
+    joints: Mapping[str, Element]  #: by their names
+    fixed: Mapping[str, tuple[str, ...]]  #: links that fixed joints hold to a link, by its name
 
     def joint(self, name: str) -> Element:
         """The joint of this name.
@@ -314,39 +285,27 @@ def _end(file: str, joint: Element, which: str) -> str:
     return named[0]
 
 
-FORMAT = "drivegain-urdf"
-"""What the comment at the head of a written URDF says it is."""
+FORMAT = "drivegain-urdf"  #: What the comment at the head of a written URDF says it is
 _MERGED = b"<!-- drivegain: this body's inertia is in that of the moving link it is fixed to -->"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointUpdate:
-    """New values of a joint and the link it moves.
+    """New values of a joint and the link it moves."""
 
-    Attributes:
-        body: everything that moves with the joint as one: its link and what fixed joints hold to it, in the link frame.
-        damping: viscous friction, not negative [Nm/(rad/s), N/(m/s)].
-        friction: dry friction, not negative [Nm, N].
-    """
-
+    #: Everything that moves with the joint as one: its link and what fixed joints hold to it, in the link frame.
     body: Body
-    damping: float
-    friction: float
+    damping: float  #: viscous friction, not negative [Nm/(rad/s), N/(m/s)]
+    friction: float  #: dry friction, not negative [Nm, N]
 
 
 @dataclass(frozen=True, slots=True)
 class Updated:
-    """A URDF with its new values.
+    """A URDF with its new values."""
 
-    Attributes:
-        content: the file.
-        links: name of the link that each joint moves, by the joint's name.
-        merged: links whose own inertia was taken out, because it is part of a moving link's.
-    """
-
-    content: bytes
-    links: dict[str, str]
-    merged: tuple[str, ...]
+    content: bytes  #: the file
+    links: dict[str, str]  #: name of the link that each joint moves, by the joint's name
+    merged: tuple[str, ...]  #: links whose own inertia was taken out, because it is part of a moving link's
 
 
 def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], provenance: str) -> Updated:

@@ -28,25 +28,18 @@ _U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
 class DriveNote(StrictModel):
-    """One drive in a record.
+    """One drive in a record."""
 
-    Attributes:
-        axis, node_id: which.
-        vendor_id, product_code, serial: identity that the drive reported (1018h).
-        index, subindex, type: the object that was to be written.
-        old, new: its bits before the write, and as they were to be.
-    """
-
-    axis: str
-    node_id: Annotated[int, Field(ge=1, le=127)]
-    vendor_id: _U32
-    product_code: _U32
-    serial: _U32 | None
-    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
-    subindex: Annotated[int, Field(ge=0, le=0xFF)]
-    type: ParameterKind
-    old: _U32
-    new: _U32
+    axis: str  #: which
+    node_id: Annotated[int, Field(ge=1, le=127)]  #: which
+    vendor_id: _U32  #: identity that the drive reported (1018h)
+    product_code: _U32  #: identity that the drive reported (1018h)
+    serial: _U32 | None  #: identity that the drive reported (1018h)
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: the object that was to be written
+    subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: the object that was to be written
+    type: ParameterKind  #: the object that was to be written
+    old: _U32  #: its bits before the write, and as they were to be
+    new: _U32  #: its bits before the write, and as they were to be
 
     @property
     def parameter(self) -> Parameter:
@@ -55,20 +48,13 @@ class DriveNote(StrictModel):
 
 
 class DriveRecord(StrictModel):
-    """One write to the drives of a cell.
-
-    Attributes:
-        cell: name of the cell.
-        at: time, ISO 8601.
-        who: the operator or the job.
-        drives: one for each axis.
-    """
+    """One write to the drives of a cell."""
 
     format: Literal["drivegain drive record 1"] = "drivegain drive record 1"
-    cell: str
-    at: str
-    who: str
-    drives: tuple[DriveNote, ...]
+    cell: str  #: name of the cell
+    at: str  #: time, ISO 8601
+    who: str  #: the operator or the job
+    drives: tuple[DriveNote, ...]  #: one for each axis
 
 
 class _RecordFile(DriveRecord):

@@ -38,19 +38,12 @@ _REVIEW = "take a dry run, review it, and repeat it with the --base that it prin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveEdit(Edit):
-    """Planned change of the drives of a cell.
+    """Planned change of the drives of a cell."""
 
-    Attributes:
-        folder: of the records.
-        values: in the drives now.
-        writes: values to be written.
-        record: of the write that a rollback undoes; None for a calibration.
-    """
-
-    folder: Path
-    values: tuple[ParameterValue, ...]
-    writes: tuple[ParameterWrite, ...]
-    record: DriveRecord | None = None
+    folder: Path  #: of the records
+    values: tuple[ParameterValue, ...]  #: in the drives now
+    writes: tuple[ParameterWrite, ...]  #: values to be written
+    record: DriveRecord | None = None  #: of the write that a rollback undoes; None for a calibration
 
     @property
     def place(self) -> Path:

@@ -125,8 +125,7 @@ def _circle(file: Path) -> ControllerUnfit:
     )
 
 
-_MODE = 0o644
-"""Every user may read it, and that is enough to lock it (not on NFS, which requires write access)."""
+_MODE = 0o644  #: Every user may read it, and that is enough to lock it (not on NFS, which requires write access)
 
 
 @contextlib.contextmanager
@@ -198,20 +197,13 @@ def _is_at(descriptor: int, path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup beside a controller file; all but its content is in its name.
+    """A backup beside a controller file; all but its content is in its name."""
 
-    Attributes:
-        path: file.
-        stamp, count: its place in the order of time.
-        was: digest of its content.
-        after_digest: digest of the content that replaced it in the controller file.
-    """
-
-    path: Path
-    stamp: str
-    count: int
-    was: str
-    after_digest: str
+    path: Path  #: file
+    stamp: str  #: its place in the order of time
+    count: int  #: its place in the order of time
+    was: str  #: digest of its content
+    after_digest: str  #: digest of the content that replaced it in the controller file
 
     def content(self) -> bytes:
         """Read the backup.

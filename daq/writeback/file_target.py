@@ -37,15 +37,10 @@ from ident.calibration import Calibration, Gain
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileEdit(Edit):
-    """Planned change of a controller's file.
+    """Planned change of a controller's file."""
 
-    Attributes:
-        file: as it was named; `subject` is the file behind its symbolic links.
-        format: of the file; None where its name says it.
-    """
-
-    file: Path
-    format: ControllerFormat | None = None
+    file: Path  #: as it was named; `subject` is the file behind its symbolic links
+    format: ControllerFormat | None = None  #: of the file; None where its name says it
 
     @property
     def place(self) -> Path:

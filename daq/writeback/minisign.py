@@ -40,15 +40,10 @@ _MEMLIMIT_ALLOWED, _OPSLIMIT_ALLOWED = 2**30, 2**26
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """Key that a signature is checked with.
+    """Key that a signature is checked with."""
 
-    Attributes:
-        key_id: 8 bytes that name the key pair.
-        key: Ed25519 public key, 32 bytes.
-    """
-
-    key_id: bytes
-    key: bytes
+    key_id: bytes  #: 8 bytes that name the key pair
+    key: bytes  #: Ed25519 public key, 32 bytes
 
     @property
     def line(self) -> str:
@@ -81,15 +76,10 @@ class PublicKey:
 
 @dataclass(frozen=True, slots=True)
 class SecretKey:
-    """Key that a file is signed with, in memory only.
+    """Key that a file is signed with, in memory only."""
 
-    Attributes:
-        key_id: 8 bytes that name the key pair.
-        seed: Ed25519 private key, 32 bytes; hidden from every representation.
-    """
-
-    key_id: bytes
-    seed: bytes
+    key_id: bytes  #: 8 bytes that name the key pair
+    seed: bytes  #: Ed25519 private key, 32 bytes; hidden from every representation
 
     def __repr__(self) -> str:
         """Hide the secret, which must not reach a log with a traceback."""
@@ -127,19 +117,12 @@ class SecretKey:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """One signature.
+    """One signature."""
 
-    Attributes:
-        key_id: of the key pair that made it.
-        signature: of the content's BLAKE2b-512, 64 bytes.
-        comment: the trusted comment.
-        whole: of `signature` and `comment` together, 64 bytes.
-    """
-
-    key_id: bytes
-    signature: bytes
-    comment: str
-    whole: bytes
+    key_id: bytes  #: of the key pair that made it
+    signature: bytes  #: of the content's BLAKE2b-512, 64 bytes
+    comment: str  #: the trusted comment
+    whole: bytes  #: of `signature` and `comment` together, 64 bytes
 
     @property
     def text(self) -> str:

@@ -74,28 +74,17 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class GainChange:
-    """One gain before and after.
+    """One gain before and after."""
 
-    Attributes:
-        axis: name of the axis.
-        key: place of the number: its key in the controller file, or the drive's object.
-        line: of the number in the file, from 1; 0 in a drive.
-        old, new: gain now, and as it will be read back [unit]; new is NaN where there is none to write.
-        std: standard deviation of the identified gain [unit].
-        unit: Nm at the joint per unit of the current-loop reference.
-        nameplate: the manufacturer's gain [unit].
-        spelling: the new number as written, in the controller's own unit; empty where none can be written.
-    """
-
-    axis: str
-    key: str
-    line: int
-    old: float
-    new: float
-    std: float
-    unit: str
-    nameplate: float
-    spelling: str
+    axis: str  #: name of the axis
+    key: str  #: place of the number: its key in the controller file, or the drive's object
+    line: int  #: of the number in the file, from 1; 0 in a drive
+    old: float  #: gain now, and as it will be read back [unit]; new is NaN where there is none to write
+    new: float  #: gain now, and as it will be read back [unit]; new is NaN where there is none to write
+    std: float  #: standard deviation of the identified gain [unit]
+    unit: str  #: Nm at the joint per unit of the current-loop reference
+    nameplate: float  #: the manufacturer's gain [unit]
+    spelling: str  #: the new number as written, in the controller's own unit; empty where none can be written
 
     @classmethod
     def of(cls, gain: Gain, key: str, line: int, old: float, planned: tuple[float, str] | None) -> GainChange:
@@ -125,29 +114,19 @@ class GainChange:
         return _percent(self.std, abs(self.new))
 
 
-Finding = tuple[str, str, str, str]
-"""Reason to refuse a write: subject, found, expected, remedy."""
+Finding = tuple[str, str, str, str]  #: Reason to refuse a write: subject, found, expected, remedy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Edit:
-    """Planned change of a target; nothing is written yet.
+    """Planned change of a target; nothing is written yet."""
 
-    Attributes:
-        subject: the target, as audit and history name it.
-        before: its content now; None where the file is gone.
-        after: its content after the change.
-        changes: one for each gain, in the order of the calibration; none in a rollback.
-        unexpected: where the content now is not the one that drivegain expects there.
-        source: backup or record that a rollback restores; None for a calibration.
-    """
-
-    subject: str
-    before: bytes | None
-    after: bytes
-    changes: tuple[GainChange, ...] = ()
-    unexpected: tuple[Finding, ...] = ()
-    source: Path | None = None
+    subject: str  #: the target, as audit and history name it
+    before: bytes | None  #: its content now; None where the file is gone
+    after: bytes  #: its content after the change
+    changes: tuple[GainChange, ...] = ()  #: one for each gain, in the order of the calibration; none in a rollback
+    unexpected: tuple[Finding, ...] = ()  #: where the content now is not the one that drivegain expects there
+    source: Path | None = None  #: backup or record that a rollback restores; None for a calibration
 
     @property
     def place(self) -> Path:
@@ -208,15 +187,10 @@ def change_digest(before: bytes, after: bytes) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ReviewedChange:
-    """The change that the operator has reviewed.
+    """The change that the operator has reviewed."""
 
-    Attributes:
-        base_sha256: digest of the content before it; None where nothing was reviewed.
-        after_digest: first digits of the digest of the content after it; None where any is accepted.
-    """
-
-    base_sha256: str | None
-    after_digest: str | None
+    base_sha256: str | None  #: digest of the content before it; None where nothing was reviewed
+    after_digest: str | None  #: first digits of the digest of the content after it; None where any is accepted
 
 
 def parse_base(base: str | None, before: bytes) -> ReviewedChange:

@@ -23,13 +23,11 @@ from drivers.errors import BusError
 from drivers.stream.socketcan import open_socketcan
 
 CONNECT_TIMEOUT_S = 5.0
-SEND_S = 2.0
-"""Longest time in which a server may accept nothing; a frame sent in part cannot be recalled."""
+SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
 _RECEIVE_BYTES = 1 << 16
 LONGEST_BYTES = 4096
 """Longest unfinished message; a frame has some 50. A server that never ends a message speaks another protocol."""
-_LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16
-"""Hexadecimal digits."""
+_LONGEST_IDENTIFIER, _LONGEST_DATA = 8, 16  #: Hexadecimal digits
 _SHOWN = 60
 _ADDRESS = re.compile(r"([\w-]+):([^@]+)(?:@([^:]+):(\d+))?")
 # Possessive, and never past the next '<': each byte of a mismatch is read once.

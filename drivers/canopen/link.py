@@ -23,10 +23,8 @@ SYNC_COB_ID = 0x080
 _NMT_COB_ID = 0x000
 SDO_REQUEST = 0x600
 _EMCY, _SDO_ANSWER, HEARTBEAT = 0x080, 0x580, 0x700
-_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))
-"""Set-points of a drive (CiA 301, predefined connection set)."""
-PUMP_S = 1.0
-"""Longest time spent on frames that have already arrived, however fast more arrive."""
+_RPDOS = frozenset((0x200, 0x300, 0x400, 0x500))  #: Set-points of a drive (CiA 301, predefined connection set)
+PUMP_S = 1.0  #: Longest time spent on frames that have already arrived, however fast more arrive
 # linux/can/error.h: classes of an error frame, and the controller's state in its second byte.
 _CONTROLLER, _RESTARTED = 0x004, 0x100
 _OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x03, 0x0C, 0x30, 0x40

@@ -26,35 +26,24 @@ from drivers.profiles.scale import ScaleReading, read_scale
 from drivers.stream.sample import Sample
 from drivers.stream.split_bus import CellAddress, open_cell_bus
 
-ASKED_AT_ONCE = 8
-"""Candidates for the recorder's node id that are tried together."""
-HEARTBEAT_MS = 100
-"""Period of the heartbeats of every node, and of the recorder."""
-STANDSTILL_COUNTS = 1024
-"""An encoder at rest flickers, and an axis may sink onto its brake between two readings."""
+ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
+HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
+STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Time limits of a network [s].
+    """Time limits of a network [s]."""
 
-    Attributes:
-        listen_s: for other masters before the first frame is sent; each SYNC period of theirs must fit.
-        answer_s: until every node answered the search.
-        silence_s: until nodes that do not answer while the network closes are given up, all of them together.
-        nmt_s: until a heartbeat confirms an NMT state.
-        mode_s: until 6061h shows the requested mode.
-        disable_s: until an axis is without power when the network closes.
-        free_s: for devices with the node ids that the recorder may take. With `listen_s` before it, longer than
-            `guard_ms` of a cell whose SYNC has a usual period: a slower heartbeat could not replace the recorder's.
-    """
-
-    answer_s: float = 1.0
+    answer_s: float = 1.0  #: until every node answered the search
+    #: Until nodes that do not answer while the network closes are given up, all of them together.
     silence_s: float = 0.5
-    listen_s: float = 0.2
-    nmt_s: float = 2.0
-    mode_s: float = 1.0
-    disable_s: float = 2.0
+    listen_s: float = 0.2  #: for other masters before the first frame is sent; each SYNC period of theirs must fit
+    nmt_s: float = 2.0  #: until a heartbeat confirms an NMT state
+    mode_s: float = 1.0  #: until 6061h shows the requested mode
+    disable_s: float = 2.0  #: until an axis is without power when the network closes
+    #: For devices with the node ids that the recorder may take. With `listen_s` before it, longer than `guard_ms` of a
+    #: cell whose SYNC has a usual period: a slower heartbeat could not replace the recorder's.
     free_s: float = 0.35
 
 

@@ -19,8 +19,7 @@ from drivers.motion.guard import CONSUMERS
 from drivers.profiles.cia402 import POWERLESS, decode
 from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Parameter
 
-SAVE_TIMEOUT_S = 10.0
-"""Drives write their whole memory, which takes 0.4 s and more, and answer when it is done."""
+SAVE_TIMEOUT_S = 10.0  #: Drives write their whole memory, which takes 0.4 s and more, and answer when it is done
 
 
 class Saving(Enum):

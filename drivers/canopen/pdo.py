@@ -16,12 +16,10 @@ from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import Axis, ObjectEntry
 
 PDO_BYTES = 8
-PDOS = 4
-"""PDOs of the predefined connection set, in each direction."""
+PDOS = 4  #: PDOs of the predefined connection set, in each direction
 NOT_VALID = 1 << 31
 _COB_ID_BITS = NOT_VALID | 0x1FFF_FFFF  # bit 30 (RTR) is set by some drives on their own
-SYNCHRONOUS = 1
-"""Transmission type: sent, or acted upon, at every SYNC."""
+SYNCHRONOUS = 1  #: Transmission type: sent, or acted upon, at every SYNC
 
 STATUSWORD = ObjectEntry(0x6041, 0, 16, signed=False)
 CONTROLWORD = ObjectEntry(0x6040, 0, 16, signed=False)
@@ -42,20 +40,13 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PdoRecord:
-    """Communication and mapping parameters of one PDO in a drive.
+    """Communication and mapping parameters of one PDO in a drive."""
 
-    Attributes:
-        direction, number: of the PDO; numbers from 0.
-        cob_id: sub 1 with its flag bits.
-        transmission: type, sub 2.
-        entries: mapped objects, each as the 32-bit word of the mapping parameter.
-    """
-
-    direction: Direction
-    number: int
-    cob_id: int
-    transmission: int
-    entries: tuple[int, ...]
+    direction: Direction  #: of the PDO; numbers from 0
+    number: int  #: of the PDO; numbers from 0
+    cob_id: int  #: sub 1 with its flag bits
+    transmission: int  #: type, sub 2
+    entries: tuple[int, ...]  #: mapped objects, each as the 32-bit word of the mapping parameter
 
     def __str__(self) -> str:
         mapped = " ".join(f"{entry:08X}" for entry in self.entries) or "nothing"

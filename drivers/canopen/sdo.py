@@ -24,12 +24,10 @@ _INITIATE_DOWNLOAD, _INITIATE_UPLOAD = 1, 2
 
 T = TypeVar("T")
 
-Send = Callable[[Sequence[can.Message]], None]
-"""Sends frames."""
+Send = Callable[[Sequence[can.Message]], None]  #: Sends frames
 Pump = Callable[[float], None]
 """Reads the bus for at most the given time [s] and dispatches frames; returns after each frame."""
-Clock = Callable[[], int]
-"""Monotonic time [ns]."""
+Clock = Callable[[], int]  #: Monotonic time [ns]
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,29 +38,21 @@ _ENABLED = Command.ENABLE_OPERATION
 
 @dataclass(frozen=True, slots=True)
 class MotionBounds:
-    """Time limits in the time of the samples [s], and distances that count as standstill and as arrival.
+    """Time limits in the time of the samples [s], and distances that count as standstill and as arrival."""
 
-    Attributes:
-        enable_s: from the first controlword to OPERATION ENABLED.
-        acknowledge_s: from a set-point to bit 12, and from its end to bit 12 cleared.
-        settle_s: added to a move's computed duration.
-        stop_s: from the quick stop to standstill without power.
-        standstill_cycles, standstill_counts: an axis that stays in QUICK STOP ACTIVE is at standstill, and loses its
-            power, when its position has kept within this many counts for this many cycles. An encoder of 20 bits a turn
-            flickers by several counts at rest. 16 counts in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of
-            such a motor, which is harmless to a brake.
-        arrival_counts, arrival_fraction: largest distance from a target that bit 10 reports as reached, in counts plus
-            a fraction of the way: it catches a drive whose bit 10 is still that of the move before.
-    """
-
-    enable_s: float = 3.0
-    acknowledge_s: float = 0.5
-    settle_s: float = 3.0
-    stop_s: float = 3.0
+    enable_s: float = 3.0  #: from the first controlword to OPERATION ENABLED
+    acknowledge_s: float = 0.5  #: from a set-point to bit 12, and from its end to bit 12 cleared
+    settle_s: float = 3.0  #: added to a move's computed duration
+    stop_s: float = 3.0  #: from the quick stop to standstill without power
+    #: An axis that stays in QUICK STOP ACTIVE is at standstill, and loses its power, when its position has kept within
+    #: this many counts for this many cycles. An encoder of 20 bits a turn flickers by several counts at rest. 16 counts
+    #: in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of such a motor, which is harmless to a brake.
     standstill_cycles: int = 20
-    standstill_counts: int = 16
+    standstill_counts: int = 16  #: see `standstill_cycles`
+    #: Largest distance from a target that bit 10 reports as reached, in counts plus a fraction of the way: it catches a
+    #: drive whose bit 10 is still that of the move before.
     arrival_counts: int = 2000
-    arrival_fraction: float = 0.05
+    arrival_fraction: float = 0.05  #: see `arrival_counts`
 
 
 DEFAULT_BOUNDS = MotionBounds()

@@ -22,10 +22,8 @@ from drivers.profiles.profile import ObjectEntry
 CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
-MOST_CONSUMERS = 127
-"""Entries that 1016h can have (CiA 301)."""
-LOWEST_USUAL_ID = 112
-"""The recorder takes the highest free id: this one or a higher one on any usual bus."""
+MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
+LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
@@ -33,19 +31,12 @@ Consumers = tuple[tuple[ObjectEntry, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Guard:
-    """How an amplifier can watch the recorder, and the original values of the objects.
+    """How an amplifier can watch the recorder, and the original values of the objects."""
 
-    Attributes:
-        consumer: entry of 1016h that is used, None when there is none.
-        consumer_before: its original value.
-        option_before: original value of 6007h, None when the amplifier has no such object.
-        lack: missing capability, in words; empty when nothing is missing.
-    """
-
-    consumer: ObjectEntry | None
-    consumer_before: int
-    option_before: int | None
-    lack: str = ""
+    consumer: ObjectEntry | None  #: entry of 1016h that is used, None when there is none
+    consumer_before: int  #: its original value
+    option_before: int | None  #: original value of 6007h, None when the amplifier has no such object
+    lack: str = ""  #: missing capability, in words; empty when nothing is missing
 
     def describe(self, silence_ms: int) -> str:
         """Describe the guard in words, for the log."""

@@ -147,17 +147,12 @@ class Trapezoid:
 
     Every axis accelerates for ``ramp_s``, cruises, and decelerates for ``ramp_s``; because the ramps are shared, any
     linear combination of axes (a coupled motor) moves on a trapezoid of the same times.
-
-    Attributes:
-        start, end: positions [any unit], shape (n,).
-        duration_s: from start to end [s].
-        ramp_s: of acceleration, and of deceleration [s].
     """
 
-    start: FloatArray
-    end: FloatArray
-    duration_s: float
-    ramp_s: float
+    start: FloatArray  #: positions [any unit], shape (n,)
+    end: FloatArray  #: positions [any unit], shape (n,)
+    duration_s: float  #: from start to end [s]
+    ramp_s: float  #: of acceleration, and of deceleration [s]
 
     @property
     def velocity(self) -> FloatArray:

@@ -21,12 +21,10 @@ from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 FROZEN_S = 0.05
 """Duration of exactly equal values, in the time of the samples. A loop that fights friction changes its current at
 once, and a measured current has noise."""
-FROZEN_COUNTS = 64
-"""Least distance of the set-point meanwhile: one that creeps or has just begun proves nothing."""
+FROZEN_COUNTS = 64  #: Least distance of the set-point meanwhile: one that creeps or has just begun proves nothing
 STALE_PERIODS = 2
 """Of the amplifier's update period, and of SYNC, without a toggle; less may be the difference of two timers."""
-HEARTBEAT_PERIODS = 2.0
-"""Silence after which a node is lost."""
+HEARTBEAT_PERIODS = 2.0  #: Silence after which a node is lost
 LIMIT_S = 0.5
 """A current that saturates in a ramp is masked by the fit; a limit that is active longer is no ramp any more."""
 _WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR

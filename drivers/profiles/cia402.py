@@ -27,8 +27,7 @@ class State(Enum):
     QUICK_STOP_ACTIVE = (0x6F, 0x07)
     FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
     FAULT = (0x4F, 0x08)
-    UNKNOWN = (0x00, 0xFF)
-    """A pattern outside the standard; no statusword matches this mask."""
+    UNKNOWN = (0x00, 0xFF)  #: A pattern outside the standard; no statusword matches this mask
 
     def __str__(self) -> str:
         return self.name.replace("_", " ")
@@ -37,8 +36,7 @@ class State(Enum):
 POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT)
 """States in which a drive gives its motor no power; in FAULT REACTION ACTIVE it still does, in UNKNOWN it may."""
 
-STATE_BITS = 0x6F
-"""Bits of the statusword that encode the state."""
+STATE_BITS = 0x6F  #: Bits of the statusword that encode the state
 
 
 def _match(statusword: int) -> State:

@@ -120,46 +120,30 @@ class CurrentScale:
 
 @dataclass(frozen=True, slots=True)
 class RatedMotor:
-    """Objects of the motor's name plate in a drive, against which ampere values are checked.
+    """Objects of the motor's name plate in a drive, against which ampere values are checked."""
 
-    Attributes:
-        current, ampere_per_unit: rated current and its unit (6075h: 1e-3).
-        torque, newton_metre_per_unit: rated torque and its unit (6076h: 1e-3); None where the drive has none.
-    """
-
-    current: ObjectEntry
-    ampere_per_unit: float = 1e-3
-    torque: ObjectEntry | None = None
-    newton_metre_per_unit: float = 1e-3
+    current: ObjectEntry  #: rated current and its unit (6075h: 1e-3)
+    ampere_per_unit: float = 1e-3  #: rated current and its unit (6075h: 1e-3)
+    torque: ObjectEntry | None = None  #: rated torque and its unit (6076h: 1e-3); None where the drive has none
+    newton_metre_per_unit: float = 1e-3  #: rated torque and its unit (6076h: 1e-3); None where the drive has none
 
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """Command that saves a drive's parameters.
+    """Command that saves a drive's parameters."""
 
-    Attributes:
-        command, signature: object, and the value to write to it ("save" of CiA 301).
-        mapping: whether it saves PDO mappings too; those of a recording must then be restored before.
-    """
-
-    command: ObjectEntry
-    signature: int
-    mapping: Mapping
+    command: ObjectEntry  #: object, and the value to write to it ("save" of CiA 301)
+    signature: int  #: object, and the value to write to it ("save" of CiA 301)
+    mapping: Mapping  #: whether it saves PDO mappings too; those of a recording must then be restored before
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """Evidence for one key of a profile.
+    """Evidence for one key of a profile."""
 
-    Attributes:
-        about: key of the profile.
-        basis: kind of evidence.
-        where: document and section, EDS object, or the missing evidence.
-    """
-
-    about: str
-    basis: Basis
-    where: str
+    about: str  #: key of the profile
+    basis: Basis  #: kind of evidence
+    where: str  #: document and section, EDS object, or the missing evidence
 
 
 @dataclass(frozen=True, slots=True)

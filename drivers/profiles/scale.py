@@ -15,35 +15,23 @@ from drivers.profiles.profile import Amplitude, DriveProfile
 
 SMALLEST_RATED_A, LARGEST_RATED_A = 0.01, 1000.0
 """Range of servo motors; a value outside was entered in another unit than mA."""
-MIN_STEPS = 20.0
-"""Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it."""
-GROSS = 5.0
-"""Ratio of two name plates above which one of them must be in another unit."""
-FINE = 1.25
-"""Ratio that tolerances of Kt and a gear's efficiency explain."""
+MIN_STEPS = 20.0  #: Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it
+GROSS = 5.0  #: Ratio of two name plates above which one of them must be in another unit
+FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
 
 
 @dataclass(frozen=True, slots=True)
 class ScaleReading:
-    """Current scale and motor data of a drive.
+    """Current scale and motor data of a drive."""
 
-    Attributes:
-        node_id, name: of the axis.
-        profile: name of its profile.
-        ampere_per_unit: of the mapped current object [A].
-        objects: values of the scale objects, by object.
-        rated_current_a, rated_torque_nm: of the motor, None where the drive does not report them.
-        warnings: missing checks and doubtful values, with the evidence.
-    """
-
-    node_id: int
-    name: str
-    profile: str
-    ampere_per_unit: float
-    objects: dict[str, int]
-    rated_current_a: float | None
-    rated_torque_nm: float | None
-    warnings: tuple[str, ...]
+    node_id: int  #: of the axis
+    name: str  #: of the axis
+    profile: str  #: name of its profile
+    ampere_per_unit: float  #: of the mapped current object [A]
+    objects: dict[str, int]  #: values of the scale objects, by object
+    rated_current_a: float | None  #: of the motor, None where the drive does not report them
+    rated_torque_nm: float | None  #: of the motor, None where the drive does not report them
+    warnings: tuple[str, ...]  #: missing checks and doubtful values, with the evidence
 
 
 def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:

@@ -22,14 +22,11 @@ VELOCITY_BANDWIDTH_RAD_S = 220.0
 POSITION_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 4.0
 INTEGRAL_BANDWIDTH_RAD_S = VELOCITY_BANDWIDTH_RAD_S / 5.0
 
-VELOCITY_FILTER_S = 0.0008
-"""Time constant of the velocity filter: one encoder count a substep is a coarse velocity."""
+VELOCITY_FILTER_S = 0.0008  #: Time constant of the velocity filter: one encoder count a substep is a coarse velocity
 
-POSTURES = 3
-"""Positions tried for each joint in tuning."""
+POSTURES = 3  #: Positions tried for each joint in tuning
 
-SEGMENTS = 4
-"""Largest number of pieces of one move: stop, acceleration, cruise, deceleration."""
+SEGMENTS = 4  #: Largest number of pieces of one move: stop, acceleration, cruise, deceleration
 
 LOOP = np.dtype(
     [
@@ -95,17 +92,11 @@ def tuned_inertia_a_s2(spec: CellSpec, plant: Plant) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class ProfileMove:
-    """Set-point of profile position mode: SEGMENTS pieces of constant acceleration.
+    """Set-point of profile position mode: SEGMENTS pieces of constant acceleration."""
 
-    Attributes:
-        duration_s: of each piece; zero for a piece that is not needed.
-        acceleration: in each piece [counts/s²], signed.
-        target: end of the move [counts].
-    """
-
-    duration_s: tuple[float, ...]
-    acceleration: tuple[float, ...]
-    target: float
+    duration_s: tuple[float, ...]  #: of each piece; zero for a piece that is not needed
+    acceleration: tuple[float, ...]  #: in each piece [counts/s²], signed
+    target: float  #: end of the move [counts]
 
 
 def plan(

@@ -25,14 +25,11 @@ from drivers.stream.split_bus import SplitBus
 SYNC_ID = 0x080
 NMT_ID = 0x000
 
-IDLE_S = 0.02
-"""Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time."""
+IDLE_S = 0.02  #: Longest wait for a frame [s]; it limits the punctuality of heartbeats by wall time
 
-PATIENCE = 3
-"""SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first."""
+PATIENCE = 3  #: SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first
 
-Cycles = tuple[frozenset[int], ...]
-"""Cycles to run now, each given by the buses whose nodes take part."""
+Cycles = tuple[frozenset[int], ...]  #: Cycles to run now, each given by the buses whose nodes take part
 
 
 class SyncGate:
@@ -378,8 +375,7 @@ POWERED = (
     PowerState.FAULT_REACTION_ACTIVE,
 )
 
-Mounted = Callable[[], CellSpec | None]
-"""Return the cell with its present payload, or None if unchanged."""
+Mounted = Callable[[], CellSpec | None]  #: Return the cell with its present payload, or None if unchanged
 
 
 class MountingCell(SimulatedCell):

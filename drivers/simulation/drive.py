@@ -59,25 +59,16 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis.
+    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis."""
 
-    Attributes:
-        position: 6064h [counts].
-        demand: 6062h [counts].
-        velocity: 606Ch [counts/s].
-        current_demand: 6074h [per mille of rated current].
-        current: 6077h and 6078h [per mille of rated current].
-        reached, limited, following_error: bits 10, 11 and 13 of 6041h as the loops see them.
-    """
-
-    position: list[int]
-    demand: list[int]
-    velocity: list[int]
-    current_demand: list[int]
-    current: list[int]
-    reached: list[int]
-    limited: list[int]
-    following_error: list[int]
+    position: list[int]  #: 6064h [counts]
+    demand: list[int]  #: 6062h [counts]
+    velocity: list[int]  #: 606Ch [counts/s]
+    current_demand: list[int]  #: 6074h [per mille of rated current]
+    current: list[int]  #: 6077h and 6078h [per mille of rated current]
+    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
 
 
 def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:

@@ -22,31 +22,20 @@ class Moment:
 
     There are n joints and motors, N coordinates and m directions of dry friction. The coordinates are the joints,
     then the motors behind a flexible drive. A prismatic joint has N for Nm and m for rad.
-
-    Attributes:
-        time_s: since power-on.
-        step_s: length of the substep.
-        position_rad, velocity_rad_s: at its start, shape (N,); read only.
-        motor_rad: rotor angles, shape (n,); read only.
-        current_a: in the motors, shape (n,); read only.
-        load_torque_nm: torque of the links on each joint in the step before, shape (n,); read only.
-        bound_nm: of dry friction, shape (m,); the first n are the joints'. May be changed; must not become negative.
-        viscous_nm_s_rad: of viscous friction, shape (N,); may be changed.
-        torque_nm: other torques on each coordinate, shape (N,); may be changed.
-        motor_torque_nm: of each motor, in joint units, shape (n,); may be changed.
     """
 
-    time_s: float
-    step_s: float
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    motor_rad: FloatArray
-    current_a: FloatArray
-    load_torque_nm: FloatArray
+    time_s: float  #: since power-on
+    step_s: float  #: length of the substep
+    position_rad: FloatArray  #: at its start, shape (N,); read only
+    velocity_rad_s: FloatArray  #: at its start, shape (N,); read only
+    motor_rad: FloatArray  #: rotor angles, shape (n,); read only
+    current_a: FloatArray  #: in the motors, shape (n,); read only
+    load_torque_nm: FloatArray  #: torque of the links on each joint in the step before, shape (n,); read only
+    #: Of dry friction, shape (m,); the first n are the joints'. May be changed; must not become negative.
     bound_nm: FloatArray
-    viscous_nm_s_rad: FloatArray
-    torque_nm: FloatArray
-    motor_torque_nm: FloatArray
+    viscous_nm_s_rad: FloatArray  #: of viscous friction, shape (N,); may be changed
+    torque_nm: FloatArray  #: other torques on each coordinate, shape (N,); may be changed
+    motor_torque_nm: FloatArray  #: of each motor, in joint units, shape (n,); may be changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +112,12 @@ class Presliding:
     """Dahl's friction torque·z, dz/dq = (1 − z·sign(v)) / distance (Dahl 1968), in place of as much dry friction.
 
     Contacts bend before they slide, so friction builds up over a distance after each reversal.
-
-    Attributes:
-        axis: joint.
-        torque_nm: friction after a long distance in one direction.
-        distance_rad: over which 63 % of a change of z happens.
-        bristle: z, the state.
     """
 
-    axis: int
-    torque_nm: float
-    distance_rad: float
-    bristle: float = 0.0
+    axis: int  #: joint
+    torque_nm: float  #: friction after a long distance in one direction
+    distance_rad: float  #: over which 63 % of a change of z happens
+    bristle: float = 0.0  #: z, the state
 
     def act(self, moment: Moment) -> None:
         """Exchange dry friction for Dahl's; z is advanced by the exact solution over the distance of the step."""
@@ -163,20 +146,13 @@ class WarmUp:
 
 @dataclass(slots=True)
 class Coupling:
-    """Dry and viscous friction on the sum of two joints' speeds (a shaft of one that runs through the other, eq. 25).
+    """Friction on the sum of the speeds of two joints, dry and viscous (one shaft runs through the other, eq. 25)."""
 
-    Attributes:
-        axis: one joint.
-        other_axis: number of the other joint, from 1 as a person counts.
-        coulomb_nm, viscous_nm_s_rad: of the shared friction.
-        direction: index of its direction of dry friction, filled in by the plant.
-    """
-
-    axis: int
-    other_axis: float
-    coulomb_nm: float
-    viscous_nm_s_rad: float
-    direction: int = field(default=-1, init=False)
+    axis: int  #: one joint
+    other_axis: float  #: number of the other joint, from 1 as a person counts
+    coulomb_nm: float  #: of the shared friction
+    viscous_nm_s_rad: float  #: of the shared friction
+    direction: int = field(default=-1, init=False)  #: index of its direction of dry friction, filled in by the plant
 
     @property
     def other(self) -> int:
@@ -236,17 +212,11 @@ class Saturation:
 
 @dataclass(slots=True)
 class Lag:
-    """First-order lag of the reported current reference; the current itself is not delayed.
+    """First-order lag of the reported current reference; the current itself is not delayed."""
 
-    Attributes:
-        axis: motor.
-        time_constant_s: of the lag.
-        value_a: of the filter, the state.
-    """
-
-    axis: int
-    time_constant_s: float
-    value_a: float = 0.0
+    axis: int  #: motor
+    time_constant_s: float  #: of the lag
+    value_a: float = 0.0  #: of the filter, the state
 
     def report(self, reported_a: NDArray[np.float64], step_s: float) -> None:
         """Replace this axis' reference by the filtered one; called once a substep (exact for a held input)."""
@@ -256,19 +226,14 @@ class Lag:
 
 @dataclass(slots=True)
 class Elasticity:
-    """A spring and a damper in the drive of one motor: the motor becomes a coordinate of its own (two masses).
+    """A spring and a damper in the drive of one motor: the motor becomes a coordinate of its own (two masses)."""
 
-    Attributes:
-        axis: motor.
-        stiffness_nm_per_rad, damping_nm_s_per_rad: in joint units.
-        coordinate, row: the motor's coordinate and its row r of the drive train, filled in by the plant.
-    """
-
-    axis: int
-    stiffness_nm_per_rad: float
-    damping_nm_s_per_rad: float
+    axis: int  #: motor
+    stiffness_nm_per_rad: float  #: in joint units
+    damping_nm_s_per_rad: float  #: in joint units
+    #: The motor's coordinate and its row r of the drive train, filled in by the plant.
     coordinate: int = field(default=-1, init=False)
-    row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), init=False)
+    row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), init=False)  #: see `coordinate`
 
     def act(self, moment: Moment) -> None:
         """Add the drive's torque to the links and subtract it from the motor."""
@@ -277,14 +242,10 @@ class Elasticity:
 
 @dataclass(slots=True)
 class Backlash:
-    """Elasticity with a gap: the drive transmits only where the teeth touch, and there it only pushes.
-
-    Attributes:
-        gap_rad: free play between the flanks, in joint units; the others as in Elasticity.
-    """
+    """Elasticity with a gap: the drive transmits only where the teeth touch, and there it only pushes."""
 
     axis: int
-    gap_rad: float
+    gap_rad: float  #: free play between the flanks, in joint units; the others as in Elasticity
     stiffness_nm_per_rad: float
     damping_nm_s_per_rad: float
     coordinate: int = field(default=-1, init=False)

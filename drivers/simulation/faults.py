@@ -44,21 +44,13 @@ class FaultKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FaultSpec:
-    """One fault.
+    """One fault."""
 
-    Attributes:
-        kind: kind of fault.
-        axis: index from 0, or None for all.
-        at_cycle: first SYNC since power-on with the fault; 0 is from power-on.
-        cycles: duration, or None without end.
-        value: EMCY code (EMERGENCY).
-    """
-
-    kind: FaultKind
-    axis: int | None = None
-    at_cycle: int = 0
-    cycles: int | None = None
-    value: int = 0
+    kind: FaultKind  #: kind of fault
+    axis: int | None = None  #: index from 0, or None for all
+    at_cycle: int = 0  #: first SYNC since power-on with the fault; 0 is from power-on
+    cycles: int | None = None  #: duration, or None without end
+    value: int = 0  #: EMCY code (EMERGENCY)
 
     def active(self, cycle: int) -> bool:
         """Return whether the fault is present in a cycle."""
@@ -71,15 +63,13 @@ class FaultSpec:
 
 Frame = tuple[int, bytes]
 
-FOREIGN_SDO = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
-"""SDO request of another master: read 6041h."""
+FOREIGN_SDO = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))  #: SDO request of another master: read 6041h
 ERROR_FRAMES = {
     FaultKind.BUS_OFF: (0x040, bytes(8)),
     FaultKind.ERROR_PASSIVE: (0x004, bytes((0, 0x30, 0, 0, 0, 0, 0, 0))),
 }
 """Class and data of an error frame of this end's controller (linux/can/error.h): bus-off; both counters passive."""
-_FROZEN_BYTES = 6
-"""Bytes of a TPDO that hold position and current; the statusword behind them is not frozen."""
+_FROZEN_BYTES = 6  #: Bytes of a TPDO that hold position and current; the statusword behind them is not frozen
 
 
 class Disturbance:

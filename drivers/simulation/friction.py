@@ -32,16 +32,13 @@ def compiled(function: F) -> F:
 
 FloatArray = NDArray[np.float64]
 
-TOLERANCE_RAD_S = 1e-10
-"""Largest speed that a direction may keep while its friction is inside its bound [rad/s]."""
+TOLERANCE_RAD_S = 1e-10  #: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
 
 MAX_SWEEPS = 2_000
 
-SWEEPS_A_ROUND = 10
-"""Sweeps that find which directions stick, before these are solved for directly."""
+SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these are solved for directly
 
-DEPENDENT = 1e-9
-"""Relative pivot below which a sticking direction depends on those before it."""
+DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
 
 
 @compiled

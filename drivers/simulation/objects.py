@@ -54,22 +54,14 @@ Value = int | str
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One entry of the dictionary.
+    """One entry of the dictionary."""
 
-    Attributes:
-        kind: data type.
-        default: at power-on, if the node does not compute it.
-        writable: by SDO.
-        mappable: into PDOs.
-        lowest, highest: range of values that are accepted, inclusive, None for the whole type.
-    """
-
-    kind: Kind
-    default: Value = 0
-    writable: bool = False
-    mappable: Mappable = Mappable.NO
-    lowest: int | None = None
-    highest: int | None = None
+    kind: Kind  #: data type
+    default: Value = 0  #: at power-on, if the node does not compute it
+    writable: bool = False  #: by SDO
+    mappable: Mappable = Mappable.NO  #: into PDOs
+    lowest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
+    highest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
 
     def encode(self, value: Value) -> bytes:
         """Return the bytes for the bus."""

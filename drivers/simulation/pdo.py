@@ -24,15 +24,13 @@ NO_SUCH_OBJECT = 0x06020000
 NOT_MAPPABLE = 0x06040041
 PDO_TOO_LONG = 0x06040042
 
-INVALID = 1 << 31
-"""Bit of the COB-ID: the PDO does not exist."""
+INVALID = 1 << 31  #: Bit of the COB-ID: the PDO does not exist
 
 NO_RTR = 1 << 30
 
 MAX_ENTRIES = 8
 
-EVENT_DRIVEN = 254
-"""First transmission type that is sent on a change, not on SYNC."""
+EVENT_DRIVEN = 254  #: First transmission type that is sent on a change, not on SYNC
 
 
 class Direction(Enum):
@@ -44,23 +42,14 @@ class Direction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class PdoParameters:
-    """Communication and mapping parameters.
+    """Communication and mapping parameters."""
 
-    Attributes:
-        cob_id: with bit 31 (invalid) and bit 30 (no RTR).
-        transmission: type; 1 to 240 on that many SYNCs, 0 on the SYNC after a change, 254 and 255 on a change.
-        inhibit_100us: least time between two event-driven frames.
-        event_timer_ms: longest time between two event-driven frames, 0 for none.
-        entries: mapping entries (index, subindex, bits), MAX_ENTRIES long.
-        count: how many of them are mapped.
-    """
-
-    cob_id: int
-    transmission: int
-    inhibit_100us: int
-    event_timer_ms: int
-    entries: tuple[int, ...]
-    count: int
+    cob_id: int  #: with bit 31 (invalid) and bit 30 (no RTR)
+    transmission: int  #: type; 1 to 240 on that many SYNCs, 0 on the SYNC after a change, 254 and 255 on a change
+    inhibit_100us: int  #: least time between two event-driven frames
+    event_timer_ms: int  #: longest time between two event-driven frames, 0 for none
+    entries: tuple[int, ...]  #: mapping entries (index, subindex, bits), MAX_ENTRIES long
+    count: int  #: how many of them are mapped
 
 
 class Pdo:

@@ -15,26 +15,18 @@ from drivers.simulation.spec import Body, CellSpec, FrictionUnsolved, SpecInvali
 
 FloatArray = NDArray[np.float64]
 
-BRAKE_FACTOR = 2.0
-"""Holding torque of a brake over the peak torque of its motor."""
+BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Coordinates of a plant: n motors, N coordinates, m directions of dry friction.
+    """Coordinates of a plant: n motors, N coordinates, m directions of dry friction."""
 
-    Attributes:
-        motor_direction: how each motor turns with the coordinates, shape (n, N).
-        directions: of dry friction, shape (m, N); the first n are the joints.
-        own_row: the direction that carries each motor's own dry friction and brake, shape (n,).
-        lone: coordinate of each direction that has only one, else -1, shape (m,).
-        flexible: drives between a motor and its joints, in the order of their coordinates.
-    """
-
-    motor_direction: FloatArray
-    directions: FloatArray
-    own_row: NDArray[np.int64]
-    lone: NDArray[np.int64]
+    motor_direction: FloatArray  #: how each motor turns with the coordinates, shape (n, N)
+    directions: FloatArray  #: of dry friction, shape (m, N); the first n are the joints
+    own_row: NDArray[np.int64]  #: the direction that carries each motor's own dry friction and brake, shape (n,)
+    lone: NDArray[np.int64]  #: coordinate of each direction that has only one, else -1, shape (m,)
+    #: Drives between a motor and its joints, in the order of their coordinates.
     flexible: tuple[Elasticity | Backlash, ...]
 
 

@@ -19,16 +19,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A rigid body in the frame of the last joint.
+    """A rigid body in the frame of the last joint."""
 
-    Attributes:
-        mass_kg: its mass [kg].
-        centre_m: centre of mass [m], (x, y, z).
-        inertia_kg_m2: about the centre of mass [kg m²], (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
-    """
-
-    mass_kg: float
-    centre_m: tuple[float, float, float]
+    mass_kg: float  #: its mass [kg]
+    centre_m: tuple[float, float, float]  #: centre of mass [m], (x, y, z)
+    #: About the centre of mass [kg m²], (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
     inertia_kg_m2: tuple[float, float, float, float, float, float]
 
 
@@ -44,92 +39,56 @@ class Dialect(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AxisSpec:
-    """One motor, its amplifier, and the joint of the same number.
+    """One motor, its amplifier, and the joint of the same number."""
 
-    Attributes:
-        node_id: CANopen node id.
-        vendor_id, product_code, revision, serial: object 1018h.
-        counts_per_revolution: encoder counts a motor revolution.
-        rated_current_a: object 6075h (written there in mA); the current reference 6074h is in per mille of it.
-        peak_current_a: the amplifier's limit; the reference saturates there and statusword bit 11 is set.
-        gain_nm_per_a: the true joint drive gain g = N·Gt·Kt [Nm at the joint per A]; may be negative.
-        motor_inertia_kg_m2: of the rotor, seen at the joint (Ia = N²·J).
-        viscous_nm_s_rad, coulomb_nm: friction on the joint side.
-        motor_viscous_nm_s_rad, motor_coulomb_nm: friction on the motor side, in joint units (divided by N, see eq. 25).
-        offset_nm: constant torque at the joint.
-        current_noise_a: standard deviation of the noise of the current reference [A].
-        noise_correlation_s: correlation time of that noise (first-order); 0 is white.
-        dialect: vendor objects that report its current.
-        toggle_bit: bit of statusword 6041h that is inverted with every SYNC, or None.
-        entered_gain_nm_per_a: gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
-    """
-
-    node_id: int
-    vendor_id: int
-    product_code: int
-    revision: int
-    serial: int
-    counts_per_revolution: int
-    rated_current_a: float
-    peak_current_a: float
-    gain_nm_per_a: float
-    motor_inertia_kg_m2: float
-    viscous_nm_s_rad: float
-    coulomb_nm: float
-    motor_viscous_nm_s_rad: float
-    motor_coulomb_nm: float
-    offset_nm: float
-    current_noise_a: float
-    noise_correlation_s: float
-    dialect: Dialect = Dialect.CIA402
-    toggle_bit: int | None = None
+    node_id: int  #: CANopen node id
+    vendor_id: int  #: object 1018h
+    product_code: int  #: object 1018h
+    revision: int  #: object 1018h
+    serial: int  #: object 1018h
+    counts_per_revolution: int  #: encoder counts a motor revolution
+    rated_current_a: float  #: object 6075h (written there in mA); the current reference 6074h is in per mille of it
+    peak_current_a: float  #: the amplifier's limit; the reference saturates there and statusword bit 11 is set
+    gain_nm_per_a: float  #: the true joint drive gain g = N·Gt·Kt [Nm at the joint per A]; may be negative
+    motor_inertia_kg_m2: float  #: of the rotor, seen at the joint (Ia = N²·J)
+    viscous_nm_s_rad: float  #: friction on the joint side
+    coulomb_nm: float  #: friction on the joint side
+    motor_viscous_nm_s_rad: float  #: friction on the motor side, in joint units (divided by N, see eq. 25).
+    motor_coulomb_nm: float  #: friction on the motor side, in joint units (divided by N, see eq. 25).
+    offset_nm: float  #: constant torque at the joint
+    current_noise_a: float  #: standard deviation of the noise of the current reference [A]
+    noise_correlation_s: float  #: correlation time of that noise (first-order); 0 is white
+    dialect: Dialect = Dialect.CIA402  #: vendor objects that report its current
+    toggle_bit: int | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
+    #: Gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     entered_gain_nm_per_a: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class UndeclaredEffect:
-    """Physical effect of the plant that no configuration declares.
+    """Physical effect of the plant that no configuration declares."""
 
-    Attributes:
-        name: key in `effects.EFFECTS`.
-        axis: index of the joint, from 0.
-        parameters: by name, with units in the names.
-    """
-
-    name: str
-    axis: int
-    parameters: dict[str, float]
+    name: str  #: key in `effects.EFFECTS`
+    axis: int  #: index of the joint, from 0
+    parameters: dict[str, float]  #: by name, with units in the names
 
 
 @dataclass(frozen=True, slots=True)
 class CellSpec:
-    """A whole simulated cell.
+    """A whole simulated cell."""
 
-    Attributes:
-        urdf: text of the URDF with the true inertial parameters of the links.
-        gravity_m_s2: in the base frame, (x, y, z).
-        ratio: drive train R, q_motor = R q_joint (eq. 24), shape (n, n); rad/m for a prismatic joint.
-        axes: one for each motor.
-        start_rad: joint positions at power-on [rad or m], shape (n,); encoder counts are zero at joint position zero.
-        payload: mounted body, or None.
-        effects: effects beyond the declared model.
-        sync_period_us: time by which one SYNC advances the plant.
-        substeps: control and integration steps in one SYNC period.
-        seed: seed of the current noise.
-        faults: injected faults.
-    """
-
-    urdf: str
-    gravity_m_s2: tuple[float, float, float]
-    ratio: FloatArray
-    axes: tuple[AxisSpec, ...]
+    urdf: str  #: text of the URDF with the true inertial parameters of the links
+    gravity_m_s2: tuple[float, float, float]  #: in the base frame, (x, y, z)
+    ratio: FloatArray  #: drive train R, q_motor = R q_joint (eq. 24), shape (n, n); rad/m for a prismatic joint.
+    axes: tuple[AxisSpec, ...]  #: one for each motor
+    #: Joint positions at power-on [rad or m], shape (n,); encoder counts are zero at joint position zero.
     start_rad: FloatArray
-    payload: Body | None
-    effects: tuple[UndeclaredEffect, ...]
-    sync_period_us: int
-    substeps: int
-    seed: int
-    faults: tuple[FaultSpec, ...] = ()
+    payload: Body | None  #: mounted body, or None
+    effects: tuple[UndeclaredEffect, ...]  #: effects beyond the declared model
+    sync_period_us: int  #: time by which one SYNC advances the plant
+    substeps: int  #: control and integration steps in one SYNC period
+    seed: int  #: seed of the current noise
+    faults: tuple[FaultSpec, ...] = ()  #: injected faults
 
 
 class SimulationError(DriverError):

@@ -24,14 +24,10 @@ from typing import NamedTuple
 SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
 MSG_OWN, MSG_LOCAL = 0x800, 0x4
 """linux/can/raw.h: MSG_CONFIRM (sent by this socket) and MSG_DONTROUTE (sent by this machine)."""
-BACKLOG_RECORDS = 1 << 20
-"""A hundred seconds of a full bus in 56 MiB."""
-BURST = 128
-"""Frames between two checks of the parent."""
-IDLE_MS = 20
-"""Silence after which losses are reported without a following frame."""
-LOOK_NS = 200_000_000
-"""Time between two checks of the interface's own counters, and of the parent's process id."""
+BACKLOG_RECORDS = 1 << 20  #: A hundred seconds of a full bus in 56 MiB
+BURST = 128  #: Frames between two checks of the parent
+IDLE_MS = 20  #: Silence after which losses are reported without a following frame
+LOOK_NS = 200_000_000  #: Time between two checks of the interface's own counters, and of the parent's process id
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
 _FRAME = struct.Struct("=IB3x8s")  # struct can_frame
@@ -40,8 +36,7 @@ _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
 _SEND_BYTES = 1 << 16
 _PAUSE_NS = 200_000
-_CLOCK_STEP_NS = 1_000_000
-"""A larger difference between two bursts is no slewing: the wall clock was set."""
+_CLOCK_STEP_NS = 1_000_000  #: A larger difference between two bursts is no slewing: the wall clock was set
 
 
 class Kind(IntEnum):
@@ -49,38 +44,24 @@ class Kind(IntEnum):
 
     READY = 0
     FRAME = 1
-    LOSSES = 2
-    """Only the counts, where no frame followed that could carry them."""
-    END = 3
-    """The last record; `can_id` is the error number."""
+    LOSSES = 2  #: Only the counts, where no frame followed that could carry them
+    END = 3  #: The last record; `can_id` is the error number
 
 
 class Record(NamedTuple):
-    """One frame, or a note of the capture process.
+    """One frame, or a note of the capture process."""
 
-    Attributes:
-        kernel_ns: wall time at which the kernel received the frame [ns since 1970].
-        monotonic_ns: the same time by the monotonic clock [ns].
-        kernel_dropped, interface_dropped, backlog_dropped: frames lost so far: in the socket's buffer, before it, and
-            in the backlog.
-        can_id: identifier and flags of struct can_frame.
-        kind: a Kind.
-        length: of the data [bytes].
-        own, local: sent by this very socket, by any program of this machine.
-        data: eight bytes.
-    """
-
-    kernel_ns: int
-    monotonic_ns: int
-    kernel_dropped: int
-    interface_dropped: int
-    backlog_dropped: int
-    can_id: int
-    kind: int
-    length: int
-    own: bool
-    local: bool
-    data: bytes
+    kernel_ns: int  #: wall time at which the kernel received the frame [ns since 1970]
+    monotonic_ns: int  #: the same time by the monotonic clock [ns]
+    kernel_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
+    interface_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
+    backlog_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
+    can_id: int  #: identifier and flags of struct can_frame
+    kind: int  #: a Kind
+    length: int  #: of the data [bytes]
+    own: bool  #: sent by this very socket, by any program of this machine
+    local: bool  #: sent by this very socket, by any program of this machine
+    data: bytes  #: eight bytes
 
 
 RECORD = struct.Struct("=qqQQQIBB??8s")

@@ -21,12 +21,9 @@ from drivers.stream.answers import slots_of
 from drivers.stream.sample import CellEvent
 from drivers.stream.split_bus import SplitAddress
 
-QUIET_S = 2.0
-"""Silence of other masters after which the axes are read by SDO."""
-ANSWER_S = 0.3
-"""Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds."""
-READING_S = 0.1
-"""Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %."""
+QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
+ANSWER_S = 0.3  #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
+READING_S = 0.1  #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
 _UPLOAD = 0x40
 _EXPEDITED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
 """Bytes of data by the command byte of an expedited upload answer (CiA 301, SDO upload initiate)."""
@@ -41,42 +38,27 @@ class Source(Enum):
 
 @dataclass(frozen=True, slots=True)
 class AxisReading:
-    """Reading of one axis.
+    """Reading of one axis."""
 
-    Attributes:
-        position_counts, current_raw, statusword: last values, None before the first.
-        nmt: state in its last heartbeat, None before the first.
-        rate_hz: of complete readings since the last reading.
-        lost: SYNCs or requests without an answer since the monitor began.
-    """
-
-    position_counts: int | None
-    current_raw: int | None
-    statusword: int | None
-    nmt: int | None
-    rate_hz: float
-    lost: int
+    position_counts: int | None  #: last values, None before the first
+    current_raw: int | None  #: last values, None before the first
+    statusword: int | None  #: last values, None before the first
+    nmt: int | None  #: state in its last heartbeat, None before the first
+    rate_hz: float  #: of complete readings since the last reading
+    lost: int  #: SYNCs or requests without an answer since the monitor began
 
 
 @dataclass(frozen=True, slots=True)
 class CellReading:
-    """Reading of a cell.
+    """Reading of a cell."""
 
-    Attributes:
-        source: of the values.
-        seconds: since the last reading.
-        axes: in their order.
-        sync_hz: SYNCs a second.
-        frames: number of frames in that time by bus and length, ours included, shape (buses, 9).
-        events: EMCY and changes of NMT states in that time.
-    """
-
-    source: Source
-    seconds: float
-    axes: tuple[AxisReading, ...]
-    sync_hz: float
+    source: Source  #: of the values
+    seconds: float  #: since the last reading
+    axes: tuple[AxisReading, ...]  #: in their order
+    sync_hz: float  #: SYNCs a second
+    #: Number of frames in that time by bus and length, ours included, shape (buses, 9).
     frames: tuple[tuple[int, ...], ...]
-    events: tuple[CellEvent, ...]
+    events: tuple[CellEvent, ...]  #: EMCY and changes of NMT states in that time
 
 
 class _AxisWatch:

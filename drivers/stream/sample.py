@@ -55,8 +55,7 @@ class EventKind(Enum):
     MOVE_END = "move end"
     STOP = "stop"
     STOP_UNCONFIRMED = "stop unconfirmed"
-    ENDED = "ended"
-    """Before all moves were made; the text has the cause."""
+    ENDED = "ended"  #: Before all moves were made; the text has the cause
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,13 +23,10 @@ import can
 from drivers.stream import capture
 from drivers.stream.capture import RECORD, Kind
 
-RECEIVE_BUFFER_BYTES = 4 << 20
-"""The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more."""
-START_S = 20.0
-"""Time for the capture process to start; a loaded machine is slow to start an interpreter."""
+RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
+START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
 END_S = 5.0
-SEND_S = 0.1
-"""Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms."""
+SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
 RETRY_S = 0.0002
 SO_RCVBUFFORCE, SO_TIMESTAMPNS = 33, 35  # asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
@@ -43,17 +40,12 @@ _PAIR_BYTES = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """Frames that came over the wire and were lost in this machine.
+    """Frames that came over the wire and were lost in this machine."""
 
-    Attributes:
-        kernel: in the socket's receive buffer (SO_RXQ_OVFL).
-        backlog: in the capture process, because this process did not read them for minutes.
-        interface: before any socket, in the controller or in the kernel's queue behind its driver (the interface's
-            counters, which are read five times a second).
-    """
-
-    kernel: int = 0
-    backlog: int = 0
+    kernel: int = 0  #: in the socket's receive buffer (SO_RXQ_OVFL)
+    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
+    #: Before any socket, in the controller or in the kernel's queue behind its driver (the interface's counters, which
+    #: are read five times a second).
     interface: int = 0
 
     @property
@@ -77,18 +69,13 @@ class CapturedMessage(can.Message):
     """A frame with the kernel's time.
 
     ``is_rx`` is False on a SYNC that this end sent itself: it is received for its time.
-
-    Attributes:
-        kernel_ns: wall time at which the kernel received or sent it [ns since 1970].
-        monotonic_ns: the same time by the monotonic clock [ns].
-        local: sent by a program of this machine.
     """
 
     __slots__ = ("kernel_ns", "local", "monotonic_ns")
 
-    kernel_ns: int
-    monotonic_ns: int
-    local: bool
+    kernel_ns: int  #: wall time at which the kernel received or sent it [ns since 1970]
+    monotonic_ns: int  #: the same time by the monotonic clock [ns]
+    local: bool  #: sent by a program of this machine
 
 
 def losses_of(bus: can.BusABC) -> Losses:

@@ -23,10 +23,8 @@ from drivers.canopen.bus import BusAddress, open_bus, send_burst
 from drivers.errors import BusError, NodeMisplaced
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 
-ALTERNATION_S = 0.0005
-"""Time to wait at one bus while another may receive, where one of them has no file descriptor."""
-LARGEST_RUN = 64
-"""Frames of one bus in a row while another has one too: a lagging clock must not silence the others."""
+ALTERNATION_S = 0.0005  #: Time to wait at one bus while another may receive, where one of them has no file descriptor
+LARGEST_RUN = 64  #: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
 _FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
@@ -73,8 +71,7 @@ class SplitAddress:
         return tuple(range(len(self.parts)))
 
 
-CellAddress = BusAddress | SplitAddress
-"""Address of one bus, or of several."""
+CellAddress = BusAddress | SplitAddress  #: Address of one bus, or of several
 
 
 def open_cell_bus(address: CellAddress) -> can.BusABC:

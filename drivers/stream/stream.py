@@ -23,8 +23,7 @@ from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, Ti
 SHORTENED, STRAGGLING = 16, 4
 """Fractions of a lockstep cycle's time: for a cell that was silent before, and for axes after others answered."""
 
-LARGEST_LAG_NS = 1_000_000_000
-"""Largest delay of the reader behind the bus; older data cannot protect moving axes."""
+LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 FRAMES_PER_S = 50_000
 """More than two buses of 1 Mbit/s carry: among so many frames a SYNC producer that is alive has been heard."""
 

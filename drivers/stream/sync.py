@@ -34,15 +34,13 @@ SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
 """Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
 PRODUCES = 1 << 30
-STEERING_S = 0.25
-"""Time between two corrections of the kernel's interval."""
+STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
 _TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
 # struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
 _HEAD, _FRAME = struct.Struct("@3I4l2I0q"), struct.Struct("=IB3x8s")
-SURPLUS = 3.0
-"""SYNCs ahead of the schedule that are too many; a late producer catches up with one or two."""
+SURPLUS = 3.0  #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
 DECAY = 0.99
 """Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
 

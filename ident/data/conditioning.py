@@ -111,14 +111,10 @@ class Decimator:
 
     The finite window makes it exact at the edges of a chunk, and makes "standstill fills a tenth of the window" a
     definite statement.
-
-    Attributes:
-        taps: weights, odd number, summing to one.
-        factor: q.
     """
 
-    taps: FloatArray
-    factor: int
+    taps: FloatArray  #: weights, odd number, summing to one
+    factor: int  #: q
 
     @property
     def half(self) -> int:

@@ -14,24 +14,16 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """How a log was made: evidence for the gates before a controller; axes in their order.
+    """How a log was made: evidence for the gates before a controller; axes in their order."""
 
-    Attributes:
-        recorded_s: Unix time of its first sample [s]; None where an imported log does not contain it.
-        entered_kg: mass of the payload as it was entered at the recording, from the scale; None without an entry.
-        serials: serial number of each amplifier, None for one that reports none.
-        saturated_percent: share of each axis's samples in which a limit acted [%].
-        lost_cycles: SYNC cycles that are not in it.
-        missing: samples in which each axis did not answer.
-        controller_sha256: digest of the controller's file when it was recorded; None where the cell named none.
-    """
-
-    recorded_s: float | None
+    recorded_s: float | None  #: Unix time of its first sample [s]; None where an imported log does not contain it
+    #: Mass of the payload as it was entered at the recording, from the scale; None without an entry.
     entered_kg: float | None
-    serials: tuple[int | None, ...]
-    saturated_percent: tuple[float, ...]
-    lost_cycles: int
-    missing: tuple[int, ...]
+    serials: tuple[int | None, ...]  #: serial number of each amplifier, None for one that reports none
+    saturated_percent: tuple[float, ...]  #: share of each axis's samples in which a limit acted [%]
+    lost_cycles: int  #: SYNC cycles that are not in it
+    missing: tuple[int, ...]  #: samples in which each axis did not answer
+    #: Digest of the controller's file when it was recorded; None where the cell named none.
     controller_sha256: str | None
 
 

@@ -36,8 +36,7 @@ from ident.estimators.estimate import Estimate, RelativeError
 
 FloatArray = NDArray[np.float64]
 
-FALSE_ALARM = 0.05
-"""Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)."""
+FALSE_ALARM = 0.05  #: Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,38 +51,25 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """One model on its data.
+    """One model on its data."""
 
-    Attributes:
-        effects: in the model.
-        errors: of the model.
-        gains, gains_std: drive gains and their σ [Nm at the joint per A], shape (n,).
-        shifts: of the gains when each move is left out, shape (m, n); zero for fixed gains.
-    """
-
-    effects: tuple[PlacedEffect, ...]
-    errors: Errors
-    gains: FloatArray
-    gains_std: FloatArray
-    shifts: FloatArray
+    effects: tuple[PlacedEffect, ...]  #: in the model
+    errors: Errors  #: of the model
+    gains: FloatArray  #: drive gains and their σ [Nm at the joint per A], shape (n,)
+    gains_std: FloatArray  #: drive gains and their σ [Nm at the joint per A], shape (n,)
+    shifts: FloatArray  #: of the gains when each move is left out, shape (m, n); zero for fixed gains
 
 
 @dataclass(frozen=True, slots=True)
 class GainChange:
-    """One gain without and with further effects [Nm at the joint per A].
+    """One gain without and with further effects [Nm at the joint per A]."""
 
-    Attributes:
-        before, before_std, after, after_std: the estimates with their own σ.
-        change_std: σ of the change, 0 for a fixed gain.
-        significant: whether the change is more than noise, at FALSE_ALARM over all axes.
-    """
-
-    before: float
-    before_std: float
-    after: float
-    after_std: float
-    change_std: float
-    significant: bool
+    before: float  #: the estimates with their own σ
+    before_std: float  #: the estimates with their own σ
+    after: float  #: the estimates with their own σ
+    after_std: float  #: the estimates with their own σ
+    change_std: float  #: σ of the change, 0 for a fixed gain
+    significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes
 
     @property
     def change_percent(self) -> float:
@@ -98,38 +84,25 @@ class GainChange:
 
 @dataclass(frozen=True, slots=True)
 class BeforeAfter:
-    """Two models of the same data.
+    """Two models of the same data."""
 
-    Attributes:
-        added, removed: effects of the second model only, and of the first only.
-        before, after: errors of the two.
-        gains: one a motor.
-    """
-
-    added: tuple[PlacedEffect, ...]
-    removed: tuple[PlacedEffect, ...]
-    before: Errors
-    after: Errors
-    gains: tuple[GainChange, ...]
+    added: tuple[PlacedEffect, ...]  #: effects of the second model only, and of the first only
+    removed: tuple[PlacedEffect, ...]  #: effects of the second model only, and of the first only
+    before: Errors  #: errors of the two
+    after: Errors  #: errors of the two
+    gains: tuple[GainChange, ...]  #: one a motor
 
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """Change by a whole search for effects.
+    """Change by a whole search for effects."""
 
-    Attributes:
-        floors: noise of each motor at standstill, None where it rested too little.
-        floor: error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known.
-        holdout_floor: the same on held-out rows, None without any.
-        turns: change by each turn of the loop, None where it added nothing.
-        total: change from the declared model to the last one.
-    """
-
-    floors: tuple[NoiseFloor | None, ...]
+    floors: tuple[NoiseFloor | None, ...]  #: noise of each motor at standstill, None where it rested too little
+    #: Error that this noise alone would leave on the rows of the fit [%]; NaN where it is not known.
     floor: RelativeError
-    holdout_floor: RelativeError | None
-    turns: tuple[BeforeAfter | None, ...]
-    total: BeforeAfter
+    holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
+    turns: tuple[BeforeAfter | None, ...]  #: change by each turn of the loop, None where it added nothing
+    total: BeforeAfter  #: change from the declared model to the last one
 
 
 def account(

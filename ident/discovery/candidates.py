@@ -31,36 +31,24 @@ ColumnCache = dict[tuple[Effect, int], FloatArray]
 
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
-REDUNDANT_SHARE = 1e-6
-"""Share of a column that must be left when all declared directions are projected out of it."""
-UNSEEN = 1e-9
-"""Share of a direction, squared, below which the folds of a fit do not show it."""
-FAST = frozenset({Abscissa.MOTOR_ANGLE})
-"""Variables that turn within a decimated row."""
+REDUNDANT_SHARE = 1e-6  #: Share of a column that must be left when all declared directions are projected out of it
+UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
+FAST = frozenset({Abscissa.MOTOR_ANGLE})  #: Variables that turn within a decimated row
 
 
 @dataclass(frozen=True, slots=True)
 class SearchProblem:
-    """The residual of an estimate, ready for trials of candidates.
+    """The residual of an estimate, ready for trials of candidates."""
 
-    Attributes:
-        model: the declared model.
-        datasets: the runs of the fit.
-        observation: their rows, with the columns of the effects accepted so far.
-        runs: predicted signals of each run, at full rate.
-        rows: the same at the observation's rows.
-        folds: the problem around the estimate, in folds of moves.
-        floors_a: noise of each motor's current in a row that no model of motion explains; None where not known.
-        cache: columns of motion and time alone, which stay the same from turn to turn.
-    """
-
-    model: Model
-    datasets: Sequence[Dataset]
-    observation: Observation
-    runs: tuple[Signals, ...]
-    rows: tuple[Signals, ...]
-    folds: Folds
+    model: Model  #: the declared model
+    datasets: Sequence[Dataset]  #: the runs of the fit
+    observation: Observation  #: their rows, with the columns of the effects accepted so far
+    runs: tuple[Signals, ...]  #: predicted signals of each run, at full rate
+    rows: tuple[Signals, ...]  #: the same at the observation's rows
+    folds: Folds  #: the problem around the estimate, in folds of moves
+    #: Noise of each motor's current in a row that no model of motion explains; None where not known.
     floors_a: tuple[float | None, ...]
+    #: Columns of motion and time alone, which stay the same from turn to turn.
     cache: ColumnCache = field(default_factory=dict)
 
     @property
@@ -117,15 +105,10 @@ class SearchProblem:
 
 @dataclass(frozen=True, slots=True)
 class FamilyTrials:
-    """Trials of one family on one axis.
+    """Trials of one family on one axis."""
 
-    Attributes:
-        axis: index.
-        members: settings and their trials, at least one.
-    """
-
-    axis: int
-    members: tuple[tuple[Effect, Trial], ...]
+    axis: int  #: index
+    members: tuple[tuple[Effect, Trial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n), with the setting chosen by the other folds alone."""
@@ -135,25 +118,15 @@ class FamilyTrials:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Result of testing one candidate.
+    """Result of testing one candidate."""
 
-    Attributes:
-        coefficients: in-sample, in the unit of the columns, shape (p,).
-        fallen: in-sample fall of ‖e‖² of each motor, shape (n,).
-        training_fall: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,).
-        held_out: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n).
-        score: Φ⊥ᵀe, shape (p,).
-        scatter: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (moves, p).
-        gram: Φ⊥ᵀΦ⊥ of each move, shape (moves, p, p).
-    """
-
-    coefficients: FloatArray
-    fallen: FloatArray
-    training_fall: FloatArray
-    held_out: FloatArray
-    score: FloatArray
-    scatter: FloatArray
-    gram: FloatArray
+    coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
+    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (n,)
+    training_fall: FloatArray  #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
+    held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n)
+    score: FloatArray  #: Φ⊥ᵀe, shape (p,)
+    scatter: FloatArray  #: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (moves, p)
+    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each move, shape (moves, p, p)
 
 
 def prepare_search(
@@ -316,20 +289,15 @@ def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, h
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns.
+    """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns."""
 
-    Attributes:
-        move_jacobian, move_gram, move_score: JᵀΦ, ΦᵀΦ and Φᵀe of each move.
-        part_jacobian, part_gram, part_score, part_held: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
-    """
-
-    move_jacobian: FloatArray
-    move_gram: FloatArray
-    move_score: FloatArray
-    part_jacobian: FloatArray
-    part_gram: FloatArray
-    part_score: FloatArray
-    part_held: FloatArray
+    move_jacobian: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
+    move_gram: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
+    move_score: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
+    part_jacobian: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
+    part_gram: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
+    part_score: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
+    part_held: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
 
 
 def _products(folds: Folds, columns: FloatArray) -> _Products:

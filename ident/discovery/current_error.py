@@ -34,15 +34,10 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class CurrentError:
-    """Sums over rows, so that errors of parts of the data can be added.
+    """Sums over rows, so that errors of parts of the data can be added."""
 
-    Attributes:
-        size: ‖v_i‖² of each motor [A²], shape (n,).
-        left: ‖e_i‖² [A²], same shape.
-    """
-
-    size: FloatArray
-    left: FloatArray
+    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (n,)
+    left: FloatArray  #: ‖e_i‖² [A²], same shape
 
     def __add__(self, other: CurrentError) -> CurrentError:
         """Error on the rows of both."""
@@ -81,15 +76,10 @@ class LeftOutRun:
 
 @dataclass(frozen=True, slots=True)
 class LeftOutRuns:
-    """Errors on each run of the fit, left out in turn.
+    """Errors on each run of the fit, left out in turn."""
 
-    Attributes:
-        runs: in the order of the fit.
-        together: over the rows of all runs that could be predicted; None without any.
-    """
-
-    runs: tuple[LeftOutRun, ...]
-    together: RelativeError | None
+    runs: tuple[LeftOutRun, ...]  #: in the order of the fit
+    together: RelativeError | None  #: over the rows of all runs that could be predicted; None without any
 
 
 def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:

@@ -39,8 +39,7 @@ from ident.model.model import Model
 FloatArray = NDArray[np.float64]
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
-MAX_EFFECTS = 12
-"""More effects than this on one robot mean that the declared model is wrong."""
+MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,27 +34,18 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MIN_DWELLS = 8
-MIN_FREEDOM = 20.0
-"""σ is then known to 20 %."""
-_TREND = 3
-"""Coefficients of the parabola: a straight line would leave the bend of a settling controller."""
-_MEDIAN_EFFICIENCY = 2.0 / np.pi
-"""Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)."""
+MIN_FREEDOM = 20.0  #: σ is then known to 20 %
+_TREND = 3  #: Coefficients of the parabola: a straight line would leave the bend of a settling controller
+_MEDIAN_EFFICIENCY = 2.0 / np.pi  #: Efficiency of a median of many against their mean (van der Vaart 1998, §21.2)
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFloor:
-    """Noise floor of one motor.
+    """Noise floor of one motor."""
 
-    Attributes:
-        noise_a: σ of the current in the observation's rows [A].
-        dwells: number of standstills used.
-        freedom: their degrees of freedom, ν summed.
-    """
-
-    noise_a: float
-    dwells: int
-    freedom: float
+    noise_a: float  #: σ of the current in the observation's rows [A]
+    dwells: int  #: number of standstills used
+    freedom: float  #: their degrees of freedom, ν summed
 
     @property
     def std_percent(self) -> float:

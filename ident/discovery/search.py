@@ -29,12 +29,10 @@ from ident.effects.effect import Effect, PlacedEffect
 FloatArray = NDArray[np.float64]
 Place = tuple[str, int, tuple[int, ...]]
 
-AS_GOOD = 0.99
-"""Share of the best one's fall on held-out moves that counts as equal."""
+AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
 CLEARLY = 0.95
 """Confidence of a paired comparison over folds (Student's t; folds share training data, so it is a rough one)."""
-GOLDEN_STEPS = 6
-"""Steps of the golden section: the bracket between two neighbours becomes an eighteenth."""
+GOLDEN_STEPS = 6  #: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
 DECLARED = {"exponent": (0.8, 1.25)}
 """Settings between which an effect is nearly a declared one: friction with exponent one is viscous."""
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
@@ -42,26 +40,19 @@ GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 @dataclass(frozen=True, slots=True)
 class Gates:
-    """Limits that a candidate must pass before it may join the model.
+    """Limits that a candidate must pass before it may join the model."""
 
-    Attributes:
-        false_alarm: largest probability that noise makes one this strong anywhere.
-        folds_better, explained, error_fall: least share of folds, of the motor's squared residual and of its error on
-            held-out moves.
-        strong_folds, strong_fall: shares of folds and error on held-out moves from which `strong_false_alarm` applies:
-            with few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
-        strong_false_alarm: as `false_alarm`, for strong candidates.
-        draws: number of draws of the bootstrap.
-    """
-
-    false_alarm: float = 0.01
+    false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
+    #: Least share of folds, of the motor's squared residual and of its error on held-out moves.
     folds_better: float = 0.75
-    explained: float = 0.03
-    error_fall: float = 0.02
+    explained: float = 0.03  #: least share of folds, of the motor's squared residual and of its error on held-out moves
+    error_fall: float = 0.02  #: see `folds_better`
+    #: Shares of folds and error on held-out moves from which `strong_false_alarm` applies: with few moves the bootstrap
+    #: has little power, and a correct prediction is evidence of another kind.
     strong_folds: float = 0.875
-    strong_fall: float = 0.1
-    strong_false_alarm: float = 0.05
-    draws: int = 999
+    strong_fall: float = 0.1  #: see `strong_folds`
+    strong_false_alarm: float = 0.05  #: as `false_alarm`, for strong candidates
+    draws: int = 999  #: number of draws of the bootstrap
 
     @property
     def smallest_share(self) -> float:
@@ -71,38 +62,24 @@ class Gates:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of testing one family on one axis.
+    """Result of testing one family on one axis."""
 
-    Attributes:
-        effect: with the setting that explains most.
-        axis: index of the joint (or motor).
-        coefficients, deviations: first estimate of its linear parameters, and their σ by the scatter of moves.
-        probability: that noise alone makes a candidate this strong somewhere among all.
-        folds_better: share of folds on which it lowers the error.
-        explained: share of the squared residual of the motor that it affects most.
-        error_before_percent, error_after_percent: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%].
-        error_fall: relative fall from one to the other.
-        held_out_fall: fall of the whole whitened ‖e‖² on held-out moves; the rank.
-        passed: whether it passes every gate.
-        fold_errors: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons.
-        share_of_excess: of the motor's squared residual beyond its noise floor; None where the floor is not known.
-        ambiguity: other effects that cannot be distinguished from this one by their score on held-out moves.
-    """
-
-    effect: Effect
-    axis: int
-    coefficients: FloatArray
-    deviations: FloatArray
-    probability: float
-    folds_better: float
-    explained: float
-    error_before_percent: float
-    error_after_percent: float
-    error_fall: float
-    held_out_fall: float
-    passed: bool
-    fold_errors: FloatArray
+    effect: Effect  #: with the setting that explains most
+    axis: int  #: index of the joint (or motor)
+    coefficients: FloatArray  #: first estimate of its linear parameters, and their σ by the scatter of moves
+    deviations: FloatArray  #: first estimate of its linear parameters, and their σ by the scatter of moves
+    probability: float  #: that noise alone makes a candidate this strong somewhere among all
+    folds_better: float  #: share of folds on which it lowers the error
+    explained: float  #: share of the squared residual of the motor that it affects most
+    error_before_percent: float  #: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%]
+    error_after_percent: float  #: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%]
+    error_fall: float  #: relative fall from one to the other
+    held_out_fall: float  #: fall of the whole whitened ‖e‖² on held-out moves; the rank
+    passed: bool  #: whether it passes every gate
+    fold_errors: FloatArray  #: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons
+    #: Other effects that cannot be distinguished from this one by their score on held-out moves.
     ambiguity: tuple[PlacedEffect, ...] = ()
+    #: Of the motor's squared residual beyond its noise floor; None where the floor is not known.
     share_of_excess: float | None = None
 
 

@@ -32,10 +32,8 @@ VARIABLES = (
     (Abscissa.LOAD_CURVATURE, (0,)),
 )
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
-MUCH_MORE = 0.15
-"""Share by which a term must explain more than a named effect to call the name wrong."""
-MIN_MOVES = 5 * (INTERVALS + 1)
-"""Five moves for each coefficient of a term."""
+MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
+MIN_MOVES = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
 TAIL = 0.005
 """Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
 

@@ -17,65 +17,46 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
 
-DISPERSION = 1.05
-"""Default without a history: repeated fits of simulated cells scatter 5 % more than their σ."""
-FALSE_ALARM = 0.01
-"""Share of recalibrations without any change in which `decide` finds one."""
+DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
+FALSE_ALARM = 0.01  #: Share of recalibrations without any change in which `decide` finds one
 
 _POOLED_WEIGHT, _AXIS_WEIGHT = 10.0, 30.0
 """Weights of the prior and of the pooled estimate beside an axis' own, in numbers of successive differences."""
 _MIN_DIFFERENCES = 4
-_CUT = 1.5
-"""Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size."""
-_FARTHEST = 1e100
-"""Limit of a difference over its σ, so that its square is still a number."""
+_CUT = 1.5  #: Differences count up to so many of their σ (Huber); somewhat less than a third of them may be of any size
+_FARTHEST = 1e100  #: Limit of a difference over its σ, so that its square is still a number
 _MEAN_OF_CUT = (
     1.0
     + (_CUT**2 - 1.0) * math.erfc(_CUT / math.sqrt(2.0))
     - _CUT * math.sqrt(2.0 / math.pi) * math.exp(-(_CUT**2) / 2.0)
 )
 """E min(Z², c²) of a standard normal Z."""
-_MEDIAN_OF_NORMAL = 0.6744897501960817
-"""Median of |Z|, the upper quartile of a standard normal Z."""
+_MEDIAN_OF_NORMAL = 0.6744897501960817  #: Median of |Z|, the upper quartile of a standard normal Z
 _STEPS = 20
 """Each brings the scale nearer to its end by a factor of two and more, unless more than a tenth are outliers."""
-_UNLIKE = 0.01
-"""Changes are not one common factor if noise makes them so different in fewer cases than this."""
+_UNLIKE = 0.01  #: Changes are not one common factor if noise makes them so different in fewer cases than this
 _COMMON_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Change of one gain.
+    """Change of one gain."""
 
-    Attributes:
-        percent: of the old value's magnitude [%], inf from zero; negative where the gain has decreased.
-        sigmas: the change over its σ, signed as `percent`.
-        probability: of so large a change by noise alone, two-sided.
-    """
-
-    percent: float
-    sigmas: float
-    probability: float
+    percent: float  #: of the old value's magnitude [%], inf from zero; negative where the gain has decreased
+    sigmas: float  #: the change over its σ, signed as `percent`
+    probability: float  #: of so large a change by noise alone, two-sided
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeDecision:
-    """Whether a recalibration differs from the gains in force.
+    """Whether a recalibration differs from the gains in force."""
 
-    Attributes:
-        differs: at least one gain has changed by more than noise.
-        axes: names, as they were given.
-        changes: one an axis.
-        adjusted: probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
-        words: the same in one sentence.
-    """
-
-    differs: bool
-    axes: tuple[str, ...]
-    changes: tuple[Change, ...]
+    differs: bool  #: at least one gain has changed by more than noise
+    axes: tuple[str, ...]  #: names, as they were given
+    changes: tuple[Change, ...]  #: one an axis
+    #: Probability of each axis' change among all of them (Holm 1979, valid however their errors depend).
     adjusted: tuple[float, ...]
-    words: str
+    words: str  #: the same in one sentence
 
 
 class Pattern(Enum):

@@ -33,33 +33,21 @@ from ident.drift.change import DISPERSION
 
 FloatArray = NDArray[np.float64]
 
-FEWEST = 4
-"""Calibrations of the first line that is tested; through fewer it is hardly more than one difference."""
-_RECENT = 3
-"""Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent."""
-_FINEST = 2.0**-52
-"""Smallest σ of the largest gain over itself: no number is written finer."""
-_APART = 1e3
-"""Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway."""
+FEWEST = 4  #: Calibrations of the first line that is tested; through fewer it is hardly more than one difference
+_RECENT = 3  #: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent
+_FINEST = 2.0**-52  #: Smallest σ of the largest gain over itself: no number is written finer
+_APART = 1e3  #: Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Limits of the chart; the defaults come from `make drift-study`, docs/evidence/drift.md has its table.
+    """Limits of the chart; the defaults come from `make drift-study`, docs/evidence/drift.md has its table."""
 
-    Attributes:
-        reference: k [σ]: half the shift that is to be found soonest.
-        threshold: h [σ]: sum that raises an alarm.
-        single: deviation of one calibration that is an alarm by itself [σ].
-        trend: slope of the line through all calibrations that is an alarm [its σ].
-        baseline: number of calibrations that make it.
-    """
-
-    reference: float = 1.25
-    threshold: float = 4.6
-    single: float = 5.2
-    trend: float = 4.3
-    baseline: int = 12
+    reference: float = 1.25  #: k [σ]: half the shift that is to be found soonest
+    threshold: float = 4.6  #: h [σ]: sum that raises an alarm
+    single: float = 5.2  #: deviation of one calibration that is an alarm by itself [σ]
+    trend: float = 4.3  #: slope of the line through all calibrations that is an alarm [its σ]
+    baseline: int = 12  #: number of calibrations that make it
 
 
 CHART = Chart()
@@ -68,58 +56,43 @@ CHART = Chart()
 class AlarmKind(Enum):
     """Rule that raised an alarm."""
 
-    DRIFT = "drift"
-    """Small deviations to one side have added up (CUSUM)."""
-    JUMP = "jump"
-    """One calibration is far off by itself (Shewhart)."""
-    TREND = "trend"
-    """All calibrations lie about a line that rises or falls."""
+    DRIFT = "drift"  #: Small deviations to one side have added up (CUSUM)
+    JUMP = "jump"  #: One calibration is far off by itself (Shewhart)
+    TREND = "trend"  #: All calibrations lie about a line that rises or falls
 
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """One calibration with an alarm.
+    """One calibration with an alarm."""
 
-    Attributes:
-        index: of the calibration, from 0.
-        kind: the first rule that applies, in the order of `AlarmKind`.
-        rose: whether the gain's magnitude rose.
-    """
-
-    index: int
-    kind: AlarmKind
-    rose: bool
+    index: int  #: of the calibration, from 0
+    kind: AlarmKind  #: the first rule that applies, in the order of `AlarmKind`
+    rose: bool  #: whether the gain's magnitude rose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drift:
-    """Change of one gain since its baseline began.
+    """Change of one gain since its baseline began."""
 
-    Attributes:
-        baseline, baseline_std: reference of the newest calibrations, in the unit of the gains: the chart's baseline, up
-            to the onset while there is an alarm; while that is a trend, the beginning of the line.
-        deviations: z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
-        upper, lower: C⁺ and C⁻, shape (n,).
-        trend: t of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
-        alarms: in the order of the calibrations, also those that have passed; nothing else here depends on these.
-        onset: index of the last calibration before the change that `alarm` reports, the first calibration for a trend;
-            None where the newest calibration raises no alarm.
-        change_percent: since the baseline: mean of the newest calibrations (three, or those since the onset, without
-            alarm those behind the baseline, if fewer); while there is a trend, along the line [% of the baseline's
-            magnitude].
-        change_sigmas: the same over its σ.
-    """
-
+    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to the onset while there
+    #: is an alarm; while that is a trend, the beginning of the line.
     baseline: float
-    baseline_std: float
+    baseline_std: float  #: see `baseline`
+    #: Z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
     deviations: FloatArray
-    upper: FloatArray
-    lower: FloatArray
+    upper: FloatArray  #: C⁺ and C⁻, shape (n,)
+    lower: FloatArray  #: C⁺ and C⁻, shape (n,)
+    #: T of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
     trend: FloatArray
+    #: In the order of the calibrations, also those that have passed; nothing else here depends on these.
     alarms: tuple[Alarm, ...]
+    #: Index of the last calibration before the change that `alarm` reports, the first calibration for a trend; None
+    #: where the newest calibration raises no alarm.
     onset: int | None
+    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without alarm those behind
+    #: the baseline, if fewer); while there is a trend, along the line [% of the baseline's magnitude].
     change_percent: float
-    change_sigmas: float
+    change_sigmas: float  #: the same over its σ
 
     @property
     def alarm(self) -> Alarm | None:
@@ -243,17 +216,12 @@ def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Line through all calibrations of one gain.
+    """Line through all calibrations of one gain."""
 
-    Attributes:
-        start, start_std: its value at the first calibration, in the unit of the gain.
-        slope, slope_std: in that unit a calibration.
-    """
-
-    start: float
-    start_std: float
-    slope: float
-    slope_std: float
+    start: float  #: its value at the first calibration, in the unit of the gain
+    start_std: float  #: its value at the first calibration, in the unit of the gain
+    slope: float  #: in that unit a calibration
+    slope_std: float  #: in that unit a calibration
 
 
 def fit_line(values: FloatArray, stds: FloatArray) -> Line:

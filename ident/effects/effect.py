@@ -63,8 +63,7 @@ class Range:
 
 Switch = Annotated[int, Range(0, 1)]
 Sense = Annotated[int, Range(-1, 1)]
-AxisNumber = Annotated[int, Range(0, math.inf)]
-"""Number of another axis, from 1; 0 where an effect has none."""
+AxisNumber = Annotated[int, Range(0, math.inf)]  #: Number of another axis, from 1; 0 where an effect has none
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,9 +40,6 @@ class Cogging(Effect):
 
     Source: magnetic cogging (k poles and slots), current-offset ripple (k = pole pairs) and the wave generator of a
     strain-wave gear (k = 2); Gandhi et al., IEEE/ASME ToM 7 (2002). Signature: a line at motor order k.
-
-    Attributes:
-        order: k, per motor revolution.
     """
 
     name = "cogging"
@@ -51,7 +48,7 @@ class Cogging(Effect):
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
 
-    order: Annotated[int, Range(1, 1000)]
+    order: Annotated[int, Range(1, 1000)]  #: k, per motor revolution
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""

@@ -21,9 +21,6 @@ class Stribeck(Effect):
 
     Source: Armstrong-Hélouvry, Dupont & Canudas de Wit, Automatica 30 (1994), the exponential form of the Stribeck
     curve; boundary lubrication gives way to a film as the speed grows past η. Signature: low speed, odd in q̇.
-
-    Attributes:
-        speed_rad_s: η, between standstill and a tenth of full speed.
     """
 
     name = "stribeck"
@@ -31,7 +28,7 @@ class Stribeck(Effect):
     abscissa = Abscissa.VELOCITY
     coefficients = (Column("amplitude", "Nm"),)
 
-    speed_rad_s: Annotated[float, Range(1e-4, 1e2)]
+    speed_rad_s: Annotated[float, Range(1e-4, 1e2)]  #: η, between standstill and a tenth of full speed
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
@@ -45,16 +42,13 @@ class NonlinearViscous(Effect):
 
     Source: shear-thinning grease (η < 1) and churning losses (η = 2, 3); Harris & Kotzalas, Rolling Bearing Analysis,
     where load-free bearing drag grows with speed to the power 2/3. Signature: all speeds, odd in q̇.
-
-    Attributes:
-        exponent: η; one would be the declared viscous friction itself.
     """
 
     name = "nonlinear-viscous"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.VELOCITY
 
-    exponent: Annotated[float, Range(0.05, 10.0)]
+    exponent: Annotated[float, Range(0.05, 10.0)]  #: η; one would be the declared viscous friction itself
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -91,16 +85,13 @@ class LoadFriction(Effect):
 
     Source: Amontons' law at the gear mesh; Hamon, Gautier & Garrec, IROS 2010, "Dynamic identification of robots with
     a dry friction model depending on load and velocity". Signature: sign × load; loaded and unloaded runs differ in it.
-
-    Attributes:
-        speed_exponent: η, 0 for dry and 1 for viscous friction.
     """
 
     name = "load-friction"
     declares = Property.ODD_IN_VELOCITY
     abscissa = Abscissa.LOAD
 
-    speed_exponent: Switch
+    speed_exponent: Switch  #: η, 0 for dry and 1 for viscous friction
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -140,9 +131,6 @@ class Presliding(Effect):
 
     Instead of the declared sign(q̇), a part c of the dry friction follows z. Source: Dahl (1968), "A solid friction
     model". Signature: distance since the last reversal.
-
-    Attributes:
-        distance_rad: η, over which 63 % of a change of z happens.
     """
 
     name = "presliding"
@@ -150,7 +138,7 @@ class Presliding(Effect):
     abscissa = Abscissa.DISTANCE
     coefficients = (Column("amplitude", "Nm"),)
 
-    distance_rad: Annotated[float, Range(1e-6, 1e2)]
+    distance_rad: Annotated[float, Range(1e-6, 1e2)]  #: η, over which 63 % of a change of z happens
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
@@ -178,11 +166,6 @@ class WarmUp(Effect):
     Source: grease is stiff when cold, and the heat of the losses fills the joint's capacity with one time constant;
     Bittencourt & Axelsson, "Modeling and experiment design for identification of wear in a robot joint under load and
     temperature uncertainties based on friction data", IEEE/ASME Trans. Mechatronics 19 (2014). Signature: time.
-
-    Attributes:
-        time_constant_s: η, from half a run to many.
-        whole_session: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as
-            after a power-on.
     """
 
     name = "warm-up"
@@ -190,7 +173,8 @@ class WarmUp(Effect):
     abscissa = Abscissa.TIME
     coefficients = (Column("dry", "Nm"), Column("viscous", "Nm/(rad/s)"))
 
-    time_constant_s: Annotated[float, Range(1e-2, 1e6)]
+    time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η, from half a run to many
+    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run, as after a power-on.
     whole_session: Switch
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
@@ -205,10 +189,6 @@ class Coupling(Effect):
     """τ_i = c_s · sign(q̇_i ± q̇_j) + c_v · (q̇_i ± q̇_j), and ± the same on joint j;  c > 0: against the relative motion.
 
     Source: a shaft, belt or hose of one joint that runs through another (paper eq. 25). Signature: another axis' speed.
-
-    Attributes:
-        other_axis: number of joint j, from 1; joint i is the one with the lower number.
-        sense: 1 for the sum of the speeds, −1 for their difference.
     """
 
     name = "coupling"
@@ -217,8 +197,8 @@ class Coupling(Effect):
     abscissa = Abscissa.OTHER_VELOCITY
     coefficients = (Column("dry", "Nm"), Column("viscous", "Nm/(rad/s)"))
 
-    other_axis: AxisNumber
-    sense: Sense
+    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
+    sense: Sense  #: 1 for the sum of the speeds, −1 for their difference
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 2, k)."""

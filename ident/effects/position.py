@@ -38,9 +38,6 @@ class Compensator(Effect):
 
     Source: a compensating spring between two points of the arm, to its first harmonics; Ulrich & Kumar (1991),
     "Passive mechanical gravity compensation for robot manipulators". Signature: position, at any speed.
-
-    Attributes:
-        order: k, in the joint's revolutions.
     """
 
     name = "gravity-compensator"
@@ -49,7 +46,7 @@ class Compensator(Effect):
     coefficients = (Column("cosine", "Nm"), Column("sine", "Nm"))
     needs_revolute = True
 
-    order: Annotated[int, Range(1, 1000)]
+    order: Annotated[int, Range(1, 1000)]  #: k, in the joint's revolutions
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
@@ -62,10 +59,6 @@ class Hinge(Effect):
     """τ = c · max(0, σ (q − q₀));  c > 0: the motor pushes in the positive direction beyond q₀.
 
     Source: Hooke's law of a slack cable or hose. Signature: position, on one side of q₀.
-
-    Attributes:
-        start_rad: q₀.
-        sense: σ, 1 where it pulls above q₀, −1 below.
     """
 
     name = "hinge"
@@ -73,8 +66,8 @@ class Hinge(Effect):
     abscissa = Abscissa.POSITION
     coefficients = (Column("stiffness", "Nm/rad"),)
 
-    start_rad: Annotated[float, Range(-1e3, 1e3)]
-    sense: Sense
+    start_rad: Annotated[float, Range(-1e3, 1e3)]  #: q₀
+    sense: Sense  #: σ, 1 where it pulls above q₀, −1 below
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""

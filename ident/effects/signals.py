@@ -18,11 +18,9 @@ from ident.model.model import Model
 
 FloatArray = NDArray[np.float64]
 
-STICKING_RAD_S = 0.005
-"""Below this speed the noise of the filtered encoder decides the sign."""
+STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 CHUNK_SAMPLES = 4096
-POSTURE_SAMPLES = 20
-"""Samples between two postures in which the mass matrix is computed."""
+POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 
 class Abscissa(Enum):
@@ -52,33 +50,23 @@ class Signals:
 
     Torques and currents are the model's predictions, never measurements: a measured current in a regressor would put
     its noise on both sides of the equation.
-
-    Attributes:
-        rate_hz: sampling rate.
-        time_s: since the start of the run, shape (k,).
-        session_s: since the first run of the session began, shape (k,); equal to time_s without a common clock.
-        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
-        motor_position_rad: of the motors, R q.
-        inertia_kg_m2: mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a
-            rotor's inertia where it is regrouped with theirs, shape (n, n, k).
-        load_torque_nm: torque at each joint for links and payload, without friction and drive chain.
-        geared_torque_nm: torque through the gear of each joint: load and friction.
-        motor_torque_nm: torque of each motor in joint units (g v), friction included, effects left out.
-        current_a: the same in the unit of the current reference.
     """
 
-    rate_hz: float
-    time_s: FloatArray
+    rate_hz: float  #: sampling rate
+    time_s: FloatArray  #: since the start of the run, shape (k,)
+    #: Since the first run of the session began, shape (k,); equal to time_s without a common clock.
     session_s: FloatArray
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray
-    motor_position_rad: FloatArray
+    position_rad: FloatArray  #: of the joints
+    velocity_rad_s: FloatArray  #: of the joints
+    acceleration_rad_s2: FloatArray  #: of the joints
+    motor_position_rad: FloatArray  #: of the motors, R q
+    #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
+    #: where it is regrouped with theirs, shape (n, n, k).
     inertia_kg_m2: FloatArray
-    load_torque_nm: FloatArray
-    geared_torque_nm: FloatArray
-    motor_torque_nm: FloatArray
-    current_a: FloatArray
+    load_torque_nm: FloatArray  #: torque at each joint for links and payload, without friction and drive chain
+    geared_torque_nm: FloatArray  #: torque through the gear of each joint: load and friction
+    motor_torque_nm: FloatArray  #: torque of each motor in joint units (g v), friction included, effects left out
+    current_a: FloatArray  #: the same in the unit of the current reference
 
     def variable(self, abscissa: Abscissa, axis: int, other: int | None = None) -> FloatArray:
         """Return a variable of an axis along the run, shape (k,); `other` is the second axis of OTHER_VELOCITY."""

@@ -23,9 +23,6 @@ class Backlash(Effect):
     across; τ_j is the torque through the gear, M the mass matrix. Source: Nordin & Gutman (2002), "Controlling
     mechanical systems with backlash", Automatica 38, the dead-zone model with stiff flanks. Signature: sign changes of
     the load.
-
-    Attributes:
-        share: w, over which the side changes, in parts of the load's root mean square.
     """
 
     name = "backlash"
@@ -34,6 +31,7 @@ class Backlash(Effect):
     abscissa = Abscissa.LOAD
     coefficients = (Column("half gap", "rad"),)
 
+    #: W, over which the side changes, in parts of the load's root mean square.
     share: Annotated[float, Range(1e-6, 1.0)]
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
@@ -73,9 +71,6 @@ class InertialCoupling(Effect):
 
     Source: a rotor or shaft that both joints turn (paper eq. 25: Ia_m6 beside the diagonal). Signature: another axis'
     acceleration.
-
-    Attributes:
-        other_axis: number of joint j, from 1; joint i is the one with the lower number.
     """
 
     name = "inertial-coupling"
@@ -84,7 +79,7 @@ class InertialCoupling(Effect):
     abscissa = Abscissa.OTHER_VELOCITY
     coefficients = (Column("inertia", "kg m²"),)
 
-    other_axis: AxisNumber
+    other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, 1, k)."""

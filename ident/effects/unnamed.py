@@ -34,21 +34,16 @@ class Smooth(Effect):
     S_k are combinations of the cubic B-splines over a uniform division of the range of x (de Boor, A Practical Guide to
     Splines), and p is 1, or sign(q̇) where `signed`. Of a velocity, x is the magnitude and p its own sign. The declared
     terms are not among them: p itself (offset, dry friction), and p · x of LINEAR_IN_MODEL.
-
-    Attributes:
-        variable: x.
-        lower, upper: its range; outside of it the function keeps its value at the end.
-        signed: 1 where p turns with the direction of motion, else 0.
-        other_axis: number of the other axis, from 1, where x is its velocity; else 0.
     """
 
     declares = Property.SMOOTH
 
-    variable: Abscissa
+    variable: Abscissa  #: x
+    #: Its range; outside of it the function keeps its value at the end.
     lower: Annotated[float, Range(-1e12, 1e12)] = 0.0
-    upper: Annotated[float, Range(-1e12, 1e12)] = 1.0
-    signed: Switch = 0
-    other_axis: AxisNumber = 0
+    upper: Annotated[float, Range(-1e12, 1e12)] = 1.0  #: see `lower`
+    signed: Switch = 0  #: 1 where p turns with the direction of motion, else 0
+    other_axis: AxisNumber = 0  #: number of the other axis, from 1, where x is its velocity; else 0
 
     @property
     def side(self) -> Side:
@@ -95,9 +90,6 @@ class Periodic(Effect):
     """τ = Σ a_k cos kθ + b_k sin kθ, θ the motor's angle, k in PERIODIC_ORDERS; times sign(q̇) where `signed`.
 
     Source: Fourier series of any torque, or friction, that repeats with the motor.
-
-    Attributes:
-        signed: 1 where it turns with the direction of motion, else 0.
     """
 
     name = "periodic-motor-angle"
@@ -106,7 +98,7 @@ class Periodic(Effect):
     abscissa = Abscissa.MOTOR_ANGLE
     coefficients = tuple(Column(f"{part} {order}", "Nm") for order in PERIODIC_ORDERS for part in ("cosine", "sine"))
 
-    signed: Switch = 0
+    signed: Switch = 0  #: 1 where it turns with the direction of motion, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2 · orders, k)."""

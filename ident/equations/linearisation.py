@@ -22,36 +22,23 @@ from ident.errors import TooFewMoves
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MIN_MOVES = 8
-"""With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each."""
+MIN_MOVES = 8  #: With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each
 
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Rows of all motors below each other, motor 1 first.
+    """Rows of all motors below each other, motor 1 first."""
 
-    Attributes:
-        jacobian: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale, shape (rows, f).
-        residual: whitened, shape (rows,).
-        current: measured, whitened: what the residual is relative to, shape (rows,).
-        motor: of each row, shape (rows,).
-        cluster: move of each row, numbered 0 … without gaps, shape (rows,).
-        source: index of each row among the observation's decimated rows, shape (rows,).
-        gamma: 1/g, shape (n,).
-        noise: σ_i [A], shape (n,).
-        free: which of (gains, parameters) are free, shape (f,).
-        scale: unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
-    """
-
-    jacobian: FloatArray
-    residual: FloatArray
-    current: FloatArray
-    motor: IntArray
-    cluster: IntArray
-    source: IntArray
-    gamma: FloatArray
-    noise: FloatArray
-    free: IntArray
+    jacobian: FloatArray  #: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale, shape (rows, f)
+    residual: FloatArray  #: whitened, shape (rows,)
+    current: FloatArray  #: measured, whitened: what the residual is relative to, shape (rows,)
+    motor: IntArray  #: of each row, shape (rows,)
+    cluster: IntArray  #: move of each row, numbered 0 … without gaps, shape (rows,)
+    source: IntArray  #: index of each row among the observation's decimated rows, shape (rows,)
+    gamma: FloatArray  #: 1/g, shape (n,)
+    noise: FloatArray  #: σ_i [A], shape (n,)
+    free: IntArray  #: which of (gains, parameters) are free, shape (f,)
+    #: Unit of each free unknown: a step of one in the scaled unknown is this much of the real one, shape (f,).
     scale: FloatArray
 
     @property
@@ -203,36 +190,23 @@ class Folds:
     """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
 
     A block holds the rows of one motor in one move; what is wanted of a fold, a move or a motor is a sum over blocks.
-
-    Attributes:
-        problem: the linearisation, its rows sorted by fold, move and motor.
-        moves: whole moves that the folds were dealt, whatever pieces the problem's clusters are.
-        blocks: rows of each block.
-        fold, move, motor: of each block, shape (blocks,).
-        whole: Cholesky factor of JᵀJ, with scipy's flag.
-        factors: the same without each fold.
-        scores: Jᵀe without each fold, shape (folds, f).
-        move_hessian, move_score: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f).
-        part_hessian, part_score: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f).
-        motor_score: Jᵀe of each motor, shape (n, f).
-        residual: r, the e of each row predicted by a fit that did not see its fold, shape (rows,).
     """
 
-    problem: Linearisation
-    moves: int
-    blocks: tuple[slice, ...]
-    fold: IntArray
-    move: IntArray
-    motor: IntArray
-    whole: tuple[FloatArray, bool]
-    factors: tuple[tuple[FloatArray, bool], ...]
-    scores: FloatArray
-    move_hessian: FloatArray
-    move_score: FloatArray
-    part_hessian: FloatArray
-    part_score: FloatArray
-    motor_score: FloatArray
-    residual: FloatArray
+    problem: Linearisation  #: the linearisation, its rows sorted by fold, move and motor
+    moves: int  #: whole moves that the folds were dealt, whatever pieces the problem's clusters are
+    blocks: tuple[slice, ...]  #: rows of each block
+    fold: IntArray  #: of each block, shape (blocks,)
+    move: IntArray  #: of each block, shape (blocks,)
+    motor: IntArray  #: of each block, shape (blocks,)
+    whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
+    factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
+    scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
+    move_hessian: FloatArray  #: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f)
+    move_score: FloatArray  #: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f)
+    part_hessian: FloatArray  #: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f)
+    part_score: FloatArray  #: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f)
+    motor_score: FloatArray  #: Jᵀe of each motor, shape (n, f)
+    residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
 
     @property
     def count(self) -> int:

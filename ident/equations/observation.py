@@ -27,44 +27,25 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """Rows of several runs, before any scaling; arrays are joint-first and time-last.
+    """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
-    Attributes:
-        drive_train: R.
-        columns: name and unit of the b columns of W: base parameters, then effects.
-        base: how the base parameters were regrouped.
-        current: decimated current references of the motors [A], shape (n, r).
-        robot: W, torque at each joint per unit of each column, shape (n, b, r).
-        flange: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r).
-        use: rows of each joint that count: moving and valid, shape (n, r).
-        motor_use: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r).
-        time_s: of each row, since the start of its run, shape (r,).
-        run: index of each row's run, shape (r,).
-        move: number of each row's move, unique over all runs, shape (r,).
-        mounting: index into payloads, −1 without load, shape (r,).
-        payloads: one for each mounting.
-        payload_columns: for each mounting, its unknown parameters that these data see, as indices of
-            LINK_PARAMETERS.
-        runs: names of the runs.
-        conditioning: the filters these rows went through.
-    """
-
-    drive_train: DriveTrain
-    columns: tuple[Column, ...]
-    base: BaseParameters
-    current: FloatArray
-    robot: FloatArray
-    flange: FloatArray
-    use: BoolArray
-    motor_use: BoolArray
-    time_s: FloatArray
-    run: IntArray
-    move: IntArray
-    mounting: IntArray
-    payloads: tuple[Payload, ...]
+    drive_train: DriveTrain  #: R
+    columns: tuple[Column, ...]  #: name and unit of the b columns of W: base parameters, then effects
+    base: BaseParameters  #: how the base parameters were regrouped
+    current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
+    robot: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
+    flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
+    use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
+    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
+    time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
+    run: IntArray  #: index of each row's run, shape (r,)
+    move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
+    mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
+    payloads: tuple[Payload, ...]  #: one for each mounting
+    #: For each mounting, its unknown parameters that these data see, as indices of LINK_PARAMETERS.
     payload_columns: tuple[tuple[int, ...], ...]
-    runs: tuple[str, ...]
-    conditioning: Conditioning
+    runs: tuple[str, ...]  #: names of the runs
+    conditioning: Conditioning  #: the filters these rows went through
 
     @property
     def joint_count(self) -> int:

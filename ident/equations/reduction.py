@@ -34,53 +34,35 @@ MAX_CLUSTERS = 256
 
 @dataclass(frozen=True, slots=True)
 class Cluster:
-    """The motor rows of one move, or of several that follow each other in runs of one mounting.
+    """The motor rows of one move, or of several that follow each other in runs of one mounting."""
 
-    Attributes:
-        mounting: index into the payloads, −1 without load.
-        factors: for each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns
-            that the motor's equation can hold (``Layout.motor``).
-    """
-
-    mounting: int
+    mounting: int  #: index into the payloads, −1 without load
+    #: For each motor i the rows, or where they are many their triangle, of [v_i | (T W_st)_i], the columns that the
+    #: motor's equation can hold (``Layout.motor``).
     factors: tuple[FloatArray, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Which of the columns [v_1 … v_n | W_st] a joint's or a motor's equation holds.
+    """Which of the columns [v_1 … v_n | W_st] a joint's or a motor's equation holds."""
 
-    Attributes:
-        joint: for each joint, indices into [V | W_st], ascending.
-        motor: for each motor, indices of W_st; its own current comes before them.
-    """
-
-    joint: tuple[IntArray, ...]
-    motor: tuple[IntArray, ...]
+    joint: tuple[IntArray, ...]  #: for each joint, indices into [V | W_st], ascending
+    motor: tuple[IntArray, ...]  #: for each motor, indices of W_st; its own current comes before them
 
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """Triangles of several runs in standard columns.
+    """Triangles of several runs in standard columns."""
 
-    Attributes:
-        model: the declared model.
-        conditioning: the filters that the rows went through.
-        payloads: one for each mounting.
-        runs: names of the runs.
-        joints: for each mounting, −1 (without load) first, the triangle of each joint's rows.
-        joint_rows, motor_rows: equations of each axis, shape (n,).
-        clusters: in the order of the runs.
-    """
-
-    model: Model
-    conditioning: Conditioning
-    payloads: tuple[Payload, ...]
-    runs: tuple[str, ...]
+    model: Model  #: the declared model
+    conditioning: Conditioning  #: the filters that the rows went through
+    payloads: tuple[Payload, ...]  #: one for each mounting
+    runs: tuple[str, ...]  #: names of the runs
+    #: For each mounting, −1 (without load) first, the triangle of each joint's rows.
     joints: tuple[tuple[FloatArray, ...], ...]
-    joint_rows: IntArray
-    motor_rows: IntArray
-    clusters: tuple[Cluster, ...]
+    joint_rows: IntArray  #: equations of each axis, shape (n,)
+    motor_rows: IntArray  #: equations of each axis, shape (n,)
+    clusters: tuple[Cluster, ...]  #: in the order of the runs
 
     def base(self) -> BaseParameters:
         """The base parameters that these rows show.

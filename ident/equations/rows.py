@@ -17,8 +17,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-CHUNK_ROWS = 256
-"""Decimated rows built at once: the regressor of their samples stays in the cache's reach."""
+CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 
 
 def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
@@ -73,23 +72,14 @@ def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Consecutive decimated rows of one run; arrays are joint-first and time-last.
+    """Consecutive decimated rows of one run; arrays are joint-first and time-last."""
 
-    Attributes:
-        current: current references of the motors [A], shape (n, r).
-        standard: torque at each joint per unit of each standard parameter, shape (n, c, r).
-        use: rows of each joint that count: moving and valid, shape (n, r).
-        motor_use: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r).
-        time_s: of each row, since the start of the run, shape (r,).
-        move: number of each row's move within the run, shape (r,).
-    """
-
-    current: FloatArray
-    standard: FloatArray
-    use: BoolArray
-    motor_use: BoolArray
-    time_s: FloatArray
-    move: IntArray
+    current: FloatArray  #: current references of the motors [A], shape (n, r)
+    standard: FloatArray  #: torque at each joint per unit of each standard parameter, shape (n, c, r)
+    use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
+    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
+    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
+    move: IntArray  #: number of each row's move within the run, shape (r,)
 
 
 def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows: int = CHUNK_ROWS) -> Iterator[Rows]:

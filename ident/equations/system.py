@@ -19,30 +19,20 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """W_tot χ_tot = ρ of several runs, W_tot = [V | −W | −W_uL | −W_kL χ_kL], χ_tot = (g, χ, χ_uL, 1).
+    """W_tot χ_tot = ρ of several runs, W_tot = [V | −W | −W_uL | −W_kL χ_kL], χ_tot = (g, χ, χ_uL, 1)."""
 
-    Attributes:
-        drive_train: R.
-        base: how the base parameters were regrouped.
-        columns: name and unit of the columns of W: base parameters, then effects.
-        payloads: one for each mounting.
-        payload_columns: for each mounting, its unknown parameters that these data see, as indices of
-            LINK_PARAMETERS.
-        runs: names of the runs.
-        joints: triangle of each joint's rows of W_tot, c = n + p + 1 columns.
-        motors: triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation
-            g_i v_i = (T W χ + T W_kL χ_kL)_i holds one current alone.
-        moves: for each move (or neighbouring moves together), the rows or the triangle of each motor's rows.
-    """
-
-    drive_train: DriveTrain
-    base: BaseParameters
-    columns: tuple[Column, ...]
-    payloads: tuple[Payload, ...]
+    drive_train: DriveTrain  #: R
+    base: BaseParameters  #: how the base parameters were regrouped
+    columns: tuple[Column, ...]  #: name and unit of the columns of W: base parameters, then effects
+    payloads: tuple[Payload, ...]  #: one for each mounting
+    #: For each mounting, its unknown parameters that these data see, as indices of LINK_PARAMETERS.
     payload_columns: tuple[tuple[int, ...], ...]
-    runs: tuple[str, ...]
-    joints: Triangles
+    runs: tuple[str, ...]  #: names of the runs
+    joints: Triangles  #: triangle of each joint's rows of W_tot, c = n + p + 1 columns
+    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
+    #: (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
+    #: For each move (or neighbouring moves together), the rows or the triangle of each motor's rows.
     moves: tuple[tuple[FloatArray, ...], ...]
 
     @property

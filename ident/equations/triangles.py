@@ -18,8 +18,7 @@ from scipy.linalg import lapack
 
 FloatArray = NDArray[np.float64]
 
-BLOCK_ROWS = 1024
-"""Rows folded in at once: 80 columns of them stay in a core's own cache."""
+BLOCK_ROWS = 1024  #: Rows folded in at once: 80 columns of them stay in a core's own cache
 
 REFLECTORS = 8
 """Householder vectors applied together; wider blocks cost more inside themselves than they save on the rest."""
@@ -27,15 +26,10 @@ REFLECTORS = 8
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x.
+    """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x."""
 
-    Attributes:
-        factors: one for each axis, shape (≤c, c).
-        rows: number of equations of each axis, shape (n,).
-    """
-
-    factors: tuple[FloatArray, ...]
-    rows: NDArray[np.int64]
+    factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
+    rows: NDArray[np.int64]  #: number of equations of each axis, shape (n,)
 
     def stacked(self, weight: FloatArray) -> FloatArray:
         """All axes below each other, each scaled by its weight."""

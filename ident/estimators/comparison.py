@@ -24,8 +24,7 @@ CUTOFF_FACTORS = (0.5, 1.0, 2.0)
 """Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""
 
 
-RATIO = 20.0
-"""r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise."""
+RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,24 +48,15 @@ ESTIMATORS = (
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One estimator under one filter.
+    """One estimator under one filter."""
 
-    Attributes:
-        estimator: its name.
-        position_cutoff_hz, decimation_cutoff_hz: of the filters.
-        gains: Nm/A, shape (n,); None where it found none.
-        std: of the gains, same shape.
-        relative_error_percent: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter.
-        reason: why there are no gains.
-    """
-
-    estimator: str
-    position_cutoff_hz: float
-    decimation_cutoff_hz: float
-    gains: FloatArray | None
-    std: FloatArray | None
-    relative_error_percent: float | None
-    reason: str = ""
+    estimator: str  #: its name
+    position_cutoff_hz: float  #: of the filters
+    decimation_cutoff_hz: float  #: of the filters
+    gains: FloatArray | None  #: Nm/A, shape (n,); None where it found none
+    std: FloatArray | None  #: of the gains, same shape
+    relative_error_percent: float | None  #: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter
+    reason: str = ""  #: why there are no gains
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,19 +147,12 @@ class Removal:
 
 @dataclass(frozen=True, slots=True)
 class Essential:
-    """Essential parameters of a system, and the others that were taken out.
+    """Essential parameters of a system, and the others that were taken out."""
 
-    Attributes:
-        system: without the columns that were taken out.
-        estimate: of that system.
-        removed: in the order in which they went.
-        whole: the same estimate among all unknowns; a parameter that was taken out is zero and certain.
-    """
-
-    system: System
-    estimate: Estimate
-    removed: tuple[Removal, ...]
-    whole: Estimate
+    system: System  #: without the columns that were taken out
+    estimate: Estimate  #: of that system
+    removed: tuple[Removal, ...]  #: in the order in which they went
+    whole: Estimate  #: the same estimate among all unknowns; a parameter that was taken out is zero and certain
 
 
 def essential(system: System, estimator: Callable[[System], Estimate], ratio: float = RATIO) -> Essential:

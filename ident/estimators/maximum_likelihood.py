@@ -26,8 +26,7 @@ from ident.estimators.method import Method
 FloatArray = NDArray[np.float64]
 
 MAX_ITERATIONS = 100
-STEP_TOLERANCE = 1e-7
-"""Relative step of the gains; their standard deviations are some 1e-3."""
+STEP_TOLERANCE = 1e-7  #: Relative step of the gains; their standard deviations are some 1e-3
 LARGEST_DAMPING = 1e6
 
 

@@ -23,19 +23,12 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PayloadEstimate:
-    """Inertial parameters of a mounted body by the classical IDIM-WLS.
+    """Inertial parameters of a mounted body by the classical IDIM-WLS."""
 
-    Attributes:
-        names: those of the ten parameters that the run shows, in the order of LINK_PARAMETERS.
-        values: of these, in the last joint's frame [SI], shape (p,).
-        std: from the scatter of the moves, the gains taken as exact, shape (p,).
-        per_gain: ∂values/∂g, shape (p, n): what an error of each gain does to them.
-    """
-
-    names: tuple[str, ...]
-    values: FloatArray
-    std: FloatArray
-    per_gain: FloatArray
+    names: tuple[str, ...]  #: those of the ten parameters that the run shows, in the order of LINK_PARAMETERS
+    values: FloatArray  #: of these, in the last joint's frame [SI], shape (p,)
+    std: FloatArray  #: from the scatter of the moves, the gains taken as exact, shape (p,)
+    per_gain: FloatArray  #: ∂values/∂g, shape (p, n): what an error of each gain does to them
 
     @property
     def mass_kg(self) -> float:

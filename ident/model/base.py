@@ -13,17 +13,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class BaseParameters:
-    """Which standard columns are independent, and what each of them gathers from the others.
+    """Which standard columns are independent, and what each of them gathers from the others."""
 
-    Attributes:
-        independent: indices of the base columns among the standard ones, ascending.
-        grouping: shape (b, c): base parameter = grouping @ standard parameters.
-        names: leading name and what is regrouped with it.
-    """
-
-    independent: tuple[int, ...]
-    grouping: FloatArray
-    names: tuple[str, ...]
+    independent: tuple[int, ...]  #: indices of the base columns among the standard ones, ascending
+    grouping: FloatArray  #: shape (b, c): base parameter = grouping @ standard parameters
+    names: tuple[str, ...]  #: leading name and what is regrouped with it
 
 
 def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:

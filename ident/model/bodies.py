@@ -66,17 +66,11 @@ def link_parameters(pseudo: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Mass, centre and inertia of a link, as a URDF declares them.
+    """Mass, centre and inertia of a link, as a URDF declares them."""
 
-    Attributes:
-        mass_kg: of the link.
-        centre_m: centre of mass in the link frame, shape (3,).
-        inertia_kg_m2: tensor about the centre of mass, axes of the link frame, shape (3, 3).
-    """
-
-    mass_kg: float
-    centre_m: FloatArray
-    inertia_kg_m2: FloatArray
+    mass_kg: float  #: of the link
+    centre_m: FloatArray  #: centre of mass in the link frame, shape (3,)
+    inertia_kg_m2: FloatArray  #: tensor about the centre of mass, axes of the link frame, shape (3, 3)
 
     @property
     def parameters(self) -> FloatArray:

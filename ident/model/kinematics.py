@@ -27,15 +27,10 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
-    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i.
+    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i."""
 
-    Attributes:
-        rotation: shape (n + 1, k, 3, 3).
-        origin_m: shape (n + 1, k, 3).
-    """
-
-    rotation: FloatArray
-    origin_m: FloatArray
+    rotation: FloatArray  #: shape (n + 1, k, 3, 3)
+    origin_m: FloatArray  #: shape (n + 1, k, 3)
 
 
 def poses(robot: Robot, position_rad: FloatArray) -> Poses:

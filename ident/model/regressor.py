@@ -29,8 +29,7 @@ from ident.model.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
-BLOCK_SAMPLES = 1024
-"""Samples computed at once: their screws and products stay in a core's own cache."""
+BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
 
 
 def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:

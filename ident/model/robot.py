@@ -20,8 +20,7 @@ from ident.model.bodies import Body
 
 FloatArray = NDArray[np.float64]
 
-LARGEST_DISTANCE_M = 50.0
-"""Between joints that follow each other: more than any gantry has."""
+LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 
 
 class JointKind(Enum):
@@ -33,22 +32,14 @@ class JointKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """One joint and the link behind it.
+    """One joint and the link behind it."""
 
-    Attributes:
-        name: as in the URDF.
-        kind: revolute or prismatic.
-        parent: index of the joint before it, -1 for the base.
-        rotation, translation_m: placement of the joint frame in the parent's frame at position zero, (3, 3) and (3,).
-        axis: unit vector of the motion in the joint frame, (3,).
-    """
-
-    name: str
-    kind: JointKind
-    parent: int
-    rotation: FloatArray
-    translation_m: FloatArray
-    axis: FloatArray
+    name: str  #: as in the URDF
+    kind: JointKind  #: revolute or prismatic
+    parent: int  #: index of the joint before it, -1 for the base
+    rotation: FloatArray  #: placement of the joint frame in the parent's frame at position zero, (3, 3) and (3,)
+    translation_m: FloatArray  #: placement of the joint frame in the parent's frame at position zero, (3, 3) and (3,)
+    axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,17 +62,12 @@ class Robot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UrdfRobot:
-    """The n moving joints of a URDF.
+    """The n moving joints of a URDF."""
 
-    Attributes:
-        joints: their geometry, depth first from the base.
-        bodies: what each joint moves, in its frame, links behind fixed joints included; mass zero where none is given.
-        effort_limit: [Nm or N], shape (n,); inf where none is given.
-    """
-
-    joints: tuple[Joint, ...]
+    joints: tuple[Joint, ...]  #: their geometry, depth first from the base
+    #: What each joint moves, in its frame, links behind fixed joints included; mass zero where none is given.
     bodies: tuple[Body, ...]
-    effort_limit: FloatArray
+    effort_limit: FloatArray  #: [Nm or N], shape (n,); inf where none is given
 
 
 def robot_from_urdf(urdf: str, gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> Robot:

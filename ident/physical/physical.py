@@ -15,8 +15,7 @@ from ident.physical.programme import MARGIN, InertiaPrior, NotPhysical, Programm
 
 FloatArray = NDArray[np.float64]
 
-EXACT = 1e-6
-"""Share of the torque below which a consistent set counts as predicting the identified torque."""
+EXACT = 1e-6  #: Share of the torque below which a consistent set counts as predicting the identified torque
 SLACK = 0.1
 """If the nearest torque is not the identified one, bodies are sought among all that are at most this share farther from
 it: right at the nearest there is no choice left, and the errors of the data decide on the bodies."""
@@ -24,24 +23,16 @@ it: right at the nearest there is no choice left, and the errors of the data dec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhysicalParameters:
-    """Physically consistent standard parameters with their certificate.
+    """Physically consistent standard parameters with their certificate."""
 
-    Attributes:
-        model: the declared model.
-        standard: χ_st, shape (c,).
-        base: grouping of the base parameters.
-        identified: given values of the base parameters, shape (b,).
-        realised: base parameters of `standard`, shape (b,); those identified where a consistent set exists.
-        torque_change_percent: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
-        eigenvalues: smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
-    """
-
-    model: Model
-    standard: FloatArray
-    base: BaseParameters
-    identified: FloatArray
-    realised: FloatArray
+    model: Model  #: the declared model
+    standard: FloatArray  #: χ_st, shape (c,)
+    base: BaseParameters  #: grouping of the base parameters
+    identified: FloatArray  #: given values of the base parameters, shape (b,)
+    realised: FloatArray  #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
+    #: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
     torque_change_percent: RelativeError
+    #: Smallest one of each link's pseudo-inertia, as a share of its prior's; at least about MARGIN.
     eigenvalues: FloatArray
 
     @property

@@ -16,10 +16,8 @@ from ident.model.robot import read_urdf
 
 FloatArray = NDArray[np.float64]
 
-MARGIN = 1e-4
-"""Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)."""
-_ROOM = 2.0
-"""The first programme keeps this multiple of the margin, so that the second has room to search."""
+MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
+_ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search
 _SCALAR_ROOM = 2e-7
 """Lower bound of drive-chain parameters that may not be negative [share of the whole torque]: above the solver's
 tolerance, and too small to count as a change; the second programme keeps half of it."""
@@ -27,8 +25,7 @@ _TRACE = 1e-8
 """Weight that bounds the links in the first programme where the torque does not; the norm beside it is exact."""
 _RIDGE = 1e-6
 """Weight of the drive-chain parameters in the second: decides between those that the torque cannot distinguish."""
-_INVISIBLE = 1e-9
-"""Change of the relative torque below which a unit step leaves the torque unchanged."""
+_INVISIBLE = 1e-9  #: Change of the relative torque below which a unit step leaves the torque unchanged
 _ATTEMPTS: tuple[dict[str, bool | float], ...] = ({}, {"equilibrate_enable": False}, {"max_step_fraction": 0.9})
 """Settings of Clarabel, tried in turn: some programmes end in a numerical error with the first."""
 
@@ -44,27 +41,17 @@ class NotPhysical(IdentificationError):
 
 @dataclass(frozen=True, slots=True)
 class Programme:
-    """Data of both programmes for c standard parameters, n links and b base parameters.
+    """Data of both programmes for c standard parameters, n links and b base parameters."""
 
-    Attributes:
-        factors: L of each link's prior, shape (n, 4, 4).
-        link_columns: indices of each link's ten parameters, shape (n, 10).
-        scalars: indices of the other parameters, shape (s,).
-        scales: value of each of these that makes the whole torque, shape (s,).
-        grouping: base parameters = grouping @ standard parameters, shape (b, c).
-        triangle: a torque of relative size ‖triangle @ base‖, shape (b, b).
-        positive: parameters that may not be negative.
-        dissipative: for each set of motors that turn with the same joints: parameters, and the contribution of each to
-            the symmetric matrix that must be positive semidefinite, shape (p, k, k).
-    """
-
-    factors: FloatArray
-    link_columns: NDArray[np.int64]
-    scalars: NDArray[np.int64]
-    scales: FloatArray
-    grouping: FloatArray
-    triangle: FloatArray
-    positive: tuple[int, ...]
+    factors: FloatArray  #: L of each link's prior, shape (n, 4, 4)
+    link_columns: NDArray[np.int64]  #: indices of each link's ten parameters, shape (n, 10)
+    scalars: NDArray[np.int64]  #: indices of the other parameters, shape (s,)
+    scales: FloatArray  #: value of each of these that makes the whole torque, shape (s,)
+    grouping: FloatArray  #: base parameters = grouping @ standard parameters, shape (b, c)
+    triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
+    positive: tuple[int, ...]  #: parameters that may not be negative
+    #: For each set of motors that turn with the same joints: parameters, and the contribution of each to the symmetric
+    #: matrix that must be positive semidefinite, shape (p, k, k).
     dissipative: tuple[tuple[tuple[int, ...], FloatArray], ...]
 
     def nearest(self, base: FloatArray) -> FloatArray:
@@ -192,10 +179,8 @@ def _linear_map(factor: FloatArray, columns: NDArray[np.int64], count: int) -> F
     return out
 
 
-DEFAULT_MASS_KG = 1.0
-"""Mass of a link without one in the URDF."""
-DEFAULT_RADIUS_M = 0.1
-"""Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist."""
+DEFAULT_MASS_KG = 1.0  #: Mass of a link without one in the URDF
+DEFAULT_RADIUS_M = 0.1  #: Radius of the solid ball assumed for a link whose inertia the URDF lacks or that cannot exist
 _THINNEST = 1e-6
 """Smallest share of a ball's second moment that a link of the URDF may have in any direction: rods and plates pass,
 rounding errors around zero do not."""
@@ -203,15 +188,10 @@ rounding errors around zero do not."""
 
 @dataclass(frozen=True, slots=True)
 class InertiaPrior:
-    """One body a joint, in the order of the robot's joints.
+    """One body a joint, in the order of the robot's joints."""
 
-    Attributes:
-        links: parameters in the order of LINK_PARAMETERS, shape (n, 10).
-        assumed: numbers (from 0) of the links for which a ball was taken.
-    """
-
-    links: FloatArray
-    assumed: tuple[int, ...]
+    links: FloatArray  #: parameters in the order of LINK_PARAMETERS, shape (n, 10)
+    assumed: tuple[int, ...]  #: numbers (from 0) of the links for which a ball was taken
 
 
 def urdf_links(urdf: str) -> FloatArray:

@@ -16,8 +16,7 @@ from ident.model.model import Model
 
 FloatArray = NDArray[np.float64]
 
-_SAME = 1e-4
-"""Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less."""
+_SAME = 1e-4  #: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
 _TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")
 
 

@@ -21,79 +21,51 @@ from ident.model.robot import JointKind, Robot
 
 FloatArray = NDArray[np.float64]
 
-BASE = -1
-"""Index of the link that does not move."""
+BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004
 """A stretch in which nothing moves farther than this, and which is still not known to be clear, counts as blocked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """All points within a radius of a segment.
+    """All points within a radius of a segment."""
 
-    Attributes:
-        name: for messages.
-        link: index of the joint that it moves with, BASE for the base.
-        start_m, end_m: ends of the segment in that joint's frame (3 numbers each).
-        radius_m: above zero.
-    """
-
-    name: str
-    link: int
-    start_m: tuple[float, float, float]
-    end_m: tuple[float, float, float]
-    radius_m: float
+    name: str  #: for messages
+    link: int  #: index of the joint that it moves with, BASE for the base
+    start_m: tuple[float, float, float]  #: ends of the segment in that joint's frame (3 numbers each)
+    end_m: tuple[float, float, float]  #: ends of the segment in that joint's frame (3 numbers each)
+    radius_m: float  #: above zero
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Axis-aligned box in the base frame.
+    """Axis-aligned box in the base frame."""
 
-    Attributes:
-        name: for messages.
-        lower_m, upper_m: opposite corners.
-    """
-
-    name: str
-    lower_m: tuple[float, float, float]
-    upper_m: tuple[float, float, float]
+    name: str  #: for messages
+    lower_m: tuple[float, float, float]  #: opposite corners
+    upper_m: tuple[float, float, float]  #: opposite corners
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Bodies that must keep apart.
+    """Bodies that must keep apart."""
 
-    Attributes:
-        capsules: of the arm and its payload.
-        pairs: indices of capsules that must keep apart.
-        boxes: obstacles; capsules of the base may touch them.
-        workspace: box that the confined capsules must not leave, None for no bounds.
-        confined: indices of capsules.
-        minimum_m: distance that must be kept.
-    """
-
-    capsules: tuple[Capsule, ...]
-    pairs: tuple[tuple[int, int], ...]
-    boxes: tuple[Box, ...]
-    workspace: Box | None
-    confined: tuple[int, ...]
-    minimum_m: float
+    capsules: tuple[Capsule, ...]  #: of the arm and its payload
+    pairs: tuple[tuple[int, int], ...]  #: indices of capsules that must keep apart
+    boxes: tuple[Box, ...]  #: obstacles; capsules of the base may touch them
+    workspace: Box | None  #: box that the confined capsules must not leave, None for no bounds
+    confined: tuple[int, ...]  #: indices of capsules
+    minimum_m: float  #: distance that must be kept
 
 
 @dataclass(frozen=True, slots=True)
 class Obstruction:
-    """Reason why a path is not clear.
+    """Reason why a path is not clear."""
 
-    Attributes:
-        first, second: names of the two bodies.
-        distance_m: found there; negative when they overlap.
-        position: of the joints there [rad or m].
-    """
-
-    first: str
-    second: str
-    distance_m: float
-    position: tuple[float, ...]
+    first: str  #: names of the two bodies
+    second: str  #: names of the two bodies
+    distance_m: float  #: found there; negative when they overlap
+    position: tuple[float, ...]  #: of the joints there [rad or m]
 
 
 class Checker:

@@ -32,10 +32,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
-UNSEEN = 1e-9
-"""Share of a column that counts as nothing when the others are projected out of it."""
-LINK_MASS_KG = 5.0
-"""Mass of each link where the URDF has no inertias, as a slender rod to the next joint."""
+UNSEEN = 1e-9  #: Share of a column that counts as nothing when the others are projected out of it
+LINK_MASS_KG = 5.0  #: Mass of each link where the URDF has no inertias, as a slender rod to the next joint
 ROD_RADIUS_M = 0.05
 STEEL_KG_M3 = 7850.0
 DRY_FRICTION = 0.05
@@ -43,21 +41,15 @@ VISCOUS_FRICTION = 0.10
 ROTOR = 0.03
 """Shares of a joint's torque limit: dry friction, viscous friction at its speed limit, rotor at its acceleration limit;
 typical of geared arms (paper, Table 3)."""
-TORQUE_RESERVE = 3.0
-"""Torque limit over the largest rigid-body torque, where the URDF gives none."""
+TORQUE_RESERVE = 3.0  #: Torque limit over the largest rigid-body torque, where the URDF gives none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedPayload:
-    """Expected payload on one mounting.
+    """Expected payload on one mounting."""
 
-    Attributes:
-        known: names of its known LINK_PARAMETERS; the others are unknowns of the fit.
-        parameters: all ten, guessed or estimated where they are not known, shape (10,).
-    """
-
-    known: frozenset[str]
-    parameters: FloatArray
+    known: frozenset[str]  #: names of its known LINK_PARAMETERS; the others are unknowns of the fit
+    parameters: FloatArray  #: all ten, guessed or estimated where they are not known, shape (10,)
 
     @property
     def unknown(self) -> tuple[int, ...]:
@@ -67,36 +59,25 @@ class ExpectedPayload:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expectation:
-    """Expected robot: nominal before a fit, estimated after it.
+    """Expected robot: nominal before a fit, estimated after it."""
 
-    Attributes:
-        model: the declared model.
-        gains: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,).
-        parameters: of the model's standard columns, shape (c,); an estimate of base parameters is placed at its leading
-            columns, with zeros elsewhere.
-        payloads: the mountings.
-        noise_a: standard deviation of one row of each motor in the unit of its current reference, with correlation
-            (``effective_noise``), shape (n,).
-    """
-
-    model: Model
-    gains: FloatArray
+    model: Model  #: the declared model
+    gains: FloatArray  #: joint drive gains [Nm or N per unit of the current reference], signed, shape (n,)
+    #: Of the model's standard columns, shape (c,); an estimate of base parameters is placed at its leading columns,
+    #: with zeros elsewhere.
     parameters: FloatArray
-    payloads: tuple[ExpectedPayload, ...]
+    payloads: tuple[ExpectedPayload, ...]  #: the mountings
+    #: Standard deviation of one row of each motor in the unit of its current reference, with correlation
+    #: (``effective_noise``), shape (n,).
     noise_a: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Excitation:
-    """Rows of a motion, for any payload.
+    """Rows of a motion, for any payload."""
 
-    Attributes:
-        motion: of the n joints at the centres of k rows.
-        use: rows of each motor that count, shape (n, k); standstill does not (see ident/equations/rows.py).
-    """
-
-    motion: Motion
-    use: BoolArray
+    motion: Motion  #: of the n joints at the centres of k rows
+    use: BoolArray  #: rows of each motor that count, shape (n, k); standstill does not (see ident/equations/rows.py)
 
 
 def recorded(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning) -> Excitation:
@@ -133,14 +114,10 @@ class Design:
     """The unknowns of an experiment, and the information that excitations give about them.
 
     The unknowns are, in this order, base parameters, unknown parameters of each mounting, ln of the gains.
-
-    Attributes:
-        expectation: the expected robot.
-        base: its base parameters.
     """
 
-    expectation: Expectation
-    base: BaseParameters
+    expectation: Expectation  #: the expected robot
+    base: BaseParameters  #: its base parameters
 
     @property
     def others(self) -> int:

@@ -21,12 +21,9 @@ from ident.planning.excitation import Design, Excitation
 
 FloatArray = NDArray[np.float64]
 
-GOOD_PERCENT = 1.0
-"""Largest standard deviation of a good gain: drives are sold with gains known to some percent."""
-UNSEEN_PERCENT = 10.0
-"""Standard deviation above which the nameplate is the better source."""
-SHARE_OF_BEST = 3.0
-"""A source counts when it alone gives at most so many times the deviation of the best one."""
+GOOD_PERCENT = 1.0  #: Largest standard deviation of a good gain: drives are sold with gains known to some percent
+UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
+SHARE_OF_BEST = 3.0  #: A source counts when it alone gives at most so many times the deviation of the best one
 
 
 class Source(Enum):
@@ -47,17 +44,11 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExtraMoves:
-    """Moves that could be added to an experiment, made once without load and once with each payload.
+    """Moves that could be added to an experiment, made once without load and once with each payload."""
 
-    Attributes:
-        words: description, to follow "add": ``fast moves of J1 with the arm stretched``.
-        seconds: their duration, once.
-        excitation: their rows.
-    """
-
-    words: str
-    seconds: float
-    excitation: Excitation
+    words: str  #: description, to follow "add": ``fast moves of J1 with the arm stretched``
+    seconds: float  #: their duration, once
+    excitation: Excitation  #: their rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,23 +62,14 @@ class Advice:
 
 @dataclass(frozen=True, slots=True)
 class GainVerdict:
-    """Verdict on one gain.
+    """Verdict on one gain."""
 
-    Attributes:
-        axis: index from 0.
-        std_percent: predicted standard deviation [% of the gain]; inf where it is not identifiable.
-        alone_percent: standard deviation that each source would give alone [%].
-        gravity_acts: whether gravity of any body on the last link acts on this axis.
-        verdict: good, weak or unseen.
-        advice: for a gain that is not good; None where no extra moves were offered or none helps.
-    """
-
-    axis: int
-    std_percent: float
-    alone_percent: dict[Source, float]
-    gravity_acts: bool
-    verdict: Verdict
-    advice: Advice | None
+    axis: int  #: index from 0
+    std_percent: float  #: predicted standard deviation [% of the gain]; inf where it is not identifiable
+    alone_percent: dict[Source, float]  #: standard deviation that each source would give alone [%]
+    gravity_acts: bool  #: whether gravity of any body on the last link acts on this axis
+    verdict: Verdict  #: good, weak or unseen
+    advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
 
     @property
     def sources(self) -> tuple[Source, ...]:

@@ -27,8 +27,7 @@ _CODE = re.compile(r"0|[1-9][0-9]{0,9}|0x[0-9a-f]{1,8}", re.IGNORECASE)
 _OCTAL = re.compile(r"[-+]?0[0-9]+")
 _VALUE, _TYPE, _OBJECT_TYPE = "parametervalue", "datatype", "objecttype"
 _VARIABLE = 7
-_BYTE_ORDER_MARK = "ï»¿"
-"""That of UTF-8, each byte a character."""
+_BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 _INTEGERS = {
     0x02: (8, True),
     0x03: (16, True),

@@ -25,8 +25,7 @@ from daq.writeback.formats.scalar import ControllerDocument
 from daq.writeback.formats.xml_document import xml_document
 from daq.writeback.formats.yaml_document import yaml_document
 
-MAX_BYTES = 4 * 2**20
-"""No controller's parameter file is larger; a file that is must be something else."""
+MAX_BYTES = 4 * 2**20  #: No controller's parameter file is larger; a file that is must be something else
 
 FORMATS: dict[ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument], tuple[str, ...]]] = {
     ControllerFormat.YAML: (yaml_document, (".yaml", ".yml")),

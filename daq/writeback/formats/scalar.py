@@ -21,16 +21,11 @@ _INTEGER = re.compile(r"-?(?:0|[1-9][0-9]*)|0[xX][0-9a-fA-F]+")
 
 @dataclass(frozen=True, slots=True)
 class IntegerStyle:
-    """Integers of a type in decimal, or in hexadecimal as two's complement.
+    """Integers of a type in decimal, or in hexadecimal as two's complement."""
 
-    Attributes:
-        bits: of the type.
-        lowest, highest: limits.
-    """
-
-    bits: int
-    lowest: int
-    highest: int
+    bits: int  #: of the type
+    lowest: int  #: limits
+    highest: int  #: limits
 
     def read(self, text: str) -> int:
         """Parse an integer.
@@ -85,29 +80,20 @@ def spell(value: float, std: float, like: str = "") -> str:
 
 
 KeyPath = tuple[str, ...]
-Leaves = Mapping[KeyPath, str]
-"""Every value of a document by its path, as one parser sees it."""
+Leaves = Mapping[KeyPath, str]  #: Every value of a document by its path, as one parser sees it
 
 
 @dataclass(frozen=True, slots=True)
 class Scalar:
-    """One number in the text.
+    """One number in the text."""
 
-    Attributes:
-        key: its key in the cell configuration.
-        value: the number.
-        text: the number as it is written.
-        start, end: its characters in the text, quotes outside.
-        line: from 1.
-        integer: style of the integers that are allowed there; None where any decimal number is.
-    """
-
-    key: str
-    value: float
-    text: str
-    start: int
-    end: int
-    line: int
+    key: str  #: its key in the cell configuration
+    value: float  #: the number
+    text: str  #: the number as it is written
+    start: int  #: its characters in the text, quotes outside
+    end: int  #: its characters in the text, quotes outside
+    line: int  #: from 1
+    #: Style of the integers that are allowed there; None where any decimal number is.
     integer: IntegerStyle | None = None
 
     def read(self, text: str) -> float:
@@ -147,16 +133,11 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class RewrittenGain:
-    """A gain in a document, whose unit may be another.
+    """A gain in a document, whose unit may be another."""
 
-    Attributes:
-        old, new: gain there now, and as it would be read back from the new text [gain unit].
-        spelling: the new number in the document; unchanged text where it is the same number.
-    """
-
-    old: float
-    new: float
-    spelling: str
+    old: float  #: gain there now, and as it would be read back from the new text [gain unit]
+    new: float  #: gain there now, and as it would be read back from the new text [gain unit]
+    spelling: str  #: the new number in the document; unchanged text where it is the same number
 
 
 def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> RewrittenGain:
@@ -180,15 +161,10 @@ def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) 
 
 @dataclass(frozen=True, slots=True)
 class ControllerDocument(ABC):
-    """A controller's file as it was read.
+    """A controller's file as it was read."""
 
-    Attributes:
-        name: of the file, for messages.
-        text: all of it, a byte order mark and the line ends included.
-    """
-
-    name: str
-    text: str
+    name: str  #: of the file, for messages
+    text: str  #: all of it, a byte order mark and the line ends included
 
     @property
     def content(self) -> bytes:

@@ -47,17 +47,11 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class ParsedXml:
-    """A file as expat sees it.
+    """A file as expat sees it."""
 
-    Attributes:
-        root: its root element.
-        around: parent of the root, with the comments beside it.
-        encoding: as declared.
-    """
-
-    root: Element
-    around: Element
-    encoding: str
+    root: Element  #: its root element
+    around: Element  #: parent of the root, with the comments beside it
+    encoding: str  #: as declared
 
 
 def parse(content: bytes, name: str) -> ParsedXml:
@@ -144,13 +138,9 @@ _ATTRIBUTE = re.compile(r"\s+([^\s=/>]+)\s*=\s*(?:'([^']*)'|\"([^\"]*)\")")
 
 @dataclass(frozen=True, slots=True)
 class XmlDocument(ControllerDocument):
-    """An XML file as it was read.
+    """An XML file as it was read."""
 
-    Attributes:
-        encoding: of the file.
-    """
-
-    encoding: str
+    encoding: str  #: of the file
 
     @property
     def content(self) -> bytes:
@@ -272,19 +262,12 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """One part of a path.
+    """One part of a path."""
 
-    Attributes:
-        written: as in the path.
-        name: of the element.
-        having: attributes with their values.
-        number: among those, from 1; None where there must be one alone.
-    """
-
-    written: str
-    name: str
-    having: tuple[tuple[str, str], ...]
-    number: int | None
+    written: str  #: as in the path
+    name: str  #: of the element
+    having: tuple[tuple[str, str], ...]  #: attributes with their values
+    number: int | None  #: among those, from 1; None where there must be one alone
 
     def choose(self, elements: list[Element]) -> list[Element]:
         """Select the elements that the step means."""

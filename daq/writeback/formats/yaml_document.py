@@ -16,8 +16,7 @@ from daq.errors import ControllerUnfit
 from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit, utf8
 
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-_OCTAL = re.compile(r"[-+]?0[0-9]+")
-"""To YAML 1.1; a decimal number to YAML 1.2."""
+_OCTAL = re.compile(r"[-+]?0[0-9]+")  #: To YAML 1.1; a decimal number to YAML 1.2
 _MERGE = "<<"
 _FLOAT = "tag:yaml.org,2002:float"
 

@@ -56,17 +56,11 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class GateContext:
-    """All that the gates compare.
+    """All that the gates compare."""
 
-    Attributes:
-        request: calibration, policy, time, and what the operator states.
-        edit: planned change of the target.
-        cell: as it is now; None for a library without one, where nothing is compared with it.
-    """
-
-    request: Request
-    edit: Edit
-    cell: Cell | None = None
+    request: Request  #: calibration, policy, time, and what the operator states
+    edit: Edit  #: planned change of the target
+    cell: Cell | None = None  #: as it is now; None for a library without one, where nothing is compared with it
 
     @property
     def calibration(self) -> Calibration:

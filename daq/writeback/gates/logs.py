@@ -16,10 +16,8 @@ _FIT, _HOLDOUT = "fit", "holdout"
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _UNFINISHED = ".part"
 _DAY_S = 86_400.0
-_CLOCKS_DAYS = 1.0
-"""By which the recorder's clock may be ahead of ours."""
-_LONGEST_DAYS = 1e5
-"""Some 270 years: no log is so old."""
+_CLOCKS_DAYS = 1.0  #: By which the recorder's clock may be ahead of ours
+_LONGEST_DAYS = 1e5  #: Some 270 years: no log is so old
 
 
 def sources(context: GateContext) -> Iterator[Finding]:

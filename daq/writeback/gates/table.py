@@ -13,29 +13,19 @@ from daq.writeback.request import Finding
 _LIMITS = ApplyPolicy()
 
 
-Check = Callable[[GateContext], Iterator[Finding]]
-"""Yields one finding for each reason to refuse."""
+Check = Callable[[GateContext], Iterator[Finding]]  #: Yields one finding for each reason to refuse
 
 
 @dataclass(frozen=True, slots=True)
 class GateRow:
-    """One gate.
+    """One gate."""
 
-    Attributes:
-        gate: its name in messages, in the audit and in `--json`.
-        fails_if: what it compares, as the condition under which it refuses.
-        limit: default limit with its key in `policy: {apply: ...}`; empty where there is none.
-        remedy: what to do.
-        check: the condition in code.
-        further_check: a second part of it, where the gate compares two things.
-    """
-
-    gate: Gate
-    fails_if: str
-    limit: str
-    remedy: str
-    check: Check
-    further_check: Check | None = None
+    gate: Gate  #: its name in messages, in the audit and in `--json`
+    fails_if: str  #: what it compares, as the condition under which it refuses
+    limit: str  #: default limit with its key in `policy: {apply: ...}`; empty where there is none
+    remedy: str  #: what to do
+    check: Check  #: the condition in code
+    further_check: Check | None = None  #: a second part of it, where the gate compares two things
 
 
 GATES: tuple[GateRow, ...] = (

@@ -14,8 +14,7 @@ from daq.writeback.request import Finding, GainChange, parse_base, short_digest
 from daq.writeback.signature import signers_of
 from ident.calibration import Gain
 
-_SPELLING = 1e-9
-"""Two spellings of one number are one number."""
+_SPELLING = 1e-9  #: Two spellings of one number are one number
 _CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass"
 
 
