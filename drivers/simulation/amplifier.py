@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.simulation.dynamics import compiled
 from drivers.simulation.effects import Lag
-from drivers.simulation.friction import compiled
 from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec
 

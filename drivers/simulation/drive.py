@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.simulation.amplifier import AmplifierSet, FloatArray, plan
-from drivers.simulation.friction import compiled
+from drivers.simulation.dynamics import compiled
 
 
 class PowerState(Enum):
