@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import compiled
-from drivers.simulation.effects import Lag
+from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec
 
@@ -242,31 +242,29 @@ def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
 
 
 class AmplifierSet:
-    """Loops of the n amplifiers of one cell, and the currents that they report.
+    """Loops of the n amplifiers of one cell, at rest where the plant is, and the currents that they report."""
 
-    Attributes:
-        loops: LOOP records, shape (n,).
-        reported_a: current reference with its noise, as in 6074h [A], shape (n,); renewed once a SYNC.
-        actual_a: current of the motor at the same moment [A], shape (n,).
-    """
-
-    def __init__(self, spec: CellSpec, inertia_a_s2: FloatArray, lags: tuple[Lag, ...]) -> None:
+    def __init__(self, spec: CellSpec, plant: Plant) -> None:
         n = len(spec.axes)
         period_s = spec.sync_period_us * 1e-6
         self.step_s = period_s / spec.substeps
-        self.loops: NDArray[np.void] = np.zeros(n, dtype=LOOP)
-        self.loops["inertia_a_s2"] = inertia_a_s2
+        self.loops: NDArray[np.void] = np.zeros(n, dtype=LOOP)  #: shape (n,)
+        self.loops["inertia_a_s2"] = tuned_inertia_a_s2(spec, plant)
         self.loops["position_1_s"] = POSITION_BANDWIDTH_RAD_S
         self.loops["velocity_1_s"] = VELOCITY_BANDWIDTH_RAD_S
         self.loops["integral_1_s"] = INTEGRAL_BANDWIDTH_RAD_S
         self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
-        self.reported_a = np.zeros(n)
-        self.actual_a = np.zeros(n)
+        self.reported_a = np.zeros(n)  #: current reference with its noise, as in 6074h [A]; renewed once a SYNC
+        self.actual_a = np.zeros(n)  #: current of the motor at the same moment [A]
         self._counts_per_rad = counts_per_rad(spec)
+        # Read the encoders at power-on, so that the position of a resting axis does not jump.
+        for state in ("counts", "demand", "target"):
+            self.loops[state] = np.rint(plant.motor_rad * self._counts_per_rad)
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
-        self._lags = lags
+        built = (build_effect(effect, n) for effect in spec.effects)
+        self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
         # A random stream for each axis: its noise does not depend on the other axes.
         self._random = [np.random.default_rng(np.random.SeedSequence(spec.seed, spawn_key=(i,))) for i in range(n)]
@@ -278,12 +276,6 @@ class AmplifierSet:
         self._noise_a = sigma * [stream.standard_normal() for stream in self._random]
         self._block = np.zeros((0, n))
         self._used = 0
-
-    def prime(self, motor_rad: FloatArray) -> None:
-        """Read the encoders at power-on, so that the position of a resting axis does not jump."""
-        self.loops["counts"] = np.rint(motor_rad * self._counts_per_rad)
-        self.loops["demand"] = self.loops["counts"]
-        self.loops["target"] = self.loops["counts"]
 
     def control(self, motor_rad: FloatArray) -> None:
         """Run one substep; ``loops["current_a"]`` then holds the currents for the next one."""

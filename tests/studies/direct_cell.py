@@ -33,9 +33,8 @@ from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
-from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
+from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import Readings, take
-from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec
@@ -164,10 +163,7 @@ class DirectStream:
         self._cycle = 0
         self._plant = Plant(spec)
         self._plant.time_s = began_s
-        built = (build_effect(effect, n) for effect in spec.effects)
-        lags = tuple(effect for effect in built if isinstance(effect, Lag))
-        self._amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, self._plant), lags)
-        self._amplifiers.prime(self._plant.motor_rad)
+        self._amplifiers = AmplifierSet(spec, self._plant)
         self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
         self._readings = take(self._amplifiers, self._rated_a)
         self._enabled = np.zeros(n, dtype=np.int64)
@@ -220,7 +216,7 @@ class DirectStream:
         self.events.append(event)
 
     def advance(self) -> Sample:
-        """One SYNC period, in the order of drivers.simulated.cell.SimulatedCell."""
+        """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
         outgoing, self._outgoing = self._outgoing, []
         for message in outgoing:
             for node in self._nodes:
@@ -242,7 +238,7 @@ class DirectStream:
         for node in self._nodes:
             node.end_cycle()
         self.time_ns = self._cycle * self.pacing.period_ns
-        statuswords = tuple(node.drive.statusword(readings) for node in self._nodes)
+        statuswords = tuple(node.drive.statusword() for node in self._nodes)
         sample = Sample(
             self._cycle, self.time_ns, tuple(readings.position), tuple(readings.current_demand), statuswords
         )

@@ -32,7 +32,7 @@ from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan
 from daq.workflow.record import Clocks, record
 from drivers.canopen.bus import open_bus
-from drivers.simulation.cell import MountingCell, SimulatedCell
+from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.spec import CellSpec
@@ -188,7 +188,7 @@ def serving(
     truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
     bus = open_bus(bus_address(rig.cell))
     try:
-        with MountingCell(truth, bus, mounted) as cell:
+        with SimulatedCell(truth, bus, mounted=mounted) as cell:
             yield cell
     finally:
         bus.shutdown()
