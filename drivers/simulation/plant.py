@@ -157,11 +157,6 @@ class Plant:
         self._impulse = np.zeros(m)
         self.set_brakes(np.ones(n, dtype=np.bool_))
 
-    @property
-    def friction_nm(self) -> FloatArray:
-        """Torque of dry friction and brakes on each coordinate in the last step [Nm], shape (N,)."""
-        return np.asarray(self._mechanics.directions.T @ self._impulse / self._mechanics.step_s)
-
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
         """Close or open the brake of each motor, shape (n,)."""
         self._bound[:] = self._free_bound

@@ -6,6 +6,7 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import can
 
@@ -113,7 +114,11 @@ def _value(node: Node, index: int, subindex: int) -> bytes:
 
 
 def run(
-    name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int = 0, toggle_bit: int | None = None
+    name: str,
+    *faults: FaultSpec,
+    guard_ms: int = 60_000,
+    afterwards: int = 0,
+    toggle_bit: Literal[8, 14, 15] | None = None,
 ) -> Outcome:
     """One move of all axes there and back in a cell with these faults.
 

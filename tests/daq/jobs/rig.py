@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
@@ -180,7 +180,11 @@ def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = N
 
 @contextmanager
 def serving(
-    rig: Rig, *faults: FaultSpec, toggle_bit: int | None = None, seed: int = 1, spec: CellSpec | None = None
+    rig: Rig,
+    *faults: FaultSpec,
+    toggle_bit: Literal[8, 14, 15] | None = None,
+    seed: int = 1,
+    spec: CellSpec | None = None,
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
     mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
