@@ -20,6 +20,7 @@ from drivers.simulation.faults import FaultSpec
 
 FloatArray = NDArray[np.float64]
 Positive = Annotated[float, Gt(0)]
+ToggleBit = Literal[8, 14, 15]
 NotNegative = Annotated[float, Ge(0)]
 U32 = Annotated[int, Interval(ge=0, le=0xFFFFFFFF)]
 
@@ -66,7 +67,7 @@ class AxisSpec:
     current_noise_a: NotNegative  #: standard deviation of the noise of the current reference [A]
     noise_correlation_s: NotNegative  #: correlation time of that noise (first-order); 0 is white
     dialect: Dialect = Dialect.CIA402  #: vendor objects that report its current
-    toggle_bit: Literal[8, 14, 15] | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
+    toggle_bit: ToggleBit | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
     #: Gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     entered_gain_nm_per_a: float = 0.0
 

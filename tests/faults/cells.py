@@ -6,7 +6,6 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import can
 
@@ -23,7 +22,7 @@ from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.node import Node
-from drivers.simulation.spec import SdoAbort
+from drivers.simulation.spec import SdoAbort, ToggleBit
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.stream import SyncStream
@@ -118,7 +117,7 @@ def run(
     *faults: FaultSpec,
     guard_ms: int = 60_000,
     afterwards: int = 0,
-    toggle_bit: Literal[8, 14, 15] | None = None,
+    toggle_bit: ToggleBit | None = None,
 ) -> Outcome:
     """One move of all axes there and back in a cell with these faults.
 

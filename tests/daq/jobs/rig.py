@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -35,7 +35,7 @@ from drivers.canopen.bus import open_bus
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
-from drivers.simulation.spec import CellSpec
+from drivers.simulation.spec import CellSpec, ToggleBit
 
 BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
 WHO = "the test's job"
@@ -182,7 +182,7 @@ def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = N
 def serving(
     rig: Rig,
     *faults: FaultSpec,
-    toggle_bit: Literal[8, 14, 15] | None = None,
+    toggle_bit: ToggleBit | None = None,
     seed: int = 1,
     spec: CellSpec | None = None,
 ) -> Iterator[SimulatedCell]:
