@@ -241,6 +241,39 @@ def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
         axis["reached"] = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis."""
+
+    position: list[int]  #: 6064h [counts]
+    demand: list[int]  #: 6062h [counts]
+    velocity: list[int]  #: 606Ch [counts/s]
+    current_demand: list[int]  #: 6074h [per mille of rated current]
+    current: list[int]  #: 6077h and 6078h [per mille of rated current]
+    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+
+
+@compiled
+def _fill(
+    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
+) -> None:
+    """Fill one row for each field of Readings, in their order, shape (8, n)."""
+    for i in range(len(loops)):
+        axis = loops[i]
+        # int32 as the bus carries it: an endless axis wraps around.
+        readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
+        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
+        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
+        per_mille = 1000.0 / rated_current_a[i]
+        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
+        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
+        readings[5, i] = axis["reached"]
+        readings[6, i] = axis["limited"]
+        readings[7, i] = axis["following_error"]
+
+
 class AmplifierSet:
     """Loops of the n amplifiers of one cell, at rest where the plant is, and the currents that they report."""
 
@@ -276,6 +309,8 @@ class AmplifierSet:
         self._noise_a = sigma * [stream.standard_normal() for stream in self._random]
         self._block = np.zeros((0, n))
         self._used = 0
+        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
+        self.readings = self._read()  #: renewed once a SYNC
 
     def control(self, motor_rad: FloatArray) -> None:
         """Run one substep; ``loops["current_a"]`` then holds the currents for the next one."""
@@ -286,7 +321,7 @@ class AmplifierSet:
                 lag.report(self._lagged_a, self.step_s)
 
     def report(self) -> None:
-        """Renew the reported currents, once a SYNC."""
+        """Renew the reported currents and the readings, once a SYNC."""
         self.actual_a[:] = self.loops["current_a"]
         if self._used == len(self._block):
             self._block = np.stack([stream.standard_normal(1024) for stream in self._random], axis=1)
@@ -295,6 +330,12 @@ class AmplifierSet:
         self._noise_a = self._memory * self._noise_a + self._drive_a * self._block[self._used]
         self._used += 1
         np.add(self._lagged_a if self._lags else self.loops["current_a"], self._noise_a, out=self.reported_a)
+        self.readings = self._read()
+
+    def _read(self) -> Readings:
+        readings = np.empty((8, len(self.loops)), dtype=np.int64)
+        _fill(self.loops, self.reported_a, self._rated_a, readings)
+        return Readings(*readings.tolist())
 
     def enable(self, index: int, on: bool) -> None:
         """Switch the power stage on or off; the set-point then holds the present position."""

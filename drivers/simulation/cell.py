@@ -14,7 +14,7 @@ import numpy as np
 from drivers.canopen.bus import SocketcandBus
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
-from drivers.simulation.drive import ErrorCode, PowerState, take
+from drivers.simulation.drive import ErrorCode, PowerState
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
 from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.plant import Plant
@@ -125,14 +125,11 @@ class SimulatedCell:
         # Compile with numba on copies: the first SYNC must not wait for it.
         Plant(spec).step(np.zeros(len(ids)))
         AmplifierSet(spec, self.plant).control(self.plant.motor_rad)
-        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
-        self._readings = take(self._amplifiers, self._rated_a)
         self._enabled = np.zeros(len(ids), dtype=np.int64)
         self._substeps, self._period_us = spec.substeps, spec.sync_period_us
         self._bus, self._clock = bus, clock
         self.nodes = tuple(
-            Node(index, axis, self._amplifiers, lambda: self._readings, partial(self._send_of, index))
-            for index, axis in enumerate(spec.axes)
+            Node(index, axis, self._amplifiers, partial(self._send_of, index)) for index, axis in enumerate(spec.axes)
         )
         self._wires, there = _wires(bus, ids)
         self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
@@ -313,7 +310,6 @@ class SimulatedCell:
             amplifiers.control(plant.motor_rad)
         self.cycles += 1
         amplifiers.report()
-        self._readings = take(amplifiers, self._rated_a)
         now_us = self.time_us
         for node in self.nodes:
             node.end_cycle()

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.simulation.amplifier import AmplifierSet, FloatArray, plan
-from drivers.simulation.dynamics import compiled
+from drivers.simulation.amplifier import AmplifierSet, plan
 
 
 class PowerState(Enum):
@@ -58,46 +53,6 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
     return after
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis."""
-
-    position: list[int]  #: 6064h [counts]
-    demand: list[int]  #: 6062h [counts]
-    velocity: list[int]  #: 606Ch [counts/s]
-    current_demand: list[int]  #: 6074h [per mille of rated current]
-    current: list[int]  #: 6077h and 6078h [per mille of rated current]
-    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-
-
-def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:
-    """Return the rounded and wrapped state of the loops."""
-    readings = np.empty((8, len(rated_current_a)), dtype=np.int64)
-    _fill(amplifiers.loops, amplifiers.reported_a, rated_current_a, readings)
-    return Readings(*readings.tolist())
-
-
-@compiled
-def _fill(
-    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
-) -> None:
-    """Fill one row for each field of Readings, in their order, shape (8, n)."""
-    for i in range(len(loops)):
-        axis = loops[i]
-        # int32 as the bus carries it: an endless axis wraps around.
-        readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
-        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
-        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
-        per_mille = 1000.0 / rated_current_a[i]
-        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
-        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
-        readings[5, i] = axis["reached"]
-        readings[6, i] = axis["limited"]
-        readings[7, i] = axis["following_error"]
-
-
 class ErrorCode(IntEnum):
     """Error codes of CiA 402-2 and CiA 301 (603Fh, EMCY)."""
 
@@ -125,11 +80,9 @@ Setpoint = tuple[float, float, float, float]
 class Drive:
     """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet."""
 
-    def __init__(
-        self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int], readings: Callable[[], Readings]
-    ) -> None:
+    def __init__(self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int]) -> None:
         self._index, self._amplifiers = index, amplifiers
-        self._number, self._readings = number, readings  # present value of an object; state of the loops
+        self._number = number  # present value of an object
         self.state = PowerState.SWITCH_ON_DISABLED  #: CiA 402 power state
         self.controlword = 0  #: last value written
         self.error: int = ErrorCode.NONE  #: code of the active fault
@@ -170,7 +123,7 @@ class Drive:
             waiting, self._waiting = self._waiting, None
             self._acknowledged = bool(self.controlword & 0x10)
             self._start(waiting)
-        if self._readings().following_error[self._index] and self.powered:
+        if self._amplifiers.readings.following_error[self._index] and self.powered:
             self.fail(ErrorCode.FOLLOWING_ERROR)
             return ErrorCode.FOLLOWING_ERROR
         return ErrorCode.NONE
@@ -196,7 +149,7 @@ class Drive:
 
     def statusword(self) -> int:
         """Return object 6041h."""
-        readings = self._readings()
+        readings = self._amplifiers.readings
         word = self.state.value | 0x0210  # voltage present, remote
         if self.powered:
             word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
@@ -243,7 +196,7 @@ class Drive:
         self._waiting = None
         self._start(setpoint)
         # Reported at once, so that a master does not take the end of the last move for the end of this one.
-        self._readings().reached[self._index] = 0
+        self._amplifiers.readings.reached[self._index] = 0
 
     def _start(self, setpoint: Setpoint) -> None:
         axis = self._amplifiers.loops[self._index]

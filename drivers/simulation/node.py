@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from drivers.simulation.amplifier import AmplifierSet
-from drivers.simulation.drive import Drive, ErrorCode, Readings
+from drivers.simulation.drive import Drive, ErrorCode
 from drivers.simulation.faults import FaultKind
 from drivers.simulation.objects import (
     LOAD,
@@ -60,16 +60,13 @@ class Stored:
 class Node:
     """Node and its object dictionary; all methods are called from the cell's one thread."""
 
-    def __init__(
-        self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, readings: Callable[[], Readings], send: Send
-    ) -> None:
+    def __init__(self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, send: Send) -> None:
         self.node_id = axis.node_id
         self.nmt = NmtState.INITIALISING
-        self.drive = Drive(index, amplifiers, self._number, readings)
+        self.drive = Drive(index, amplifiers, self._number)
         self._index = index
         self._axis = axis
-        self._loop = amplifiers.loops[index]
-        self._readings = readings
+        self._amplifiers = amplifiers
         self._send = send
         self._dictionary = amplifier_dictionary(axis)
         self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
@@ -282,22 +279,22 @@ class Node:
         return side[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:
-        i, drive, readings = self._index, self.drive, self._readings
+        i, drive, amplifiers = self._index, self.drive, self._amplifiers
         live: dict[int, Callable[[], int]] = {
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
-            0x2240: lambda: readings().position[i],
+            0x2240: lambda: amplifiers.readings.position[i],
             0x6041: lambda: drive.statusword() | self._toggle,
             0x6061: lambda: self._number(0x6060),
-            0x6062: lambda: readings().demand[i],
-            0x6063: lambda: readings().position[i],
-            0x6064: lambda: readings().position[i],
-            0x606C: lambda: readings().velocity[i],
-            0x6074: lambda: readings().current_demand[i],
-            0x6077: lambda: readings().current[i],
-            0x6078: lambda: readings().current[i],
-            0x60F4: lambda: readings().demand[i] - readings().position[i],
+            0x6062: lambda: amplifiers.readings.demand[i],
+            0x6063: lambda: amplifiers.readings.position[i],
+            0x6064: lambda: amplifiers.readings.position[i],
+            0x606C: lambda: amplifiers.readings.velocity[i],
+            0x6074: lambda: amplifiers.readings.current_demand[i],
+            0x6077: lambda: amplifiers.readings.current[i],
+            0x6078: lambda: amplifiers.readings.current[i],
+            0x60F4: lambda: amplifiers.readings.demand[i] - amplifiers.readings.position[i],
         }
         index, subindex = key
         if index == 0x1003:
@@ -327,13 +324,14 @@ class Node:
             self._apply_settings()
 
     def _apply_settings(self) -> None:
-        self._loop["error_window"] = self._number(0x6065)
-        self._loop["error_time_s"] = self._number(0x6066) * 1e-3
-        self._loop["target_window"] = self._number(0x6067)
-        self._loop["target_time_s"] = self._number(0x6068) * 1e-3
+        loop = self._amplifiers.loops[self._index]
+        loop["error_window"] = self._number(0x6065)
+        loop["error_time_s"] = self._number(0x6066) * 1e-3
+        loop["target_window"] = self._number(0x6067)
+        loop["target_time_s"] = self._number(0x6068) * 1e-3
         # An amplifier without 6073h keeps its peak current.
         if (0x6073, 0) in self._dictionary:
-            self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
+            loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
 
     def _connection_lost(self) -> None:
         """React by the abort connection option code 6007h."""

@@ -214,7 +214,7 @@ class DirectStream:
         for node in nodes:
             node.begin_cycle()
         self._cell._advance(())
-        readings = self._cell._readings
+        readings = self._cell._amplifiers.readings
         self.time_ns = self._cycle * self.pacing.period_ns
         statuswords = tuple(node.drive.statusword() for node in nodes)
         sample = Sample(
