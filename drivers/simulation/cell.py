@@ -109,7 +109,7 @@ class SimulatedCell:
                 fast, and another object is another payload. The loops keep their tuning, as those of real drives do.
 
         Raises:
-            SpecInvalid, EffectUnknown: the description is wrong, or a node is on none of the buses.
+            SpecInvalid: the description is wrong, or a node is on none of the buses.
         """
         ids = [axis.node_id for axis in spec.axes]
         if len(set(ids)) < len(ids) or not all(1 <= node_id <= 127 for node_id in ids):

@@ -15,7 +15,7 @@ from inspect import Parameter, signature
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.simulation.spec import EffectUnknown, UndeclaredEffect
+from drivers.simulation.spec import SpecInvalid, UndeclaredEffect
 
 FloatArray = NDArray[np.float64]
 
@@ -217,24 +217,24 @@ def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
     """Build the physics of an undeclared effect for a cell with a number of axes.
 
     Raises:
-        EffectUnknown: the name, a parameter or the axis does not exist, or a parameter is missing.
+        SpecInvalid: the name, a parameter or the axis does not exist, or a parameter is missing.
     """
     physics = UNDECLARED_EFFECTS.get(effect.name)
     if physics is None:
         names = ", ".join(UNDECLARED_EFFECTS)
-        raise EffectUnknown(f"undeclared effect {effect.name!r} does not exist; there are {names}")
+        raise SpecInvalid(f"undeclared effect {effect.name!r} does not exist; there are {names}")
     if not 0 <= effect.axis < axes:
-        raise EffectUnknown(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
+        raise SpecInvalid(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
     known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in ("moment", "axis")}
     unknown = sorted(set(effect.parameters) - set(known))
     missing = [name for name, default in known.items() if default is Parameter.empty and name not in effect.parameters]
     wrong = [f"unknown parameter {', '.join(unknown)}"] if unknown else []
     wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
     if wrong:
-        raise EffectUnknown(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
+        raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
     if not isinstance(physics, type):
         return partial(physics, axis=effect.axis, **effect.parameters)
     built: Presliding | Coupling | Elasticity | Lag = physics(axis=effect.axis, **effect.parameters)
     if isinstance(built, Coupling) and (not 0 <= built.other < axes or built.other == built.axis):
-        raise EffectUnknown(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
+        raise SpecInvalid(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
     return built

@@ -109,8 +109,8 @@ class Plant:
         """Build the equations of motion.
 
         Raises:
-            SpecInvalid: URDF, drive train, axes and start position do not fit together.
-            EffectUnknown: an undeclared effect or its parameters do not exist.
+            SpecInvalid: URDF, drive train, axes and start position do not fit together, or an undeclared effect or its
+                parameters do not exist.
         """
         model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
         n = len(spec.axes)
@@ -221,7 +221,11 @@ class Plant:
             self.motor_rad,
         )
         if not residual <= TOLERANCE_RAD_S:
-            raise FrictionUnsolved(self.time_s, residual, TOLERANCE_RAD_S)
+            raise FrictionUnsolved(
+                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
+                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
+                "orders of magnitude"
+            )
         self.time_s += self._mechanics.step_s
 
 

@@ -104,25 +104,11 @@ class SimulationError(DriverError):
 
 
 class SpecInvalid(SimulationError):
-    """The cell cannot be built from its description."""
-
-
-class EffectUnknown(SimulationError):
-    """An undeclared effect or a parameter of it does not exist."""
+    """The cell cannot be built from its description, or an undeclared effect of it does not exist."""
 
 
 class FrictionUnsolved(SimulationError):
     """The dry-friction problem was not solved to its tolerance."""
-
-    def __init__(self, time_s: float, residual_rad_s: float, tolerance_rad_s: float) -> None:
-        super().__init__(
-            f"dry friction at {time_s:.6f} s: residual {residual_rad_s:.3g} rad/s, "
-            f"expected at most {tolerance_rad_s:.3g}; "
-            "check the inertias and friction of the cell for values that differ by many orders of magnitude"
-        )
-        self.time_s = time_s
-        self.residual_rad_s = residual_rad_s
-        self.tolerance_rad_s = tolerance_rad_s
 
 
 class SdoAbort(Exception):

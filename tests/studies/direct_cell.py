@@ -83,7 +83,7 @@ def simulate_run(
 
     Raises:
         DriverError: the moves leave the limits, or an axis did not follow.
-        FrictionUnsolved, SpecInvalid, EffectUnknown: from the simulated cell.
+        FrictionUnsolved, SpecInvalid: from the simulated cell.
     """
     stream = DirectStream(cell, spec, began_s)
     scale = _scaling(cell, stream.ampere_per_unit)
