@@ -337,19 +337,6 @@ class AmplifierSet:
         _fill(self.loops, self.reported_a, self._rated_a, readings)
         return Readings(*readings.tolist())
 
-    def enable(self, index: int, on: bool) -> None:
-        """Switch the power stage on or off; the set-point then holds the present position."""
-        axis = self.loops[index]
-        axis["enabled"] = int(on)
-        axis["reached"] = 0
-        axis["inside_for_s"] = 0.0
-        axis["following_error"] = 0
-        axis["current_a"] = 0.0
-        axis["demand"] = axis["target"] = axis["counts"]
-        axis["demand_velocity"] = axis["demand_acceleration"] = 0.0
-        axis["piece"] = SEGMENTS
-        axis["integral_a"] = 0.0
-
     def move(self, index: int, move: ProfileMove) -> None:
         """Begin a move from the present set-point."""
         self._piece_s[index], self._piece_acceleration[index] = move.duration_s, move.acceleration
@@ -359,12 +346,3 @@ class AmplifierSet:
         axis["piece_time_s"] = 0.0
         axis["reached"] = 0
         axis["inside_for_s"] = 0.0
-
-    def stop(self, index: int, deceleration: float) -> None:
-        """Stop with a deceleration [counts/s²]."""
-        axis = self.loops[index]
-        self.move(index, ramp_down(float(axis["demand"]), float(axis["demand_velocity"]), deceleration))
-
-    def moving(self, index: int) -> bool:
-        """Return whether the set-point still moves."""
-        return bool(self.loops[index]["piece"] < SEGMENTS)

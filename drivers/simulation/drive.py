@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import Enum, IntEnum
 
-from drivers.simulation.amplifier import AmplifierSet, plan
+from drivers.simulation.amplifier import SEGMENTS, AmplifierSet, plan, ramp_down
 
 
 class PowerState(Enum):
@@ -63,16 +63,6 @@ class ErrorCode(IntEnum):
     FOLLOWING_ERROR = 0x8611
 
 
-class QuickStop(IntEnum):
-    """Option code 605Ah."""
-
-    DISABLE = 0
-    SLOW_DOWN_AND_DISABLE = 1
-    QUICK_STOP_AND_DISABLE = 2
-    SLOW_DOWN_AND_STAY = 5
-    QUICK_STOP_AND_STAY = 6
-
-
 Setpoint = tuple[float, float, float, float]
 """Target, speed, acceleration and deceleration [counts, s]: objects 607Ah, 6081h, 6083h and 6084h when it was set."""
 
@@ -82,6 +72,7 @@ class Drive:
 
     def __init__(self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int]) -> None:
         self._index, self._amplifiers = index, amplifiers
+        self._axis = amplifiers.loops[index]  # a view
         self._number = number  # present value of an object
         self.state = PowerState.SWITCH_ON_DISABLED  #: CiA 402 power state
         self.controlword = 0  #: last value written
@@ -107,7 +98,7 @@ class Drive:
             return
         if controlword & 0x100 and not previous & 0x100:  # halt
             self._waiting = None
-            self._amplifiers.stop(self._index, self._number(0x6084))
+            self._stop(self._number(0x6084))
         if not controlword & 0x10:
             # The handshake ends when the master clears the request, unless a set-point still waits.
             self._acknowledged = self._waiting is not None
@@ -117,9 +108,9 @@ class Drive:
     def monitor(self) -> ErrorCode:
         """Update faults, quick stop and waiting set-point after a SYNC period; return the code of a new fault."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
-            if not self._stays_in_quick_stop and not self._amplifiers.moving(self._index):
+            if not self._stays_in_quick_stop and not self._moving:
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
-        elif self._waiting is not None and not self._amplifiers.moving(self._index):
+        elif self._waiting is not None and not self._moving:
             waiting, self._waiting = self._waiting, None
             self._acknowledged = bool(self.controlword & 0x10)
             self._start(waiting)
@@ -140,7 +131,7 @@ class Drive:
 
     @property
     def _stays_in_quick_stop(self) -> bool:
-        return self._number(0x605A) >= QuickStop.SLOW_DOWN_AND_STAY
+        return self._number(0x605A) >= 5  # options 5 and 6: as 1 and 2, without leaving the state
 
     def quick_stop(self) -> None:
         """Start a quick stop without a controlword."""
@@ -162,12 +153,11 @@ class Drive:
     def _change(self, state: PowerState) -> None:
         if state is PowerState.QUICK_STOP_ACTIVE:
             option = self._number(0x605A)
-            if option == QuickStop.DISABLE:
+            if option == 0:  # disable at once
                 self._enter(PowerState.SWITCH_ON_DISABLED)
                 return
-            slow = option in (QuickStop.SLOW_DOWN_AND_DISABLE, QuickStop.SLOW_DOWN_AND_STAY)
             self._waiting, self._acknowledged = None, False
-            self._amplifiers.stop(self._index, self._number(0x6084 if slow else 0x6085))
+            self._stop(self._number(0x6084 if option in (1, 5) else 0x6085))  # slow down, or quick stop
             self.state = state
             return
         if state is PowerState.OPERATION_ENABLED and self.state is PowerState.QUICK_STOP_ACTIVE:
@@ -176,17 +166,24 @@ class Drive:
         self._enter(state)
 
     def _enter(self, state: PowerState) -> None:
-        self._amplifiers.enable(self._index, state is PowerState.OPERATION_ENABLED)
+        """Enter a state with the power stage on or off; the set-point then holds the present position."""
+        axis = self._axis
+        axis["enabled"] = int(state is PowerState.OPERATION_ENABLED)
+        axis["reached"] = axis["following_error"] = 0
+        axis["current_a"] = axis["integral_a"] = axis["inside_for_s"] = 0.0
+        axis["demand"] = axis["target"] = axis["counts"]
+        axis["demand_velocity"] = axis["demand_acceleration"] = 0.0
+        axis["piece"] = SEGMENTS
         self._waiting, self._acknowledged = None, False
         self.state = state
 
     def _request(self, controlword: int) -> None:
-        moving = self._amplifiers.moving(self._index)
+        moving = self._moving
         if moving and not controlword & 0x20 and self._waiting is not None:
             return  # no room: the request stays unacknowledged
         target = self._number(0x607A)
         if controlword & 0x40:
-            target += int(self._amplifiers.loops[self._index]["target"])
+            target += int(self._axis["target"])
         self._acknowledged = True
         speed, acceleration, deceleration = (float(self._number(index)) for index in (0x6081, 0x6083, 0x6084))
         setpoint = (float(target), speed, acceleration, deceleration)
@@ -198,6 +195,14 @@ class Drive:
         # Reported at once, so that a master does not take the end of the last move for the end of this one.
         self._amplifiers.readings.reached[self._index] = 0
 
+    @property
+    def _moving(self) -> bool:
+        return bool(self._axis["piece"] < SEGMENTS)
+
     def _start(self, setpoint: Setpoint) -> None:
-        axis = self._amplifiers.loops[self._index]
-        self._amplifiers.move(self._index, plan(float(axis["demand"]), float(axis["demand_velocity"]), *setpoint))
+        move = plan(float(self._axis["demand"]), float(self._axis["demand_velocity"]), *setpoint)
+        self._amplifiers.move(self._index, move)
+
+    def _stop(self, deceleration: float) -> None:
+        move = ramp_down(float(self._axis["demand"]), float(self._axis["demand_velocity"]), deceleration)
+        self._amplifiers.move(self._index, move)

@@ -12,6 +12,7 @@ from drivers.simulation.drive import Drive, ErrorCode
 from drivers.simulation.faults import FaultKind
 from drivers.simulation.objects import (
     LOAD,
+    NO_OBJECT,
     READ_ONLY,
     SAVE,
     Kind,
@@ -20,7 +21,7 @@ from drivers.simulation.objects import (
     find,
     vendor,
 )
-from drivers.simulation.pdo import NO_SUCH_OBJECT, Pdo, PdoParameters, default_pdos
+from drivers.simulation.pdo import Pdo, PdoParameters, default_pdos
 from drivers.simulation.spec import AxisSpec, SdoAbort
 
 Send = Callable[[int, bytes], None]
@@ -275,7 +276,7 @@ class Node:
         side = self._transmit if index >= 0x1800 else self._receive
         number = index & 0x1FF
         if number >= len(side):
-            raise SdoAbort(NO_SUCH_OBJECT)
+            raise SdoAbort(NO_OBJECT)
         return side[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:

@@ -9,6 +9,7 @@ from typing import Any
 
 from drivers.simulation.objects import (
     INVALID_VALUE,
+    NO_OBJECT,
     NO_SUBINDEX,
     READ_ONLY,
     Dictionary,
@@ -19,7 +20,6 @@ from drivers.simulation.objects import (
 from drivers.simulation.spec import SdoAbort
 
 UNSUPPORTED_ACCESS = 0x06010000
-NO_SUCH_OBJECT = 0x06020000
 NOT_MAPPABLE = 0x06040041
 PDO_TOO_LONG = 0x06040042
 
@@ -205,7 +205,7 @@ class Pdo:
     def _check(self, mapping: int) -> None:
         entry = self._dictionary.get((mapping >> 16, mapping >> 8 & 0xFF))
         if entry is None:
-            raise SdoAbort(NO_SUCH_OBJECT)
+            raise SdoAbort(NO_OBJECT)
         if entry.mappable is not self._direction or entry.kind.bits != mapping & 0xFF:
             raise SdoAbort(NOT_MAPPABLE)
 
