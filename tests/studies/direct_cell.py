@@ -158,7 +158,7 @@ class DirectStream:
         self.events: list[CellEvent] = []
         self.time_ns = 0
         self._cycle = 0
-        # Its nodes answer SDO and PDO on a bus that nobody reads.
+        # Its nodes answer on a bus without readers.
         self._cell = SimulatedCell(spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None)))
         self._cell.plant.time_s = began_s
         self._outgoing: list[can.Message] = []
