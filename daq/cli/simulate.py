@@ -70,7 +70,7 @@ def simulate(
     from drivers.stream.split_bus import BusPart, SplitAddress, open_split_bus
 
     require_simulator()
-    from drivers.simulation.cell import MountingCell, SimulatedCell
+    from drivers.simulation.cell import SimulatedCell
 
     if payload is not None and payload_from is not None:
         raise UsageError(
@@ -95,7 +95,7 @@ def simulate(
         address = SplitAddress(parts) if bus else parts[0].address
         end = open_split_bus(address) if isinstance(address, SplitAddress) else open_answering_bus(address)
         stack.callback(end.shutdown)
-        cell = SimulatedCell(spec, end) if mounted is None else MountingCell(spec, end, mounted)
+        cell = SimulatedCell(spec, end, mounted=mounted)
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
         typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
