@@ -50,8 +50,7 @@ def residual_verb(
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import start_of
-    from daq.report.residual import residual_view
-    from daq.report.residual_document import residual_document
+    from daq.report.residual import residual_document, residual_view
     from daq.report.residual_page import save_report
     from daq.workflow.fit import calibration_of, close_loop, fit
     from ident.discovery.before_after import account

@@ -132,6 +132,11 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
     return table
 
 
+def error_document(error: RelativeError | None) -> dict[str, Any] | None:
+    """Return relative errors, for --json."""
+    return None if error is None else {"axes": list(error.axes), "total": error.total}
+
+
 def start_of(fitted: Fit) -> Evidence:
     """Return the rows under the declared model; the logs are read again only where the rows were not kept.
 

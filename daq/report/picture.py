@@ -1,15 +1,12 @@
-"""Shared by all pictures: size, colours and writing the file. No pyplot, which keeps figures in a global list."""
+"""Shared by all pictures: size, colours and rendering. No pyplot, which keeps figures in a global list."""
 
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-from daq.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -99,23 +96,13 @@ def legend_below(figure: Figure, *places: Axes) -> None:
     )
 
 
-def save_png(figure: Figure, path: Path | None) -> bytes:
-    """Draw a figure and write it whole; the same figure gives the same bytes.
+def render(figure: Figure, kind: str = "png") -> bytes:
+    """Return the content of a file, png or svg; the same figure gives the same bytes: no time, no random names."""
+    from matplotlib import rc_context  # noqa: PLC0415
 
-    Args:
-        figure: to draw.
-        path: None for the bytes alone, as for a page that embeds its pictures.
-
-    Returns:
-        the file's content.
-
-    Raises:
-        OSError: from the file system.
-    """
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI, metadata={"Software": None})
-    if path is not None:
-        replace_file(path, drawn.getvalue())
+    with rc_context({"svg.hashsalt": "drivegain"}):
+        figure.savefig(drawn, format=kind, dpi=DPI, metadata={"Date" if kind == "svg" else "Software": None})
     return drawn.getvalue()
 
 

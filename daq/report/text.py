@@ -56,6 +56,11 @@ def json_text(document: Any) -> str:
     return spelled_bytes(json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def picked(thing: object, *names: str) -> dict[str, Any]:
+    """Copy attributes into a document under their own names."""
+    return {name: getattr(thing, name) for name in names}
+
+
 def spelled_bytes(text: str) -> str:
     """Spell out the bytes of a file's name that are not UTF-8, which no document can hold, as `\\udcff`."""
     return text.encode(errors="backslashreplace").decode()

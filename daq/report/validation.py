@@ -12,6 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from daq.files import replace_file
 from daq.report import paper_tables
 from daq.report.plots import plot_torques
 from daq.report.text import percent_text, plain_table, printable, terminal_text
@@ -73,7 +74,7 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     axes = tuple(gain.axis for gain in calibration.gains)
     forces = tuple("N" if gain.unit.startswith("N/") else "Nm" for gain in calibration.gains)
     logs_of = Counter(validation.run for validation in validations)
-    drawn = {}
+    pictures = {}
     for validation in validations:
         # Logs in different folders may have the same name.
         stem = validation.run if logs_of[validation.run] == 1 else f"{validation.run}-{validation.digest[:8]}"
@@ -84,9 +85,10 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
         )
         title = f"{validation.run}, {validation.data_use.value}: torque of {calibration.cell}"
         folder.mkdir(parents=True, exist_ok=True)
-        plot_torques(path, validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
-        drawn[validation.log] = path
-    return drawn
+        drawn = plot_torques(validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
+        replace_file(path, drawn)
+        pictures[validation.log] = path
+    return pictures
 
 
 def validation_document(
