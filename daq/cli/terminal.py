@@ -26,16 +26,7 @@ ProgressCallback = Callable[[int, int, str], None]  #: Called with the number do
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
-    """Refuse an output file that would overwrite an input or a file of another kind.
-
-    Args:
-        out: file to write, None where nothing is written.
-        inputs: files that the verb reads, None for options that were not given.
-        format_: name of the kind; its files say ``format: …`` in their first lines, and may be replaced.
-
-    Raises:
-        UsageError: it is an input, or a file of another kind.
-    """
+    """Refuse an output file that would overwrite an input, or a file without ``format: …`` in its first lines."""
     if out is None or not out.exists():
         return
     if any(given is not None and given.exists() and out.samefile(given) for given in inputs):
@@ -46,28 +37,20 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
 
 
 def check_replaceable(out: Path, mark: str, kind: str) -> None:
-    """Refuse to overwrite a file of another kind.
-
-    Args:
-        out: file to write.
-        mark: text in the first lines of every file of this kind.
-        kind: name of the kind, for the message.
-
-    Raises:
-        UsageError: the file exists and lacks the mark.
-    """
-    if out.exists() and not (out.is_file() and mark.encode() in _head(out)):
+    """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head."""
+    if out.is_file():
+        with out.open("rb") as stream:
+            head = stream.read(_HEAD_BYTES)
+        replaceable = not head or mark.encode() in head
+    else:
+        replaceable = not out.exists()
+    if not replaceable:
         raise UsageError(
             str(out),
             found=f"an existing file that is no {kind}",
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(_HEAD_BYTES)
 
 
 @contextmanager

@@ -6,18 +6,15 @@ import csv
 import io
 from collections.abc import Sequence
 from datetime import datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daq.files import replace_file
 from daq.ledger.watch import Series
-from daq.report.picture import BLUE, DPI, GREY, ORANGE, PURPLE, SKY, legend_below, panels, unformatted
-from daq.report.text import inert_row
-from ident.drift.chart import CHART, Chart
+from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
+from daq.report.text import inert_row, picked
+from ident.drift.chart import CHART
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 _SIGMAS = 2.0
@@ -25,18 +22,17 @@ _COLUMNS = 2
 _FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
 
 
-def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:
+def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
     """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
 
     Args:
-        path: of the picture, .png or .svg.
         all_series: one an axis, at least one.
+        kind: png or svg.
         title: says which cell it is.
-        chart: limits that `all_series` was watched with.
-
-    Raises:
-        OSError: from the file system.
     """
+    import matplotlib.dates  # noqa: PLC0415
+
+    dates: Any = matplotlib.dates  # without types
     columns = min(_COLUMNS, len(all_series))
     bands = -(-len(all_series) // columns)
     figure, places = panels(2 * columns * bands, columns, unformatted(title))
@@ -44,16 +40,26 @@ def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart:
         band, column = divmod(number, columns)
         above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
         _draw_gains(above, series)
-        _draw_limits(beneath, series, chart)
+        _draw_limits(beneath, series)
     for empty in range(len(all_series), columns * bands):
         for row in range(2):
             places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
-    _date(places, [_days(point.entry.recorded) for series in all_series for point in series.points])
+    days = [_days(point.entry.recorded) for series in all_series for point in series.points]
+    # Of a single day there would be no range to label.
+    beside = max(0.5, 0.03 * (max(days) - min(days)))
+    for place in places:
+        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
+        # At most so many labels as fit beside each other.
+        locator = dates.AutoDateLocator(maxticks=7)
+        place.xaxis.set_major_locator(locator)
+        place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
     upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
     legend_below(figure, *upper)
     # One legend for both kinds of panels would be wider than the picture of one axis.
-    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=_once(places[columns]))
-    _save(figure, path)
+    handles, labels = places[columns].get_legend_handles_labels()
+    once = list(dict(zip(labels, handles, strict=True)).values())
+    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
+    return render(figure, kind)
 
 
 def _draw_gains(place: Axes, series: Series) -> None:
@@ -80,7 +86,7 @@ def _draw_gains(place: Axes, series: Series) -> None:
     place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
 
 
-def _draw_limits(place: Axes, series: Series, chart: Chart) -> None:
+def _draw_limits(place: Axes, series: Series) -> None:
     place.axhline(0.0, color=GREY, linewidth=0.8)
     for sign in (-1.0, 1.0):
         place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
@@ -88,16 +94,10 @@ def _draw_limits(place: Axes, series: Series, chart: Chart) -> None:
         times = [_days(point.entry.recorded) for point in series.points[stretch.began : stretch.ended]]
         drift = stretch.drift
         for sums in (drift.upper, -drift.lower):
-            place.step(times, sums / chart.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
-        place.plot(times, drift.trend / chart.trend, color=PURPLE, linewidth=1.0, label="trend")
-        place.plot(times, drift.deviations / chart.single, ".", color=GREY, markersize=4, label="one calibration")
+            place.step(times, sums / CHART.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
+        place.plot(times, drift.trend / CHART.trend, color=PURPLE, linewidth=1.0, label="trend")
+        place.plot(times, drift.deviations / CHART.single, ".", color=GREY, markersize=4, label="one calibration")
     place.set_ylabel("over its limit", fontsize=8)
-
-
-def _once(place: Axes) -> list[Any]:
-    """One handle a label."""
-    handles, labels = place.get_legend_handles_labels()
-    return list(dict(zip(labels, handles, strict=True)).values())
 
 
 def _days(at: datetime) -> float:
@@ -109,60 +109,11 @@ def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float
     return [when for when, _ in points], [value for _, value in points]
 
 
-def _date(places: list[Axes], days: list[float]) -> None:
-    import matplotlib.dates  # noqa: PLC0415
-
-    dates: Any = matplotlib.dates  # without types
-    # Of a single day there would be no range to label.
-    beside = max(0.5, 0.03 * (max(days) - min(days)))
-    for place in places:
-        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
-        # At most so many labels as fit beside each other.
-        locator = dates.AutoDateLocator(maxticks=7)
-        place.xaxis.set_major_locator(locator)
-        place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
-
-
-def _save(figure: Figure, path: Path) -> None:
-    from matplotlib import rc_context  # noqa: PLC0415
-
-    drawn = io.BytesIO()
-    kind = path.suffix.lower().removeprefix(".")
-    # Neither time nor random names: the same history gives the same bytes.
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with rc_context({"svg.hashsalt": "drivegain"}):
-        figure.savefig(drawn, format=kind, dpi=DPI, metadata=metadata)
-    replace_file(path, drawn.getvalue())
-
-
+_FIT = ("error_percent", "holdout_percent", "rows", "method", "software", "configuration_sha256")
 COLUMNS = (
-    "axis",
-    "recorded",
-    "gain",
-    "std",
-    "unit",
-    "nameplate",
-    "change_percent",
-    "change_sigmas",
-    "change_probability",
-    "deviation_sigmas",
-    "cusum_up",
-    "cusum_down",
-    "trend_sigmas",
-    "alarm",
-    "baseline",
-    "applied_at",
-    "applied_by",
-    "applied_to",
-    "error_percent",
-    "holdout_percent",
-    "rows",
-    "method",
-    "software",
-    "configuration_sha256",
-    "created",
-    "entered",
-    "digest",
+    *("axis", "recorded", "gain", "std", "unit", "nameplate", "change_percent", "change_sigmas", "change_probability"),
+    *("deviation_sigmas", "cusum_up", "cusum_down", "trend_sigmas", "alarm", "baseline"),
+    *("applied_at", "applied_by", "applied_to", *_FIT, "created", "entered", "digest"),
 )
 
 
@@ -191,9 +142,7 @@ def _row(series: Series, index: int) -> dict[str, Any]:
         "axis": series.axis,
         "recorded": entry.recorded.isoformat(),
         "gain": gain.value,
-        "std": gain.std,
-        "unit": gain.unit,
-        "nameplate": gain.nameplate,
+        **picked(gain, "std", "unit", "nameplate"),
         "change_percent": None if change is None else change.percent,
         "change_sigmas": None if change is None else change.sigmas,
         "change_probability": None if change is None else change.probability,
@@ -206,12 +155,7 @@ def _row(series: Series, index: int) -> dict[str, Any]:
         "applied_at": None if last is None else last.at.isoformat(),
         "applied_by": None if last is None else last.who,
         "applied_to": None if last is None else last.target,
-        "error_percent": entry.error_percent,
-        "holdout_percent": entry.holdout_percent,
-        "rows": entry.rows,
-        "method": entry.method,
-        "software": entry.software,
-        "configuration_sha256": entry.configuration_sha256,
+        **picked(entry, *_FIT),
         "created": entry.created.isoformat(),
         "entered": entry.entered.isoformat(),
         "digest": entry.digest,

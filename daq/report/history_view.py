@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -16,10 +15,10 @@ from daq.ledger.audit import AuditEntry
 from daq.ledger.entry import Entry, Event, WriteAction
 from daq.ledger.ledger import Verification
 from daq.ledger.store import HistoryStore
-from daq.ledger.watch import Point, Series, alarm_text, pattern_of, questions
+from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.history import rows
-from daq.report.text import printable
+from daq.report.text import picked, plain_table, printable
 from daq.writeback.drive_record import drives_of
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
@@ -68,25 +67,27 @@ def say_alarms(all_series: Sequence[Series], console: Console) -> None:
 
 def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]) -> Table:
     """One row a calibration."""
-    table = _table("recorded (UTC)", "calibration")
-    table.add_column("error %", justify="right", no_wrap=True)
-    table.add_column("largest change", justify="right", no_wrap=True)
-    table.add_column("alarms", no_wrap=True)
-    table.add_column("applied")
-    changes = {
-        (series.axis, point.entry.digest): (index, point)
-        for series in all_series
-        for index, point in enumerate(series.points)
-    }
+    headings = ("recorded (UTC)", "calibration", "error %", "largest change", "alarms", "applied")
+    table = plain_table(headings, left=(0, 1, 4, 5), wrap=(5,))
     for entry in sorted(entries, key=lambda one: one.recorded):
-        points = [(s, *changes[s.axis, entry.digest]) for s in all_series if (s.axis, entry.digest) in changes]
-        alarms = [s.axis for s, index, _ in points if s.alarm_at(index) is not None]
+        points = [
+            (series, index, point)
+            for series in all_series
+            for index, point in enumerate(series.points)
+            if point.entry.digest == entry.digest
+        ]
+        alarms = [series.axis for series, index, _ in points if series.alarm_at(index) is not None]
+        changes = [(point.change, point.gain.axis) for _, _, point in points if point.change is not None]
+        largest = "-"
+        if changes:
+            change, axis = max(changes, key=lambda pair: abs(pair[0].sigmas))
+            largest = f"{printable(axis)} {change.percent:+.1f} % {abs(change.sigmas):.1f} σ"
         error = entry.error_percent if entry.holdout_percent is None else entry.holdout_percent
         table.add_row(
             f"{entry.recorded:%Y-%m-%d %H:%M}",
             entry.digest[:8],
             f"{error:.2f}",
-            _largest([point for _, _, point in points]),
+            largest,
             ", ".join(alarms) or "-",
             printable(actions[entry.digest]),
         )
@@ -95,17 +96,15 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
 
 def gain_table(all_series: Sequence[Series]) -> Table:
     """Each gain as it was found last, beside its baseline."""
-    table = _table("axis")
-    for heading in ("gain ± σ", "nameplate", "since baseline %", "σ", "state"):
-        table.add_column(heading, justify="left" if heading == "state" else "right", no_wrap=True)
-    table.add_column("unit", no_wrap=True)
+    headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
+    table = plain_table(headings, left=(0, 5, 6))
     for series in all_series:
         if not series.points:
             table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
             continue
-        gain, drift = series.points[-1].gain, series.drift
+        gain = series.points[-1].gain
         count = len(series.points) - series.began
-        known = drift is not None and count > 1
+        drift = series.drift if count > 1 else None
         state = (
             "ALARM" if series.alarmed else "ok" if count > CHART.baseline else f"baseline: {count} of {CHART.baseline}"
         )
@@ -113,8 +112,8 @@ def gain_table(all_series: Sequence[Series]) -> Table:
             printable(series.axis),
             with_deviation(gain.value, gain.std),
             f"{gain.nameplate:.4g}",
-            f"{drift.change_percent:+.2f}" if drift is not None and known else "-",
-            f"{abs(drift.change_sigmas):.1f}" if drift is not None and known else "-",
+            "-" if drift is None else f"{drift.change_percent:+.2f}",
+            "-" if drift is None else f"{abs(drift.change_sigmas):.1f}",
             state,
             printable(series.unit),
         )
@@ -123,12 +122,8 @@ def gain_table(all_series: Sequence[Series]) -> Table:
 
 def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
     """Every calibration of one gain, with the two sums and the slope that are watched."""
-    table = _table("recorded (UTC)")
-    headings = (f"{printable(series.axis)} [{printable(series.unit)}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("alarm", no_wrap=True)
-    table.add_column("applied")
+    figures = (f"{series.axis} [{series.unit}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
+    table = plain_table(("recorded (UTC)", *figures, "alarm", "applied"), left=(0, 7, 8), wrap=(8,))
     for index, point in enumerate(series.points):
         stretch = series.stretch_at(index)
         place = index - stretch.began
@@ -147,39 +142,26 @@ def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
     return table
 
 
+_DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
+
+
 def describe(
-    cell: str,
-    entries: Sequence[Entry],
-    chosen: Sequence[Series],
-    all_series: Sequence[Series],
-    in_force: str | None,
+    cell: str, entries: Sequence[Entry], chosen: Sequence[Series], all_series: Sequence[Series], in_force: str | None
 ) -> dict[str, Any]:
     """All of it for --json; `chosen` are the axes that were asked for."""
     return {
         "cell": cell,
         "calibrations": len(entries),
         "in_force": in_force,
-        "chart": {
-            "reference": CHART.reference,
-            "threshold": CHART.threshold,
-            "single": CHART.single,
-            "trend": CHART.trend,
-            "baseline": CHART.baseline,
-        },
+        "chart": picked(CHART, "reference", "threshold", "single", "trend", "baseline"),
         "pattern": pattern_of(all_series).value,
         "questions": list(questions(all_series)),
         "axes": [
             {
-                "axis": series.axis,
-                "unit": series.unit,
-                "dispersion": series.dispersion,
-                "alarmed": series.alarmed,
+                **picked(series, "axis", "unit", "dispersion", "alarmed"),
                 "alarm": alarm_text(series),
                 "since": None if series.onset is None else series.onset.isoformat(),
-                "change_percent": None if series.drift is None else series.drift.change_percent,
-                "change_sigmas": None if series.drift is None else series.drift.change_sigmas,
-                "baseline": None if series.drift is None else series.drift.baseline,
-                "baseline_std": None if series.drift is None else series.drift.baseline_std,
+                **(dict.fromkeys(_DRIFT) if series.drift is None else picked(series.drift, *_DRIFT)),
                 "acknowledged": [
                     {"since": a.since.isoformat(), "at": a.at.isoformat(), "who": a.who, "why": a.why}
                     for a in series.acknowledged
@@ -230,22 +212,6 @@ def _described(entry: AuditEntry) -> dict[str, Any]:
     return {"number": entry.number, "at": entry.at, "who": entry.who, "file": entry.subject}
 
 
-def _table(*first: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for heading in first:
-        table.add_column(heading, no_wrap=True)
-    return table
-
-
-def _largest(points: Sequence[Point]) -> str:
-    changes = [(abs(point.change.sigmas), point) for point in points if point.change is not None]
-    if not changes:
-        return "-"
-    sigmas, point = max(changes, key=lambda pair: pair[0])
-    percent = 0.0 if point.change is None else point.change.percent
-    return f"{printable(point.gain.axis)} {percent:+.1f} % {sigmas:.1f} σ"
-
-
 _WORDS = {WriteAction.APPLIED: "applied", WriteAction.ROLLED_BACK: "restored"}
 """Words for an event after which a controller had the gains of a calibration."""
 
@@ -279,43 +245,31 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
 
 
 def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
-    """Return the writes of each calibration in words, by its digest.
-
-    Args:
-        entries: the calibrations.
-        events: of all controllers, oldest first.
-        digest_in_force: see `in_force`.
-    """
-    return {entry.digest: _words(entry.digest, events, digest_in_force) for entry in entries}
-
-
-def _words(digest: str, events: Sequence[Event], digest_in_force: str | None) -> str:
-    mine = [place for place, event in enumerate(events) if event.digest == digest]
-    parts = []
-    if mine:
-        last = events[mine[-1]]
-        parts.append(f"{_WORDS[last.action]} by {last.who}")
-        then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
-        if then is not None and then.action is WriteAction.ROLLED_BACK:
-            parts.append(f"rolled back by {then.who}")
-    if digest == digest_in_force:
-        parts.append("in force")
-    return ", ".join(parts) or "-"
+    """Return the writes of each calibration in words, by its digest; events are of all controllers, oldest first."""
+    described = {}
+    for entry in entries:
+        parts = []
+        mine = [place for place, event in enumerate(events) if event.digest == entry.digest]
+        if mine:
+            last = events[mine[-1]]
+            parts.append(f"{_WORDS[last.action]} by {last.who}")
+            then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
+            if then is not None and then.action is WriteAction.ROLLED_BACK:
+                parts.append(f"rolled back by {then.who}")
+        if entry.digest == digest_in_force:
+            parts.append("in force")
+        described[entry.digest] = ", ".join(parts) or "-"
+    return described
 
 
 def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
     """Whether a write of this calibration would change no number."""
-    gains = {gain.axis: gain for gain in entry.gains}
-    if gains.keys() != numbers.keys():
+    if {gain.axis for gain in entry.gains} != numbers.keys():
         return False
-    for axis, (scalar, factor) in numbers.items():
-        gain = gains[axis]
-        if not (math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value):
-            return False
-        try:
-            put = rewrite_gain(scalar, gain.value, gain.std, factor)
-        except ControllerUnfit:
-            return False
-        if put.new != put.old:
-            return False
-    return True
+    if not all(math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value for gain in entry.gains):
+        return False
+    try:
+        put = [rewrite_gain(numbers[gain.axis][0], gain.value, gain.std, numbers[gain.axis][1]) for gain in entry.gains]
+    except ControllerUnfit:
+        return False
+    return all(one.new == one.old for one in put)
