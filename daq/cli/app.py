@@ -39,7 +39,7 @@ VERBS = (
     Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
     Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
     Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
-    Listed("rollback", "daq.cli.rollback:ROLLBACK", "Undo the last write."),
+    Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
     Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
     Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."),

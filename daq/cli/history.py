@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, say_written, writing
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.cli.writing import applier
 from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
 from daq.report.text import printable
 

@@ -63,7 +63,7 @@ def simulate(
     from dataclasses import replace
     from functools import partial
 
-    from daq.cli.terminal import interruptible
+    from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
     from drivers.canopen.bus import BusAddress, open_answering_bus
     from drivers.canopen.hub import Hub
@@ -72,10 +72,7 @@ def simulate(
     require_simulator()
     from drivers.simulation.cell import SimulatedCell
 
-    if payload is not None and payload_from is not None:
-        raise UsageError(
-            "--payload-from", found="--payload beside it", expected="one of the two", remedy="leave out one of them"
-        )
+    at_most_one(payload_from=payload_from, payload=payload)
     shipped = simulation.name in _SHIPPED and not simulation.exists()
     truth = shipped_simulation(simulation.name) if shipped else simulation
     mounted = None if payload_from is None else MountedFile(payload_from, partial(load_simulation, truth), _complain)

@@ -72,13 +72,22 @@ def one_of(remedy: str, **options: object) -> None:
     Raises:
         UsageError: none, or more than one, is given.
     """
-    given = [name for name, value in options.items() if value]
-    if len(given) != 1:
+    if not any(options.values()):
+        names = ", ".join(f"--{name}" for name in options)
+        raise UsageError(names, found="neither", expected="one of them", remedy=remedy)
+    at_most_one(**options)
+
+
+def at_most_one(**options: object) -> None:
+    """Refuse options that exclude each other, by their names on the command line.
+
+    Raises:
+        UsageError: more than one is given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
+    if len(given) > 1:
         raise UsageError(
-            ", ".join(f"--{name}" for name in options),
-            found="both" if given else "neither",
-            expected="one of them",
-            remedy=remedy,
+            given[0], found=f"{', '.join(given[1:])} beside it", expected="one at most", remedy="leave out all but one"
         )
 
 

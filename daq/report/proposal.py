@@ -194,11 +194,6 @@ def _place(edit: Edit) -> str:
     return "in the drive" if isinstance(edit, DriveEdit) else "in the file"
 
 
-def significant(changes: Sequence[GainChange], known: Known = NOTHING) -> frozenset[str]:
-    """Axes whose gain differs from the controller's by more than noise."""
-    return frozenset(axis for axis, (_, beyond_noise) in _by_axis(changes, known).items() if beyond_noise)
-
-
 def _by_axis(changes: Sequence[GainChange], known: Known) -> dict[str, tuple[float, bool]]:
     """Change in σ of both as calibrations scatter, and whether it is more than noise; of comparable axes."""
     found = judge(changes, known)

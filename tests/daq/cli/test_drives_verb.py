@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from daq.cli.rollback import rollback_drives
-from daq.cli.writing import saving_of
+from daq.cli.apply import rollback_drives, saving_of
 from daq.config.cell import Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
