@@ -147,8 +147,8 @@ def _fit_cases(
 
     from daq.cli.terminal import check_output, print_view, status, writing
     from daq.files import replace_file
-    from daq.report.fit import case_tables, cases_document, cases_view
-    from daq.report.paper_tables import page
+    from daq.report.fit import cases_document, cases_view
+    from daq.report.paper_tables import case_tables, page
     from daq.workflow.calibration_file import save
     from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
 

@@ -16,22 +16,13 @@ from daq.jobs.cell_fit import Failure
 from daq.jobs.fleet import FleetRow
 from daq.jobs.fleet_survey import Summary
 from daq.report.gains import with_deviation
-from daq.report.text import inert, inert_row, printable, spelled_bytes
+from daq.report.text import inert, inert_row, picked, printable, spelled_bytes
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
 LAST_COLUMNS = (
-    "worst_axis",
-    "worst_std_percent",
-    "error_percent",
-    "error_on",
-    "effects",
-    "partial",
-    "seconds",
-    "exit_code",
-    "error_kind",
-    "error",
-    "calibration",
+    *("worst_axis", "worst_std_percent", "error_percent", "error_on", "effects", "partial"),
+    *("seconds", "exit_code", "error_kind", "error", "calibration"),
 )
 
 
@@ -172,10 +163,4 @@ def _measured_on(summary: Summary) -> str:
 
 
 def _gain(gain: Gain) -> dict[str, Any]:
-    return {
-        "axis": gain.axis,
-        "value": gain.value,
-        "std": gain.std,
-        "std_percent": gain.std_percent,
-        "unit": gain.unit,
-    }
+    return picked(gain, "axis", "value", "std", "std_percent", "unit")

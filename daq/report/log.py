@@ -17,7 +17,7 @@ from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
 from daq.log.reader import LogHead, LogReader
 from daq.report.bus import current_signals
-from daq.report.text import printable
+from daq.report.text import picked, printable
 from drivers.stream.sample import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
@@ -51,11 +51,8 @@ def describe_log(path: Path) -> dict[str, Any]:
         "axes": list(cell.axis_names),
         "current": current_signals(cell),
         "role": run.role.value,
-        "payload": None
-        if run.payload is None
-        else {"name": run.payload.name, "mounting": run.payload.mounting, "known": run.payload.known},
-        "rate_hz": run.rate_hz,
-        "speed": run.speed,
+        "payload": None if run.payload is None else picked(run.payload, "name", "mounting", "known"),
+        **picked(run, "rate_hz", "speed"),
         "samples": samples,
         "duration_s": samples / run.rate_hz,
         "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
@@ -63,15 +60,13 @@ def describe_log(path: Path) -> dict[str, Any]:
         "lost_cycles": statistics.lost_cycles,
         "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
         "partial": reader.partial,
-        "valid": statistics.valid,
-        "reason": statistics.reason,
+        **picked(statistics, "valid", "reason"),
         "events": [
             {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
             for e in reader.events
             if e.kind not in _ROUTINE
         ],
-        "operator": run.operator,
-        "software": run.software,
+        **picked(run, "operator", "software"),
         "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
         "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
         "wall_clock_step_s": None
