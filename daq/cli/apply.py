@@ -38,15 +38,10 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger("drivegain")
 
 ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator for the audit; by default the login.")]
-DrivesOption = Annotated[
-    bool,
-    typer.Option("--drives", help="The drives' objects that the cell names, not the controller's file."),
-]
-RamOnlyOption = Annotated[
-    bool, typer.Option("--ram-only", help="Do not let the drives save: the gains are lost when they lose power.")
-]
+DrivesOption = Annotated[bool, typer.Option("--drives", help="The objects in the drives, not the controller's file.")]
+RamOnlyOption = Annotated[bool, typer.Option("--ram-only", help="Do not save: a power cycle loses the gains.")]
 SaveUnknownOption = Annotated[
-    bool, typer.Option("--save-unknown", help="Let drives save even if it is unknown what they save.")
+    bool, typer.Option("--save-unknown", help="Save even if it is unknown what a drive saves.")
 ]
 
 
@@ -56,25 +51,19 @@ def apply_verb(
     to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
     base: Annotated[
-        str | None, typer.Option("--base", help="Write only the change whose dry run printed this BEFORE-AFTER.")
+        str | None, typer.Option("--base", help="Write only the change with this BEFORE-AFTER of its dry run.")
     ] = None,
     by: ByOption = None,
     payload_mass: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=KG: mass of a payload from the scale, where `record --mass` was not given."),
+        list[str] | None, typer.Option(help="NAME=KG from the scale, for a payload recorded without --mass.")
     ] = None,
-    max_change_percent: Annotated[
-        float | None, typer.Option(help="Largest change from the gain in the file; at most the cell's.", min=0.0)
-    ] = None,
+    max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None,
     max_nameplate_percent: Annotated[
-        float | None, typer.Option(help="Largest distance from the nameplate; at most the cell's.", min=0.0)
+        float | None, typer.Option(help="Tighter bound on the distance from the nameplate [%].", min=0.0)
     ] = None,
-    max_std_percent: Annotated[
-        float | None, typer.Option(help="Largest standard deviation of a gain; at most the cell's.", min=0.0)
-    ] = None,
+    max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None,
     configuration_changed: Annotated[
-        bool,
-        typer.Option("--configuration-changed", help="Accept a cell configuration that changed since the recording."),
+        bool, typer.Option("--configuration-changed", help="Accept a cell file that changed since the recording.")
     ] = False,
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
@@ -250,16 +239,12 @@ APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells
 
 def rollback(
     cell: Annotated[Path | None, typer.Option(help="Cell file; it names the controller file and the audit.")] = None,
-    to: Annotated[
-        Path | None, typer.Option("--to", help="Controller file to restore, instead of the one that the cell names.")
-    ] = None,
+    to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
     by: ByOption = None,
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
     save_unknown: SaveUnknownOption = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="With --drives: write; without it the rollback is only shown.")
-    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --drives: write, not only show.")] = False,
     audit: Annotated[Path | None, typer.Option("--audit", help="Audit file, where no --cell names it.")] = None,
     json: JsonOption = False,
 ) -> None:

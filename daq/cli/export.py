@@ -25,9 +25,7 @@ def export_log_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
     out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.")],
     csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
-    parquet: Annotated[
-        bool, typer.Option("--parquet", help="Apache Parquet; needs pip install 'drivegain[parquet]'.")
-    ] = False,
+    parquet: Annotated[bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")] = False,
     json: JsonOption = False,
 ) -> None:
     """Write the samples of a log into a table: a row per SYNC, joint positions and currents in SI beside raw numbers.

@@ -31,8 +31,7 @@ class Gains(Enum):
 
 LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
 HoldoutOption = Annotated[
-    list[Path] | None,
-    typer.Option("--holdout", help="Held-out log, for the final error; repeatable."),
+    list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
 PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is created.")]
@@ -44,10 +43,7 @@ AcceptLossesOption = Annotated[
     ),
 ]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
-KnownOption = Annotated[
-    Known,
-    typer.Option(help="Known of the payload: its weighed mass; with cad also centre and inertia from the cell file."),
-]
+KnownOption = Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")]
 EssentialOption = Annotated[
     float | None,
     typer.Option(
@@ -56,8 +52,7 @@ EssentialOption = Annotated[
     ),
 ]
 CasesOption = Annotated[
-    Path | None,
-    typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml, a file each."),
+    Path | None, typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.")
 ]
 CompareOption = Annotated[
     bool,

@@ -24,9 +24,7 @@ def fleet_verb(
         int | None,
         typer.Option(min=1, help="Cells fitted at a time; by default one per processor or thread of the scheduler."),
     ] = None,
-    residual: Annotated[
-        bool, typer.Option("--residual", help="Also detect and add missing effects in every cell: slow.")
-    ] = False,
+    residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
     out: Annotated[
         Path | None,
         typer.Option(

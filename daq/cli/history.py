@@ -35,23 +35,16 @@ def history_verb(
     csv: Annotated[Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
-        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained: a new baseline begins.")
+        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
     ] = None,
-    by: Annotated[
-        str | None, typer.Option("--by", help="With --acknowledge: who explains it; you, by default.")
-    ] = None,
+    by: Annotated[str | None, typer.Option("--by", help="With --acknowledge: who explains it; you by default.")] = None,
     why: Annotated[str | None, typer.Option("--why", help="With --acknowledge: what happened.")] = None,
     since: Annotated[
-        str | None,
-        typer.Option("--since", metavar="DATE", help="With --acknowledge: first day that counts for the new baseline."),
+        str | None, typer.Option("--since", metavar="DATE", help="With --acknowledge: first day of the baseline.")
     ] = None,
-    verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Check audit and history, by themselves and together; exit code 4 if broken."),
-    ] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Check audit and history; exit code 4 if broken.")] = False,
     rebuild: Annotated[
-        bool,
-        typer.Option("--rebuild", help="Make the history anew from the audit; the old file is kept beside it."),
+        bool, typer.Option("--rebuild", help="Rebuild it from the audit; the old file is kept.")
     ] = False,
     json: JsonOption = False,
 ) -> None:

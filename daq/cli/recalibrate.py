@@ -19,16 +19,8 @@ if TYPE_CHECKING:
 
 def recalibrate_verb(
     cell: Annotated[Path, typer.Option(help="Cell file; `recalibration` and `policy` configure the job.")],
-    dry_run: Annotated[
-        bool,
-        typer.Option(
-            "--dry-run", help="Query interlock and drives and show the next steps; nothing is moved or written."
-        ),
-    ] = False,
-    now: Annotated[
-        bool,
-        typer.Option("--now", help="Run even if the last good calibration is recent: a motor was replaced."),
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the next steps; move and write nothing.")] = False,
+    now: Annotated[bool, typer.Option("--now", help="Run even if the last good calibration is recent.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Record, fit, decide, and propose or apply, unattended, for a timer. Events go to stderr, a line each.
@@ -105,14 +97,9 @@ _SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
 def install_units(
     cell: Annotated[Path, typer.Option(help="Cell file with `recalibration`.")],
-    to: Annotated[
-        Path | None,
-        typer.Option("--to", help="Folder of the units; by default /etc/systemd/system, or the user's with --user."),
-    ] = None,
+    to: Annotated[Path | None, typer.Option("--to", help="Folder of the units, by default that of systemd.")] = None,
     user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
-    schedule: Annotated[
-        str, typer.Option(help="When: weekly, daily, or a calendar expression of systemd such as 'Sun 03:00'.")
-    ] = "weekly",
+    schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
     cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Write the units; without it they are only shown.")] = False,
 ) -> None:

@@ -31,17 +31,9 @@ def record_verb(
         ),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
-    mass: Annotated[
-        float | None,
-        typer.Option(
-            help="Mass of the payload [kg], read off the scale now; it must agree with the cell file.", min=0.0
-        ),
-    ] = None,
+    mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
     operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None,
-    speed: Annotated[
-        float,
-        typer.Option(help="Share of the plan's speed, for a first run; it is kept in the log.", min=0.05, max=1.0),
-    ] = 1.0,
+    speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0,
     json: JsonOption = False,
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
@@ -218,9 +210,7 @@ def plan_verb(
         float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
     ] = 1.0,
     condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
-    sigma: Annotated[
-        float, typer.Option(help="Largest standard deviation predicted for a gain [%].", min=0.01)
-    ] = LARGEST_STD_PERCENT,
+    sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,
 ) -> None:
     """Choose point-to-point moves that identify the worst gain as precisely as the time allows.

@@ -26,18 +26,12 @@ def residual_verb(
     logs: LogsArgument,
     gains: GainsOption = Gains.FREE,
     holdout: HoldoutOption = None,
-    seed: Annotated[
-        int, typer.Option(help="Seed of the significance test; the same seed gives the same verdict.", min=0)
-    ] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0,
     out: OutOption = None,
-    report: Annotated[
-        Path | None,
-        typer.Option("--report", help="Folder for report.html and residual.json; an earlier report is replaced."),
-    ] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html and residual.json.")] = None,
     pictures: PicturesOption = None,
     leave_out_runs: Annotated[
-        bool,
-        typer.Option("--leave-out-runs", help="Also refit without each run in turn, and predict that run: slow."),
+        bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
     ] = False,
     cell: CellOption = None,
     accept_losses: AcceptLossesOption = False,

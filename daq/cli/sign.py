@@ -22,9 +22,7 @@ def sign_verb() -> None:
 def sign_key_verb(
     name: Annotated[str, typer.Option("--name", help="Name of the person, as in the cell file.")],
     folder: Annotated[Path, typer.Option("--folder", help="Folder for NAME.key and NAME.pub.")] = Path(),
-    no_password: Annotated[
-        bool, typer.Option("--no-password", help="Make a key that only its file permissions protect.")
-    ] = False,
+    no_password: Annotated[bool, typer.Option("--no-password", help="Only its file's permissions protect it.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Make a key pair: NAME.key is secret and stays with the person, the public key goes into the cell file."""

@@ -29,13 +29,8 @@ def simulate(
         typer.Argument(help="Simulation file, the truth of a cell; or demo or clean, shipped with drivegain."),
     ],
     payload: Annotated[str | None, typer.Option(help="Name of the mounted body in the simulation file.")] = None,
-    faults: Annotated[
-        Path | None,
-        typer.Option(help="Scenario file of faults and their times; or faults-example, which lists all kinds."),
-    ] = None,
-    interface: Annotated[
-        str, typer.Option(help="socketcand starts a hub on 127.0.0.1; socketcan uses a real or virtual CAN.")
-    ] = "socketcand",
+    faults: Annotated[Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")] = None,
+    interface: Annotated[str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")] = "socketcand",
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "can0",
     bus: Annotated[
         list[str] | None,
