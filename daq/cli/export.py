@@ -98,11 +98,7 @@ def export_urdf_verb(
 
 
 def require_good(calibration: Calibration, name: str) -> None:
-    """Refuse a calibration that explains too little of the torque to derive bodies from it.
-
-    Raises:
-        ModelContradicted: the calibration's relative error is above DOUBTFUL_PERCENT.
-    """
+    """Refuse a calibration that explains too little of the torque to derive bodies from it."""
     from daq.workflow.fit import DOUBTFUL_PERCENT
 
     left = calibration.relative_error_percent.total
@@ -161,11 +157,7 @@ def _plain(urdf: str) -> tuple[Model, FloatArray]:
 
 
 def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
-    """Write the URDF whole or not at all, after reading it back as a robot with these links.
-
-    Raises:
-        OutputFailed: the file system refuses, or the file reads back with other inertias.
-    """
+    """Write the URDF whole or not at all, after reading it back as a robot with these links."""
     import numpy as np
 
     from daq.cli.terminal import writing

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.verb import CellOption, JsonOption, Verb, print_json
-from daq.errors import UsageError
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -84,7 +83,7 @@ def fit_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status
+    from daq.cli.terminal import at_most_one, check_output, print_view, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import fit_document, fit_view
@@ -92,7 +91,8 @@ def fit_verb(
     from daq.workflow.fit import check_explained, compare_estimators, fit
 
     if cases is not None:
-        _require_cases_alone(method is not None or known is not Known.MASS or gains is not Gains.FREE, out, pictures)
+        other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own
+        at_most_one(cases=cases, method=method, **other, out=out, pictures=pictures)
         _fit_cases(logs, holdout or (), None if cell is None else load_cell(cell), essential, cases, json=json)
         return
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
@@ -122,16 +122,6 @@ def fit_verb(
         print_json(fit_document(found, calibration, comparison))
     else:
         print_view(fit_view(found, calibration, comparison), out, pictures)
-
-
-def _require_cases_alone(chosen: bool, out: Path | None, pictures: Path | None) -> None:
-    if chosen or out is not None or pictures is not None:
-        raise UsageError(
-            "--cases",
-            found="--method, --gains, --known, --out or --pictures beside it",
-            expected="none of them: every case has its own, and a file in the folder",
-            remedy="leave them out, or fit one case without --cases",
-        )
 
 
 def _fit_cases(
@@ -173,11 +163,7 @@ def _fit_cases(
 
 
 def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file whole or not at all.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
+    """Write a calibration file whole or not at all."""
     from daq.cli.terminal import writing
     from daq.workflow.calibration_file import save
 
@@ -186,11 +172,7 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
 
 
 def save_pictures(fitted: Fit, calibration: Calibration, folder: Path) -> None:
-    """Draw torques, gains, and the residual before and after each effect.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
+    """Draw torques, gains, and the residual before and after each effect."""
     from daq.cli.terminal import writing
     from daq.report.plots import draw_fit
 

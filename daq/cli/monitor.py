@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,7 +12,6 @@ from daq.cli.verb import CellArgument, JsonOption, Verb, print_json
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from drivers.canopen.network import CanopenNetwork
-    from drivers.profiles.profile import Axis
 
 _SHOWN_EVENTS = 5
 
@@ -39,6 +38,7 @@ def monitor_verb(
     from daq.report.bus import monitor_view
     from drivers.canopen.network import CanopenNetwork
     from drivers.canopen.sdo import SdoPolicy
+    from drivers.errors import NodeMissing
     from drivers.stream.monitor import QUIET_S
 
     declared = load_cell(cell)
@@ -56,7 +56,10 @@ def monitor_verb(
                 print_json(document)
             else:
                 console.print(monitor_view(document))
-            _require_all(network.axes, document, QUIET_S + interval)
+            silent = [axis for axis, shown in zip(network.axes, document["axes"], strict=True) if shown["silent"]]
+            heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
+            if silent:
+                raise NodeMissing(silent, heard, QUIET_S + interval)
             return
         with Live(console=console, auto_refresh=False, screen=False) as live:
             for document in readings:
@@ -92,20 +95,6 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
                     ampere[axis] = read_scale(access, network.axes[axis].profile).ampere_per_unit
         event_lines.extend(event.text for event in reading.events)
         yield monitor_document(cell, reading, ampere, list(event_lines))
-
-
-def _require_all(axes: Sequence[Axis], document: dict[str, Any], waited_s: float) -> None:
-    """Fail where an axis was silent in the only reading.
-
-    Raises:
-        NodeMissing: an axis was silent.
-    """
-    from drivers.errors import NodeMissing
-
-    silent = [axis for axis, shown in zip(axes, document["axes"], strict=True) if shown["silent"]]
-    heard = tuple(axis["node_id"] for axis in document["axes"] if not axis["silent"])
-    if silent:
-        raise NodeMissing(silent, heard, waited_s)
 
 
 MONITOR = Verb("monitor", monitor_verb, "drivegain monitor cells/demo.yaml")

@@ -79,15 +79,7 @@ def residual_verb(
 
 
 def check_report(folder: Path | None) -> None:
-    """Create the folder of a report before any long work, and refuse one with other files of the same names.
-
-    Args:
-        folder: None where no report is written.
-
-    Raises:
-        UsageError: a file of the same name is no earlier report.
-        OutputFailed: the folder cannot be created or written.
-    """
+    """Create the folder of a report before any long work, and refuse one with other files of the same names."""
     from tempfile import TemporaryFile
 
     from daq.cli.terminal import check_replaceable, writing

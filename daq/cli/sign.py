@@ -29,7 +29,17 @@ def sign_key_verb(
     from daq.cli.terminal import print_view
     from daq.writeback.signature import generate
 
-    password = "" if no_password else _new_password()
+    password = "" if no_password else _password()
+    again = password
+    if not no_password and sys.stdin.isatty():
+        again = typer.prompt("Repeat the password", hide_input=True, err=True)
+    if password != again or not (password or no_password):
+        raise UsageError(
+            "password",
+            found="two that differ" if password else "none",
+            expected="the same twice",
+            remedy="try again, or use --no-password for a key that only its file permissions protect",
+        )
     secret, public = generate(folder, name, password)
     if json:
         print_json({"name": name, "secret_key": str(secret), "public_key": public.line})
@@ -83,19 +93,6 @@ def sign_check_verb(
     print_view(
         [f"Signed by: {signed}.", f"Signatures required by the cell: {policy.signatures}, not counting the applier's."]
     )
-
-
-def _new_password() -> str:
-    first = _password()
-    again = typer.prompt("Repeat the password", hide_input=True, err=True) if sys.stdin.isatty() else first
-    if not first or first != again:
-        raise UsageError(
-            "password",
-            found="none" if not first else "two that differ",
-            expected="the same twice",
-            remedy="try again, or use --no-password for a key that only its file permissions protect",
-        )
-    return first
 
 
 def _password() -> str:
