@@ -43,16 +43,17 @@ def recalibrate_verb(
         journal.say(Level.ERROR, "interrupted", axes="; ".join(notes) or "stopped")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except (DaqError, DriverError, IdentificationError) as error:
-        journal.say(Level.ERROR, "failed", error=type(error).__name__, text=str(error), notes=error_notes(error))
+        journal.say(
+            Level.ERROR,
+            "failed",
+            error=type(error).__name__,
+            text=str(error),
+            notes=list(getattr(error, "__notes__", ())),
+        )
         if journal.form is Form.TEXT:
             raise
         # A program reads stderr, and the message for the terminal is no line of JSON.
         raise typer.Exit(exit_code(type(error)) or ExitCode.UNEXPECTED) from error
-
-
-def error_notes(error: BaseException) -> list[str]:
-    """Return the notes of an error."""
-    return list(getattr(error, "__notes__", ()))
 
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
@@ -139,11 +140,7 @@ def install_units(
 
 
 def program() -> Path:
-    """Return the path of the command that the timer calls.
-
-    Raises:
-        UsageError: drivegain is not installed as a command.
-    """
+    """Return the path of the command that the timer calls."""
     import shutil
 
     beside = Path(sys.executable).parent / "drivegain"
@@ -167,11 +164,7 @@ def owner_of(path: Path) -> str:
 
 
 def check_schedule(schedule: str) -> None:
-    """Check a calendar expression with systemd, where this computer has it.
-
-    Raises:
-        UsageError: it is no calendar expression.
-    """
+    """Check a calendar expression with systemd, where this computer has it."""
     import shutil
     import subprocess
 
@@ -192,35 +185,23 @@ def check_schedule(schedule: str) -> None:
 
 
 def require_own_unit(path: Path, option: str = "") -> None:
-    """Refuse to replace a file that this verb did not write, or that it wrote for another cell.
-
-    Args:
-        path: of the unit.
-        option: text that a unit of this cell contains.
-
-    Raises:
-        UsageError: the file is not ours.
-    """
+    """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
     from daq.cli.terminal import writing
     from daq.jobs.units import MARK
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
-    if (text is None and path.exists()) or (text is not None and not text.startswith(MARK)):
-        raise UsageError(
-            str(path),
-            found="a unit that drivegain did not write",
-            expected="no such file, or one of an earlier `install-units`",
-            remedy="name another folder with --to, or move it away",
-        )
-    if text is not None and option not in text:
-        raise UsageError(
-            str(path),
-            found="the unit of another cell file",
-            expected=f"no such file, or one with {option}",
-            remedy="name another folder with --to, or remove it if the cell file has moved",
-        )
+    if text is None and not path.exists():
+        return
+    found, expected = "", ""
+    if text is None or not text.startswith(MARK):
+        found, expected = "a unit that drivegain did not write", "one of an earlier `install-units`"
+    elif option not in text:
+        found, expected = "the unit of another cell file", f"one with {option}"
+    if found:
+        remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
+        raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
 INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units --cell cells/demo.yaml --schedule weekly")

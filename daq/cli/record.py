@@ -91,8 +91,7 @@ def record_verb(
             error.add_note(
                 f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
             )
-        lost = isinstance(error, SampleLost)
-        if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
+        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
                 "lockstep` in the cell file; on a real cell, check the load of bus and computer"
@@ -115,11 +114,7 @@ def record_verb(
 
 
 def _free(out: Path) -> Path:
-    """Return the file in which the log grows until it is finished; called before the bus is used.
-
-    Raises:
-        UsageError: the log exists, or an unfinished recording of that name.
-    """
+    """Return the file in which the log grows until it is finished, before the bus is used; neither may exist."""
     part = out.with_name(out.name + ".part")
     if out.exists():
         raise UsageError(
@@ -174,20 +169,14 @@ def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:
-    """Return the payload of that name.
-
-    Raises:
-        UsageError: the cell declares no such payload.
-    """
-    if name is None:
-        return None
-    for candidate in cell.payloads:
-        if candidate.name == name:
-            return candidate.payload
+    """Return the payload of that name."""
+    known = {payload.name: payload.payload for payload in cell.payloads}
+    if name is None or name in known:
+        return None if name is None else known[name]
     raise UsageError(
         f"payload {name!r}",
         found="no such payload in the cell file",
-        expected=", ".join(payload.name for payload in cell.payloads) or "none: the cell declares no payloads",
+        expected=", ".join(known) or "none: the cell declares no payloads",
         remedy="weigh it and add it to `payloads` of the cell file",
     )
 

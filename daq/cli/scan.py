@@ -88,11 +88,7 @@ def explain_emcy_verb(
 
 
 def read_code(text: str) -> int:
-    """Read an error code as manuals write it.
-
-    Raises:
-        UsageError: it is no hexadecimal number of at most four digits.
-    """
+    """Read an error code as manuals write it."""
     found = _HEX.fullmatch(text.strip())
     if found is None:
         raise UsageError(

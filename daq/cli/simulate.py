@@ -70,7 +70,13 @@ def simulate(
     at_most_one(payload_from=payload_from, payload=payload)
     shipped = simulation.name in _SHIPPED and not simulation.exists()
     truth = shipped_simulation(simulation.name) if shipped else simulation
-    mounted = None if payload_from is None else MountedFile(payload_from, partial(load_simulation, truth), _complain)
+    mounted = None
+    if payload_from is not None:
+        mounted = MountedFile(
+            payload_from,
+            partial(load_simulation, truth),
+            lambda error: typer.echo(f"{error}; the mounted body stays", err=True),
+        )
     spec = load_simulation(truth, payload) if mounted is None else mounted.at_power_on()
     if faults is not None:
         shipped = faults.name == _SHIPPED_FAULTS and not faults.exists()
@@ -107,18 +113,12 @@ class MountedFile:
     def __init__(
         self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
     ) -> None:
-        self._path = path
-        self._load = load
-        self._complain = complain
+        self._path, self._load, self._complain = path, load, complain
         self._name: str | None = None
         self._spec: CellSpec | None = None
 
     def at_power_on(self) -> CellSpec:
-        """Load the cell with the body that the file names now.
-
-        Raises:
-            UsageError: the simulation does not know the body.
-        """
+        """Load the cell with the body that the file names now, an unknown one being an error."""
         self._name = self._read()
         self._spec = self._load(self._name)
         return self._spec
@@ -141,20 +141,8 @@ class MountedFile:
         return None
 
 
-def _complain(error: UsageError) -> None:
-    typer.echo(f"{error}; the mounted body stays", err=True)
-
-
 def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:
-    """Read the nodes of each channel.
-
-    Args:
-        options: CHANNEL=NODE,NODE,... of each bus.
-        node_ids: of the cell; each must be on exactly one bus.
-
-    Raises:
-        UsageError: an option is malformed, or the nodes are not those of the cell.
-    """
+    """Read the nodes of each channel from CHANNEL=NODE,NODE,...; each node of the cell must be on exactly one bus."""
     there: dict[str, frozenset[int]] = {}
     for one in options:
         channel, _, nodes = one.partition("=")
@@ -183,7 +171,15 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
     pacing = "timed" if parts[0].address.interface == "socketcan" else "lockstep"
     several = len(parts) > 1
-    buses = "".join(("  - name: " + part.name + "\n" if several else "") + _keys(part, several) for part in parts)
+    buses = ""
+    for part in parts:
+        address, indent = part.address, "    " if several else "  "
+        keys = {"interface": address.interface, "channel": address.channel}
+        if address.interface == "socketcand":
+            keys |= {"host": address.host, "port": str(address.port)}
+        keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
+        buses += f"  - name: {part.name}\n" if several else ""
+        buses += "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
     nodes = "".join(
         f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n" for part in parts
     )
@@ -193,15 +189,6 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
         + (f"{nodes}\n" if several else "")
         + "and try it in a second terminal: drivegain scan CELL"
     )
-
-
-def _keys(part: BusPart, several: bool) -> str:
-    address, indent = part.address, "    " if several else "  "
-    keys = {"interface": address.interface, "channel": address.channel}
-    if address.interface == "socketcand":
-        keys |= {"host": address.host, "port": str(address.port)}
-    keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
-    return "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
 
 
 SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --faults faults-example")

@@ -68,12 +68,7 @@ def validate_verb(
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
-    """Load calibrations by label, the one to validate first; a file that is named twice counts once.
-
-    Raises:
-        CalibrationMissing: a folder holds none.
-        CalibrationUnreadable, CalibrationRefused: a file is no calibration, or was edited by hand.
-    """
+    """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
     from collections import Counter
 
     from daq.workflow.calibration_file import load

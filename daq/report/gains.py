@@ -103,8 +103,10 @@ def plot_gain_changes(changes: tuple[GainChange, ...], axes: tuple[str, ...], *,
         ("after", BLUE, "o", _BESIDE, after, np.array([c.after_std for c in changes])),
     )
     for label, colour, marker, beside, values, std in kinds:
-        look = {"fmt": marker, "color": colour, "capsize": 5, "markersize": 5, "label": f"{label} ± {_SIGMAS:g} σ"}
-        place.errorbar(places + beside, values, yerr=_SIGMAS * std * scale, **look)
+        width, name = _SIGMAS * std * scale, f"{label} ± {_SIGMAS:g} σ"
+        place.errorbar(
+            places + beside, values, yerr=width, fmt=marker, color=colour, capsize=5, markersize=5, label=name
+        )
     names = [f"{name} *" if change.significant else name for name, change in zip(axes, changes, strict=True)]
     place.set_xticks(places, [unformatted(name) for name in names])
     place.set_xlim(-0.6, len(changes) - 0.4)

@@ -158,7 +158,7 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     errors: dict[str, list[float]] = {label: [] for label in labels}
     notes = []
     for run in runs:
-        columns = []
+        columns: list[tuple[str, ...]] = []
         for label in labels:
             mass = run.masses[label]
             if isinstance(mass, Failure):

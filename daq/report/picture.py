@@ -32,13 +32,7 @@ _TITLE_AND_LEGEND_IN = 1.1
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """Make a figure of small multiples that share their horizontal axis, filled row by row.
-
-    Args:
-        count: number of panels.
-        columns: panels side by side, at most.
-        title: names what the picture shows.
-    """
+    """Make a figure of `count` small multiples that share their horizontal axis, filled row by row."""
     columns = min(columns, count)
     rows = -(-count // columns)
     figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
@@ -55,11 +49,7 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
 def grid(rows: int, widths: tuple[float, ...], title: str, height_in: float) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure whose rows share their vertical axis and whose columns share their horizontal one.
 
-    Args:
-        rows: number of rows.
-        widths: relative width of each column.
-        title: names what the picture shows.
-        height_in: of one row [inch].
+    `widths` are relative, one a column; `height_in` is that of one row [inch].
     """
     figure = _figure(title, 2 * _PANEL_IN[0], height_in * rows + _TITLE_AND_LEGEND_IN)
     places = figure.subplots(
@@ -109,35 +99,6 @@ def render(figure: Figure, kind: str = "png") -> bytes:
 def unformatted(text: str) -> str:
     """Escape dollar signs, which would begin a formula in matplotlib."""
     return text.replace("$", r"\$")
-
-
-def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tuple[FloatArray, FloatArray]:
-    """Reduce the points to draw and keep every peak: minimum and maximum of each stretch, in order of time.
-
-    Args:
-        time_s: shape (k,).
-        columns: shape (k,); NaN where there is nothing to show.
-        points: of the result, at most.
-
-    Returns:
-        times and values, both of the same length.
-    """
-    stretch = -(-2 * len(time_s) // points)
-    if stretch <= 2:
-        return time_s, columns
-    whole = len(time_s) // stretch * stretch
-    blocks = columns[:whole].reshape(-1, stretch)
-    empty = np.isnan(blocks)
-    lowest = np.where(empty, np.inf, blocks).argmin(axis=1)
-    highest = np.where(empty, -np.inf, blocks).argmax(axis=1)
-    # The later point of a stretch with a gap becomes NaN, which breaks the line there.
-    picked = np.sort(np.stack([lowest, highest], axis=1), axis=1) + stretch * np.arange(len(blocks))[:, None]
-    values = columns[picked]
-    values[empty.any(axis=1), 1] = np.nan
-    return (
-        np.concatenate([time_s[picked.ravel()], time_s[whole:]]),
-        np.concatenate([values.ravel(), columns[whole:]]),
-    )
 
 
 def _plain(place: Axes) -> None:

@@ -27,7 +27,6 @@ from daq.report.picture import (
     legend_below,
     panels,
     render,
-    thinned,
     unformatted,
 )
 from daq.workflow.fit import Fit
@@ -110,10 +109,8 @@ def plot_torques(
     units = forces or ("Nm",) * len(axes)
     for index, (name, unit, place) in enumerate(zip(axes, units, places, strict=True)):
         measured, predicted = measured_nm[:, index], predicted_nm[:, index]
-        place.plot(
-            *thinned(time_s[shown], measured[shown]), color=SKY, linewidth=2.4, label="current × identified gain"
-        )
-        place.plot(*thinned(time_s[shown], predicted[shown]), color=BLACK, linewidth=1.5, linestyle=":", label="model")
+        place.plot(time_s[shown], measured[shown], color=SKY, linewidth=2.4, label="current × identified gain")
+        place.plot(time_s[shown], predicted[shown], color=BLACK, linewidth=1.5, linestyle=":", label="model")
         both = np.isfinite(measured) & np.isfinite(predicted)
         norm = float(np.linalg.norm(measured[both]))
         # ‖ρ‖/‖Y‖ (paper, Table 6); unknown without samples.
@@ -200,7 +197,7 @@ def plot_residual(
     figure, places = grid(2, (1.7, 1.0), title, height_in=2.5)
     rows = (("without the effect", before_nm, ORANGE), ("with the effect", after_nm, BLUE))
     for (over_time, scatter), (name, residual_nm, colour) in zip(places, rows, strict=True):
-        over_time.plot(*thinned(time_s, residual_nm), color=colour, linewidth=0.8)
+        over_time.plot(time_s, residual_nm, color=colour, linewidth=0.8)
         shown = np.isfinite(residual_nm)
         rms_nm = float(np.sqrt(np.mean(residual_nm[shown] ** 2))) if shown.any() else float("nan")
         over_time.set_title(f"{name}: RMS {rms_nm:.3g} {force}", fontsize=9, loc="left")

@@ -32,9 +32,8 @@ def urdf_view(
     table = plain_table(headings, left=(0, 1))
     for name, update in updates.items():
         centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
-        names = terminal_text(name), terminal_text(updated.links[name])
         figures = f"{update.body.mass_kg:.3g}", centre, f"{update.damping:.3g}", f"{update.friction:.3g}"
-        table.add_row(*names, *figures)
+        table.add_row(terminal_text(name), terminal_text(updated.links[name]), *figures)
     yield table
     change, joints = robot.parameters.torque_change_percent, robot.parameters.model.robot.joints
     if robot.parameters.exact:

@@ -9,13 +9,11 @@ import sys
 import matplotlib.image
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.console import Console
 
 from daq.report.gains import gain_table, plot_gains, with_deviation
-from daq.report.picture import thinned
+from daq.report.picture import ORANGE, grid, render
 from daq.report.plots import plot_residual, plot_torques
 from tests.daq.calibrations import AXES, demo_calibration
 
@@ -73,24 +71,23 @@ def test_a_run_of_which_nothing_could_be_used_is_drawn_all_the_same() -> None:
     assert matplotlib.image.imread(io.BytesIO(drawn)).size > 0
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    st.lists(st.floats(-1e6, 1e6) | st.just(float("nan")), min_size=1, max_size=400),
-    st.integers(4, 40),
-)
-def test_thinning_keeps_every_extreme_and_every_gap(values: list[float], points: int) -> None:
-    column = np.array(values)
-    time_s = np.arange(len(column), dtype=np.float64)
-    thin_s, thin = thinned(time_s, column, points)
-    stretch = -(-2 * len(column) // points)
-    assert len(thin_s) == len(thin) <= max(points + stretch, 4)
-    assert (np.diff(thin_s) >= 0).all()
-    assert np.isnan(column).any() == np.isnan(thin).any()
-    shown = np.isin(thin[~np.isnan(thin)], column)
-    assert shown.all()
-    if not np.isnan(column).any():
-        assert thin.min() == column.min()
-        assert thin.max() == column.max()
+@pytest.mark.parametrize("samples", [400, 6001, 300_000])
+@pytest.mark.parametrize("place", [0.0, 0.37, 1.0])
+def test_no_peak_and_no_gap_is_lost_on_the_way_to_the_pixels(samples: int, place: float) -> None:
+    time_s, column = np.linspace(0.0, 1.0, samples), np.zeros(samples)
+    column[round(place * (samples - 1))] = 1.0
+    column[round(0.6 * samples) : round(0.7 * samples)] = np.nan
+    figure, ((axes,),) = grid(1, (1.0,), "peak", height_in=3.0)
+    axes.plot(time_s, column, color=ORANGE, linewidth=0.8)
+    axes.set_ylim(-0.5, 1.5)
+    axes.set_xlim(-0.1, 1.1)
+    pixels = matplotlib.image.imread(io.BytesIO(render(figure)))
+    drawn = (pixels[..., 0] > 0.8) & (pixels[..., 2] < 0.5)
+    rows, columns = np.nonzero(drawn.any(axis=1))[0], np.nonzero(drawn.any(axis=0))[0]
+    assert np.ptp(rows) > 0.4 * np.ptp(axes.get_window_extent().get_points()[:, 1])  # up to the peak, half of the panel
+    gaps = np.diff(columns)
+    assert gaps.max() > 0.07 * np.ptp(columns)  # a tenth is left out
+    assert np.count_nonzero(gaps > 2) == 1
 
 
 def test_the_table_says_error_and_truth_within_80_columns() -> None:
