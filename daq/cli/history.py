@@ -57,7 +57,7 @@ def history_verb(
     from daq.config.cell_file import load_cell
     from daq.ledger.ledger import Ledger
     from daq.ledger.watch import watch
-    from daq.report.history_view import (
+    from daq.report.history import (
         describe,
         describe_actions,
         describe_verification,

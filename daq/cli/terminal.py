@@ -184,10 +184,6 @@ def interruptible(
     yielded context manager protects a stop that a fault has started in the same way; a signal that arrives meanwhile is
     dropped, because it asks for what is happening already. Outside the main thread, where Python handles no signals,
     nothing changes.
-
-    Args:
-        clock: monotonic time [s].
-        signals: those that interrupt.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext

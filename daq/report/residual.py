@@ -55,29 +55,24 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
     for number, step in enumerate(fitted.steps, start=1):
-        yield ranking_table(fitted, step.findings, f"Turn {number}: best candidates on left-out moves")
+        headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
+        table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
+        for finding in step.findings[:_SHOWN]:
+            table.add_row(
+                finding.effect.name,
+                fitted.cell.axes[finding.axis].name,
+                f"{finding.probability:.3f}",
+                f"{100 * finding.folds_better:.0f} %",
+                f"{100 * finding.explained:.1f} %",
+                f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
+                "pass" if finding.passed else "no",
+            )
+        yield table
         if step.accepted is None:
             yield "No candidate passes every gate; nothing is added.\n"
         else:
             placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
             yield f"Added: {placed_name(placed, fitted.cell.axis_names)}.\n"
-
-
-def ranking_table(fitted: Fit, findings: tuple[Finding, ...], title: str) -> Table:
-    """Table of the best findings and whether they passed every gate."""
-    headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
-    table = plain_table(headings, title=title)
-    for finding in findings[:_SHOWN]:
-        table.add_row(
-            finding.effect.name,
-            fitted.cell.axes[finding.axis].name,
-            f"{finding.probability:.3f}",
-            f"{100 * finding.folds_better:.0f} %",
-            f"{100 * finding.explained:.1f} %",
-            f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
-            "pass" if finding.passed else "no",
-        )
-    return table
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:

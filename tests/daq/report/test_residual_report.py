@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
-from daq.cli.residual import check_report
+from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputFailed, UsageError
