@@ -260,38 +260,27 @@ def rollback(
     from daq.writeback.file_target import FileTarget
 
     declared = None if cell is None else load_cell(cell)
-    if declared is not None and audit is not None:
+    at_most_one(audit=audit, cell=cell)  # writes to a cell's controller are in the cell's audit
+    if drives:
+        at_most_one(drives=drives, to=to)
+    if cell is None and (to is None or drives):
         raise UsageError(
-            "--audit",
-            found="--cell beside it",
-            expected="one of the two: writes to a cell's controller are in the cell's audit",
-            remedy="leave --audit out; `history: {audit: ...}` of the cell file says where its audit is",
+            "rollback",
+            found="no cell" if drives else "neither a cell nor a controller file",
+            expected="--cell CELL, which says where the gains are",
+            remedy="name the cell whose controller is to be rolled back",
         )
     now, actor, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if audit is not None:
         require_separate_audit(audit, (to,))
-    if drives:
-        if declared is None or to is not None:
-            raise UsageError(
-                "--drives",
-                found="no --cell" if declared is None else "--to beside it",
-                expected="--cell CELL alone, which says where the gains are in the drives",
-                remedy="name the cell, and no file",
-            )
+    if drives and declared is not None:
         saving = saving_of(ram_only, save_unknown)
         rollback_drives(declared, now=now, actor=actor, saving=saving, audit=book, yes=yes, json=json)
         return
     path = to if declared is None else to or declared.controller_path
-    if path is None and declared is not None:
+    if path is None:
         raise ConfigurationInconsistent(
             f"{cell}: controller", found="no file", expected="one", remedy="give it with --to FILE"
-        )
-    if path is None:
-        raise UsageError(
-            "rollback",
-            found="neither a cell nor a controller file",
-            expected="--cell CELL",
-            remedy="name the cell whose controller is to be rolled back",
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
     with writing(path):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, VerbGroup, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFailed, UsageError
 
 if TYPE_CHECKING:
@@ -181,4 +181,4 @@ EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --cs
 EXPORT_URDF = Verb(
     "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
 )
-EXPORT = VerbGroup("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))
+EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, VerbGroup, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.errors import UsageError
 
 
@@ -106,4 +106,4 @@ SIGN_CALIBRATION = Verb(
     "calibration", sign_calibration_verb, "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna"
 )
 SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check calibration.yaml --cell cells/demo.yaml")
-SIGN = VerbGroup("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))
+SIGN = Verb("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))

@@ -10,12 +10,10 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete
 from daq.log.conversion import scaling
-from daq.log.metadata import RunStatistics
-from daq.log.reader import LogHead, LogReader
+from daq.log.reader import LogReader
 from daq.report.bus import current_signals
 from daq.report.text import picked, printable
 from drivers.stream.sample import EventKind
@@ -41,7 +39,22 @@ def describe_log(path: Path) -> dict[str, Any]:
     head, statistics = reader.head, reader.statistics
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
     run = head.run
-    _check_counts(path, cell, head, statistics, samples, widths)
+    # The checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory.
+    scaling(cell, head.readback)
+    axes = len(cell.axes)
+    pairs = (
+        (f"{samples} samples", samples == statistics.samples, f"{statistics.samples}, as its recorder counted"),
+        (f"samples of {sorted(widths)} axes", widths <= {axes}, f"{axes}, as in its cell configuration"),
+        (f"losses of {len(statistics.missing)} axes", len(statistics.missing) == axes, f"{axes}"),
+    )
+    for found, agrees, expected in pairs:
+        if not agrees:
+            raise LogIncomplete(
+                str(path),
+                found=found,
+                expected=expected,
+                remedy="another tool may have cut or changed the log; take the original",
+            )
     return {
         "log": str(path),
         "sha256": reader.digest,
@@ -75,27 +88,6 @@ def describe_log(path: Path) -> dict[str, Any]:
         "origin": run.origin,
         "attachments": {name: len(data) for name, data in sorted(head.files.items())},
     }
-
-
-def _check_counts(
-    path: Path, cell: Cell, head: LogHead, statistics: RunStatistics, samples: int, widths: set[int]
-) -> None:
-    """Make the checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory."""
-    scaling(cell, head.readback)
-    axes = len(cell.axes)
-    pairs = (
-        (f"{samples} samples", samples == statistics.samples, f"{statistics.samples}, as its recorder counted"),
-        (f"samples of {sorted(widths)} axes", widths <= {axes}, f"{axes}, as in its cell configuration"),
-        (f"losses of {len(statistics.missing)} axes", len(statistics.missing) == axes, f"{axes}"),
-    )
-    for found, agrees, expected in pairs:
-        if not agrees:
-            raise LogIncomplete(
-                str(path),
-                found=found,
-                expected=expected,
-                remedy="another tool may have cut or changed the log; take the original",
-            )
 
 
 def log_table(description: Mapping[str, Any]) -> Table:
