@@ -81,11 +81,7 @@ def build_app() -> typer.Typer:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line and return its exit code.
-
-    Args:
-        arguments: without the command's name; None for those of this process.
-    """
+    """Run one command line, by default that of this process, and return its exit code."""
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
@@ -127,14 +123,10 @@ def _output_failed(error: OSError) -> int:
 
 def show_error(error: Exception, console: Console) -> None:
     """Print subject, found, expected and remedy of an error, a line each, and its notes."""
-    lines = [("error", str(error), "bold red")]
+    lines = [("error", error.subject if isinstance(error, DaqError) else str(error), "bold red")]
     if isinstance(error, DaqError):
-        lines = [
-            ("error", error.subject, "bold red"),
-            ("found", error.found, "bold"),
-            ("expected", error.expected, "bold"),
-            ("do", error.remedy, "bold"),
-        ]
+        parts = (("found", error.found), ("expected", error.expected), ("do", error.remedy))
+        lines += [(label, text, "bold") for label, text in parts]
     notes = getattr(error, "__notes__", ())
     lines += [(label, text, "bold") for label, _, text in (note.partition(": ") for note in notes) if label in NOTES]
     # A stop of the axes that could not be confirmed is a note on the error.

@@ -185,17 +185,10 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
 def tightened(
     policy: ApplyPolicy, change_percent: float | None, nameplate_percent: float | None, std_percent: float | None
 ) -> ApplyPolicy:
-    """Take bounds of the command line [%] into the cell's policy; None leaves the cell's.
-
-    Raises:
-        UsageError: one is wider than the cell's.
-    """
-    asked = {
-        "max_change_percent": change_percent,
-        "max_nameplate_percent": nameplate_percent,
-        "max_std_percent": std_percent,
-    }
-    tighter: dict[str, Any] = {name: bound for name, bound in asked.items() if bound is not None}
+    """Take bounds of the command line [%] into the cell's policy, none of them wider; None leaves the cell's."""
+    names = ("max_change_percent", "max_nameplate_percent", "max_std_percent")
+    asked = zip(names, (change_percent, nameplate_percent, std_percent), strict=True)
+    tighter: dict[str, Any] = {name: bound for name, bound in asked if bound is not None}
     for name, bound in tighter.items():
         allowed = getattr(policy, name)
         if not bound <= allowed:
@@ -210,11 +203,7 @@ def tightened(
 
 
 def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str, float]:
-    """Parse the values of --payload-mass: masses by payload [kg].
-
-    Raises:
-        UsageError: not NAME=KG, or no log of the calibration had that payload.
-    """
+    """Parse the values of --payload-mass, NAME=KG of payloads in the calibration's logs: masses by payload [kg]."""
     mounted = tuple(dict.fromkeys(one.payload for one in calibration.sources if one.payload is not None))
     found = {}
     for text in entries:
@@ -354,11 +343,7 @@ class Applier:
 
 
 def applier(by: str | None) -> Applier:
-    """Return the operator, by the name given.
-
-    Raises:
-        UsageError: the name has characters that cannot be printed.
-    """
+    """Return the operator, by the name given, which must be printable."""
     user = login()
     if by is not None and not by.isprintable():
         raise UsageError(
@@ -376,11 +361,7 @@ def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
 
 
 def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
-    """Refuse an audit that is another file of the command, by any name, whether it exists or not.
-
-    Raises:
-        AuditUnusable: it is.
-    """
+    """Refuse an audit that is another file of the command, by any name, whether it exists or not."""
     for other in others:
         if other is None:
             continue
@@ -456,7 +437,6 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
 
 
 def _saving_text(saving: Saving) -> str:
-    """Say whether the gains are saved."""
     from drivers.canopen.parameters import Saving
 
     if saving is Saving.RAM:

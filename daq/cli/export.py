@@ -71,6 +71,7 @@ def export_urdf_verb(
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
     from daq.workflow.calibration_file import load
+    from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
 
     one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
@@ -78,7 +79,14 @@ def export_urdf_verb(
     require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load(calibration)
-    require_good(known, str(calibration))
+    left = known.relative_error_percent.total
+    if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
+        raise ModelContradicted(
+            str(calibration),
+            found=f"a relative error of {left:.3g} %",
+            expected=f"at most {DOUBTFUL_PERCENT:g} %",
+            remedy="fit again; `drivegain fit` lists what to check",
+        )
     content = bundle(given)[URDF] if urdf is None else read_bytes(given)
     if out.exists() and out.read_bytes() == content:
         raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
@@ -95,20 +103,6 @@ def export_urdf_verb(
         print_json(urdf_document(known, robot, updates, updated, out, same))
     else:
         print_view(urdf_view(known, robot, updates, updated, same), out)
-
-
-def require_good(calibration: Calibration, name: str) -> None:
-    """Refuse a calibration that explains too little of the torque to derive bodies from it."""
-    from daq.workflow.fit import DOUBTFUL_PERCENT
-
-    left = calibration.relative_error_percent.total
-    if not left <= DOUBTFUL_PERCENT:
-        raise ModelContradicted(
-            name,
-            found=f"a relative error of {left:.3g} %",
-            expected=f"at most {DOUBTFUL_PERCENT:g} %",
-            remedy="fit again; `drivegain fit` lists what to check",
-        )
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:

@@ -36,28 +36,20 @@ OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file 
 PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is created.")]
 AcceptLossesOption = Annotated[
     bool,
-    typer.Option(
-        "--accept-losses",
-        help="Use logs that are invalid because of lost frames, without those samples; `apply` refuses the result.",
-    ),
+    typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
 ]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
 KnownOption = Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")]
 EssentialOption = Annotated[
     float | None,
-    typer.Option(
-        min=1.5,
-        help="Keep only essential parameters: the largest relative σ below this many times the smallest (10 to 30).",
-    ),
+    typer.Option(min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."),
 ]
 CasesOption = Annotated[
     Path | None, typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.")
 ]
 CompareOption = Annotated[
     bool,
-    typer.Option(
-        "--compare", help="Also run every estimator, with the cell's filters and with half and twice the cut-offs."
-    ),
+    typer.Option("--compare", help="Also run every estimator, at the cell's cut-offs, their half and their double."),
 ]
 
 

@@ -27,9 +27,7 @@ def fleet_verb(
     residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="Folder for a calibration of each cell; a cell is not fitted again from the same logs."
-        ),
+        typer.Option(help="Folder for a calibration of each cell; a cell is not fitted again from the same logs."),
     ] = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table; an earlier table is replaced.")] = None,
     json: JsonOption = False,

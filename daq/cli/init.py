@@ -26,12 +26,7 @@ TEMPLATES = (
 
 
 def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
-    """Copy the templates into a new folder, all of them or none; return the files.
-
-    Raises:
-        UsageError: the folder's name cannot be a cell's, or the folder is not empty.
-        OutputFailed: the file system refuses.
-    """
+    """Copy the templates into a new or empty folder, all of them or none; return the files."""
     import yaml
 
     texts = yaml.safe_load((shipped_configurations() / "templates" / "new-cell.yaml").read_text(encoding="utf-8"))

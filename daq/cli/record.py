@@ -25,10 +25,7 @@ def record_verb(
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
     enable_motion: Annotated[
         bool,
-        typer.Option(
-            "--enable-motion",
-            help="Allow the axes to move; nothing moves without it, or the cell's `policy: {motion: allowed}`.",
-        ),
+        typer.Option("--enable-motion", help="Allow motion, where the cell's `policy: {motion: allowed}` does not."),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
     mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
@@ -116,17 +113,13 @@ def record_verb(
 def _free(out: Path) -> Path:
     """Return the file in which the log grows until it is finished, before the bus is used; neither may exist."""
     part = out.with_name(out.name + ".part")
-    if out.exists():
-        raise UsageError(
-            str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
-        )
-    if part.exists():
-        raise UsageError(
-            str(part),
-            found="the rest of a recording of that name that failed, was interrupted, or is still running",
-            expected="none",
-            remedy=f"`fit` does not read it; {_next_command(part)}",
-        )
+    unfinished = "the rest of a recording of that name that failed, was interrupted, or is still running"
+    for path, found, remedy in (
+        (out, "a file of that name", "choose another --out, or move it away"),
+        (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
+    ):
+        if path.exists():
+            raise UsageError(str(path), found=found, expected="none", remedy=remedy)
     return part
 
 

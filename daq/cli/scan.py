@@ -21,10 +21,7 @@ def scan_verb(
     wait: Annotated[float, typer.Option(help="How long to wait for answers [s].", min=0.05, max=60.0)] = 0.5,
     reset_faults: Annotated[
         bool,
-        typer.Option(
-            "--reset-faults",
-            help="Reset every axis that is in FAULT, by 6040h; it stays without power, and nothing moves.",
-        ),
+        typer.Option("--reset-faults", help="Reset every axis in FAULT (6040h); it stays unpowered, nothing moves."),
     ] = False,
     json: JsonOption = False,
 ) -> None:

@@ -34,19 +34,12 @@ def simulate(
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "can0",
     bus: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CHANNEL=NODE,NODE,...",
-            help="One of several buses with the nodes on it, instead of --channel; repeat it for each bus.",
-        ),
+        typer.Option(metavar="CHANNEL=NODE,NODE,...", help="One of several buses, instead of --channel; repeatable."),
     ] = None,
     port: Annotated[int, typer.Option(help="Port of the hub; 0 takes a free one.", min=0, max=65535)] = 29536,
     payload_from: Annotated[
         Path | None,
-        typer.Option(
-            "--payload-from",
-            metavar="FILE",
-            help="File with the name of the mounted body, or none; read again whenever all axes are without power.",
-        ),
+        typer.Option(metavar="FILE", help="Names the mounted body, or none; read again while no axis has power."),
     ] = None,
 ) -> None:
     """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
@@ -207,7 +200,7 @@ def demo(
 
     from rich.console import Console
 
-    from daq.cli.terminal import Stepper, print_view, writing
+    from daq.cli.terminal import print_view, show_steps, writing
     from daq.files import replace_file
     from daq.report.proposal import show as show_proposal
     from daq.report.text import json_text
@@ -217,7 +210,7 @@ def demo(
     began = time.monotonic()
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
     with writing(out):
-        with Stepper() as stepper:
+        with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}
         replace_file(out / "summary.json", json_text(document).encode())

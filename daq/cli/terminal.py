@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Self
+from types import FrameType
+from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -55,11 +55,7 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Report a refusal of the file system within the block as an output that failed.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
+    """Report a refusal of the file system within the block as an output that failed."""
     try:
         yield
     except OSError as error:
@@ -67,11 +63,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def one_of(remedy: str, **options: object) -> None:
-    """Require exactly one of several options, by their names on the command line.
-
-    Raises:
-        UsageError: none, or more than one, is given.
-    """
+    """Require exactly one of several options, by their names on the command line."""
     if not any(options.values()):
         names = ", ".join(f"--{name}" for name in options)
         raise UsageError(names, found="neither", expected="one of them", remedy=remedy)
@@ -79,11 +71,7 @@ def one_of(remedy: str, **options: object) -> None:
 
 
 def at_most_one(**options: object) -> None:
-    """Refuse options that exclude each other, by their names on the command line.
-
-    Raises:
-        UsageError: more than one is given.
-    """
+    """Refuse options that exclude each other, by their names on the command line."""
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     if len(given) > 1:
         raise UsageError(
@@ -108,32 +96,15 @@ def say_written(console: Console, *paths: Path | None) -> None:
 
 
 class Stepper:
-    """Progress bars on stderr for steps that follow each other; a context manager."""
+    """Progress bars for steps that follow each other."""
 
-    def __init__(self) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[remark]}", style="dim"),
-        )
-        self._bars = Progress(*columns, console=Console(stderr=True), refresh_per_second=5)
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
         self._task: TaskID | None = None
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is None:
-            self._end()
-        self._bars.stop()
 
     def step(self, title: str) -> None:
         """End the current step and begin the next."""
-        self._end()
+        self.end()
         self._task = self._bars.add_task(title, total=None, remark="")
 
     def progress(self, done: int, total: int, remark: str) -> None:
@@ -142,16 +113,28 @@ class Stepper:
             of = f"{done}/{total} " if total else ""
             self._bars.update(self._task, completed=done, total=total or None, remark=of + remark)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """End the current step."""
         if self._task is not None:
             self._bars.update(self._task, completed=1, total=1)
             self._bars.stop_task(self._task)
 
 
 @contextmanager
+def show_steps() -> Iterator[Stepper]:
+    """Show progress bars on stderr; the last one is ended unless an error is raised."""
+    remark = TextColumn("{task.fields[remark]}", style="dim")
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
+    with Progress(*columns, console=Console(stderr=True), refresh_per_second=5) as bars:
+        stepper = Stepper(bars)
+        yield stepper
+        stepper.end()
+
+
+@contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
     """Show one progress bar on stderr."""
-    with Stepper() as stepper:
+    with show_steps() as stepper:
         stepper.step(title)
         yield stepper.progress
 

@@ -57,7 +57,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
 
 
 def fit_document(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> dict[str, Any]:
-    """Build the object of `fit --json`; arguments as of `fit_view`."""
+    """Build the object of `fit --json`."""
     fitted = found.fitted
     axes, paper = fitted.cell.axis_names, fitted.paper
     compared = {}
@@ -134,11 +134,7 @@ def error_document(error: RelativeError | None) -> dict[str, Any] | None:
 
 
 def start_of(fitted: Fit) -> Evidence:
-    """Return the rows under the declared model; the logs are read again only where the rows were not kept.
-
-    Raises:
-        DataError: a log can no longer be read.
-    """
+    """Return the rows under the declared model; the logs are read again only where the rows were not kept."""
     if not fitted.steps:
         return fitted.evidence()
     return without_effects(fitted.steps[0].after, fitted.identification.estimate)

@@ -226,10 +226,8 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
     """Return the digest of the calibration whose gains this cell's own controller has.
 
     The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
-    (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts.
-
-    Returns:
-        None where the file has other numbers than every calibration, or cannot be read.
+    (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts. None where the
+    file has other numbers than every calibration, or cannot be read.
     """
     controller, file = cell.controller, cell.controller_path
     if controller is None:
@@ -342,10 +340,7 @@ _FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 Decembe
 def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
     """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
 
-    Args:
-        all_series: one an axis, at least one.
-        kind: png or svg.
-        title: says which cell it is.
+    There is at least one series; the kind is png or svg.
     """
     import matplotlib.dates  # noqa: PLC0415
 

@@ -44,10 +44,7 @@ if TYPE_CHECKING:
 def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
     """Draw the torques of a held-out run (paper Fig. 2), the residual before and after each effect, and the gains.
 
-    Args:
-        fitted, calibration: the fit and its result.
-        truth: true gain by axis, for a simulated cell only.
-        out: folder of the pictures.
+    `truth` is the true gain by axis, for a simulated cell only.
 
     Raises:
         OSError: from the file system.
@@ -241,11 +238,7 @@ def plot_ranking(
 ) -> bytes:
     """Draw candidates by the fall of the squared error on left-out moves, the best first.
 
-    Args:
-        findings: at least one.
-        rivals: not distinguishable from the added one (or, where none was added, from the best); they are hatched.
-        axes: names of the axes.
-        title: names the turn.
+    Rivals are those not distinguishable from the added one or, where none was added, from the best; they are hatched.
     """
     figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=_BAR_IN * len(findings))
     hatched = {(rival.effect.name, rival.axis) for rival in rivals}
