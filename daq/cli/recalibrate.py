@@ -116,7 +116,12 @@ def install_units(
 
     declared = load_cell(cell)
     section, _ = section_of(declared), target_of(declared)
-    wanted = Installation(cell.resolve(), program(), schedule, user, owner_of(cell.resolve()))
+    place = cell.resolve()
+    try:
+        owner = place.owner()
+    except KeyError:  # a user without a name
+        owner = str(place.stat().st_uid)
+    wanted = Installation(place, program(), schedule, user, owner)
     if cron:
         typer.echo(cron_line(wanted))
         if yes:
@@ -153,14 +158,6 @@ def program() -> Path:
             remedy="install it (`pip install .`), then repeat this",
         )
     return Path(found).absolute()
-
-
-def owner_of(path: Path) -> str:
-    """Return the name of a file's owner, or the number of one without a name."""
-    try:
-        return path.owner()
-    except KeyError:
-        return str(path.stat().st_uid)
 
 
 def check_schedule(schedule: str) -> None:

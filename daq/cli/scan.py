@@ -68,8 +68,6 @@ def scan_verb(
 
 SCAN = Verb("scan", scan_verb, "drivegain scan cells/demo.yaml")
 
-_SHOWN_EVENTS = 5
-
 
 def monitor_verb(
     cell: CellArgument,
@@ -135,7 +133,7 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
     monitor = CellMonitor(network.link, network.axes)
     ampere: list[float | None] = [None] * len(network.axes)
     unknown = set(range(len(network.axes)))
-    event_lines: deque[str] = deque(maxlen=_SHOWN_EVENTS)
+    event_lines: deque[str] = deque(maxlen=5)
     # At the start a node's presence is no news; an error is.
     event_lines.extend(event.text for event in monitor.watch(QUIET_S).events if event.kind is not EventKind.NMT)
     while True:

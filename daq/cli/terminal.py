@@ -20,8 +20,6 @@ from daq.report.text import printable
 if TYPE_CHECKING:
     from drivers.canopen.network import SignalBlocker
 
-_HEAD_BYTES = 4096
-
 ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
 
 
@@ -40,7 +38,7 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
     """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head."""
     if out.is_file():
         with out.open("rb") as stream:
-            head = stream.read(_HEAD_BYTES)
+            head = stream.read(4096)
         replaceable = not head or mark.encode() in head
     else:
         replaceable = not out.exists()
