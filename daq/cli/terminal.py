@@ -73,7 +73,7 @@ def at_most_one(**options: object) -> None:
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     if len(given) > 1:
         raise UsageError(
-            given[0], found=f"{', '.join(given[1:])} beside it", expected="one at most", remedy="leave out all but one"
+            given[0], found=f"{', '.join(given[1:])} beside it", expected="one of them", remedy="leave out all but one"
         )
 
 

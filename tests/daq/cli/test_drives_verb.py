@@ -170,5 +170,5 @@ def test_the_two_options_of_saving() -> None:
         Saving.RAM,
         Saving.ANY,
     ]
-    with pytest.raises(UsageError, match="one at most"):
+    with pytest.raises(UsageError, match="one of them"):
         saving_of(True, True)
