@@ -132,10 +132,13 @@ def _skew_sentence(fitted: Fit) -> tuple[str, ...]:
 def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     """Rows of the table of errors; errors that were not computed or are unknown are left out."""
     before, after = account.total.before, account.total.after
+    first, second = (
+        None if errors.left_out_runs is None else errors.left_out_runs.together for errors in (before, after)
+    )
     pairs = (
         ("fit", before.in_sample, after.in_sample),
         ("moves left out", before.cross_validated, after.cross_validated),
-        ("runs left out", _together(before), _together(after)),
+        ("runs left out", first, second),
         ("held out", before.holdout, after.holdout),
     )
     floors = (("noise floor", account.floor), ("noise floor, held out", account.holdout_floor))
@@ -204,10 +207,6 @@ def _silence(fitted: Fit) -> str:
         f"{ended}An effect that the declared model cannot mimic would have been detected above this torque (root mean "
         f"square in motion): {limits}."
     )
-
-
-def _together(errors: Errors) -> RelativeError | None:
-    return None if errors.left_out_runs is None else errors.left_out_runs.together
 
 
 _METRIC = (
