@@ -93,7 +93,13 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
     (before, _), (after, where) = _strictest_error(account.total.before), _strictest_error(account.total.after)
     floor = _floor(account).total
     noise = f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
-    ending = (_silence(fitted), *_skew_sentence(fitted))
+    ending = [_silence(fitted)]
+    if (skew := time_skew(fitted)) is not None:
+        beside = " beside the effects found" if kept else ""
+        ending.append(
+            f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
+            f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}."
+        )
     if not found:
         return (f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
     whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
@@ -115,18 +121,6 @@ def time_skew(fitted: Fit) -> tuple[float, float] | None:
     """
     skews = [finding for finding in fitted.steps[-1].findings if finding.effect == TimeSkew()]
     return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
-
-
-def _skew_sentence(fitted: Fit) -> tuple[str, ...]:
-    skew = time_skew(fitted)
-    if skew is None:
-        return ()
-    seconds, std = skew
-    beside = " beside the effects found" if fitted.steps[-1].after.effects else ""
-    return (
-        f"Currents were sampled {1e3 * abs(seconds):.2f} ± {1e3 * std:.2f} ms {'after' if seconds > 0 else 'before'} "
-        f"the positions on all axes alike{beside}.",
-    )
 
 
 def error_rows(account: Account) -> tuple[ErrorRow, ...]:
