@@ -64,11 +64,6 @@ class _RecordFile(DriveRecord):
     sha256: str
 
 
-def drives_of(cell: str) -> str:
-    """Return the name of a cell's drives in audit and history."""
-    return f"drives of cell {cell}"
-
-
 def record_folder(cell: Cell) -> Path:
     """Return the folder of a cell's records: `demo.drives` beside `demo.history.sqlite`.
 

@@ -16,10 +16,10 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
+from daq.ledger.entry import drives_of
 from daq.writeback.drive_record import (
     DriveNote,
     DriveRecord,
-    drives_of,
     read_record,
     read_records,
     record_folder,
