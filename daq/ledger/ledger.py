@@ -18,7 +18,7 @@ from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
 from daq.files import fsync_folder
-from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, find_write_entry, read, verify
+from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
 from daq.ledger.entry import Acknowledgement, Event, iso
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import (
@@ -96,7 +96,9 @@ class Ledger(HistoryStore):
         if entry is None:
             if self.in_force(target) == digest:
                 return
-            entry = find_write_entry(self.place.audit, target, sha256_after)
+            for one in read(self.place.audit):
+                if (one.subject, one.details.get("sha256_after")) == (target, sha256_after):
+                    entry = one.sha256  # the newest one counts
         if not any(entry in write.digests for write in self.catch_up()):
             self.applied(digest, at=at, who=self.who, target=target, audit=entry, sha256_after=sha256_after)
 

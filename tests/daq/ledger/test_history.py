@@ -731,7 +731,7 @@ def test_a_write_that_a_job_entered_holds_within_the_job(cell: Path, capsys: pyt
     with closing(sqlite3.connect(_place(cell).store)) as other:
         other.execute("UPDATE event SET at = '2026-02-02T00:00:00.000000+00:00'")
         other.commit()
-    assert "found time 2026-02-02" in _verified(cell, capsys)
+    assert "found at '2026-02-02" in _verified(cell, capsys)
 
 
 def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
