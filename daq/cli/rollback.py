@@ -111,7 +111,7 @@ def rollback_drives(
     """
     from daq.report.proposal import describe_drive_rollback, show_drive_rollback
     from daq.writeback import target
-    from daq.writeback.drive_record import record_folder
+    from daq.writeback.drive_target import record_folder
 
     written: Written | None = None
     console = Console(soft_wrap=True, highlight=False, markup=False)

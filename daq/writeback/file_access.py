@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit
-from daq.files import fsync_folder, hold_lock, replace_file
+from daq.files import hold_lock, replace_file
 from daq.writeback.formats.document import read_bytes
 from daq.writeback.request import short_digest
 
@@ -44,8 +44,10 @@ def resolve_links(file: Path) -> Path:
         if error.errno == errno.ELOOP:
             raise _circle(file) from error
         raise
-    status, folder = _status(target), _status(target.parent)
-    owner = None if status is None else status.st_uid
+    owner, folder = None, None
+    with contextlib.suppress(OSError):  # it is gone, or access is denied
+        folder = target.parent.lstat()
+        owner = target.lstat().st_uid
     for link in links:
         made_by = link.lstat().st_uid
         if made_by not in {0, os.geteuid(), owner}:
@@ -78,14 +80,6 @@ def _links(file: Path) -> tuple[Path, ...]:
                 found[place] = None
                 names.append(place.parent / place.readlink())
     return tuple(found)
-
-
-def _status(file: Path) -> os.stat_result | None:
-    """Status of a file, None where it is gone or access is denied."""
-    try:
-        return file.lstat()
-    except OSError:
-        return None
 
 
 def require_existing(file: Path) -> None:
@@ -222,14 +216,3 @@ def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
     if taken and taken[-1] >= (stamp, count):
         stamp, count = taken[-1][0], taken[-1][1] + 1
     return f"{stamp}-{count}" if count else stamp
-
-
-def put_back(backup: Path, target: Path) -> None:
-    """Rename a backup back to the file that replaced it.
-
-    Raises:
-        OSError: from the file system; a failing fsync of the folder is ignored, as the name is there.
-    """
-    backup.replace(target)
-    with contextlib.suppress(OSError):
-        fsync_folder(target.parent)

@@ -20,7 +20,7 @@ from daq.config.cell import Cell
 from daq.errors import AuditUnusable, CalibrationRefused
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
-from daq.writeback.gates.gate import GateContext, Refusal, refusal_error
+from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, GainChange, Request
 from drivers.canopen.parameters import ParameterChange
@@ -115,8 +115,17 @@ class Proposal(Generic[E]):
 
     @property
     def error(self) -> CalibrationRefused:
-        """The error for a proposal with failed checks."""
-        return refusal_error(self.edit.subject, self.refusals)
+        """The error for a proposal with failed checks; several are listed one a line."""
+        if len(self.refusals) == 1:
+            only = self.refusals[0]
+            return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
+        listed = "".join(f"\n  {refusal}" for refusal in self.refusals)
+        return CalibrationRefused(
+            self.edit.subject,
+            found=f"{len(self.refusals)} failed checks{listed}\n ",
+            expected="none",
+            remedy="nothing was written",
+        )
 
 
 def propose(target: Target[E], request: Request) -> Proposal[E]:
