@@ -146,14 +146,6 @@ def append(
 ) -> AuditEntry:
     """Append an entry durably; a new file is made in an existing folder.
 
-    Args:
-        path: of the audit log.
-        action: what happened.
-        at: time with its zone.
-        who: the person or the job.
-        subject: the file, drives or cell that it happened to.
-        details: plain JSON with finite numbers.
-
     Raises:
         AuditUnusable: no regular file, locked for long, or its last line is not what was written.
         OSError: from the file system; at most an unfinished line was left.
@@ -194,9 +186,8 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
     """Check that the audit log is what was written, and find writes that were begun and never ended.
 
-    Args:
-        path: of the audit log; a missing file is an empty one.
-        heads: `sha256` of entries noted elsewhere. A chain alone cannot show that its last lines are missing.
+    A chain alone cannot show that its last lines are missing: `heads` are the digests of entries noted elsewhere. A
+    missing file is an empty one.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
@@ -381,7 +372,7 @@ def _torn_details(fragments: Sequence[bytes]) -> dict[str, object]:
 
 
 class _Chain:
-    """Walk from line to line, with the entry that must come next."""
+    """A walk from line to line, with the entry that must come next."""
 
     def __init__(self, content: bytes) -> None:
         self.lines = _lines_of(content)

@@ -57,11 +57,6 @@ class Ledger(HistoryStore):
 
     Where the audit log cannot be written, the history has what was added all the same, a warning says so, and `rebuild`
     enters it in the audit log later: a write that was made must not be called undone.
-
-    Args:
-        cell: whose ledger it is.
-        place: of audit log and history.
-        who: the person or the job.
     """
 
     def __init__(self, cell: Cell, place: HistoryPlace, who: str) -> None:
@@ -82,13 +77,8 @@ class Ledger(HistoryStore):
     ) -> None:
         """Enter that a controller has the gains of a calibration; before it what other processes could not enter.
 
-        Args:
-            digest: of the calibration, which was added before.
-            at: when, with its zone.
-            target: the controller's file or the drives, as the audit log names it.
-            sha256_after: of the target's content with these gains.
-            entry: SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may have
-                been killed before it entered the write, or entered it.
+        `entry` is the SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may
+        have been killed before it entered the write, or entered it.
 
         Raises:
             AuditUnusable, HistoryUnreadable, OutputFailed: see `HistoryStore.applied`.
@@ -215,12 +205,7 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
     Calibrations and writes that only the history has, which an earlier version wrote, are entered in the audit log
     first, unless the history contradicts itself or the audit log.
 
-    Args:
-        cell: whose history it is.
-        place: of audit log and history.
-        who: the person.
-        at: now, with its zone.
-        heads: SHA-256 of entries of the audit log that were noted elsewhere.
+    `heads` are the SHA-256 of entries of the audit log that were noted elsewhere.
 
     Raises:
         DataError: the audit log is not what was written; nothing was changed.

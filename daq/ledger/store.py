@@ -217,15 +217,7 @@ class HistoryStore:
             self._connection = None
 
     def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
-        """Enter a calibration.
-
-        Args:
-            calibration: of this cell.
-            digest: SHA-256 of its file.
-            at: now, with its zone.
-
-        Returns:
-            whether it is new: the same file is entered once.
+        """Enter a calibration, with the SHA-256 of its file; return whether it is new: a file is entered once.
 
         Raises:
             DataError: another cell, other axes, or a gain in another unit than the history's.
@@ -252,16 +244,10 @@ class HistoryStore:
         audit: str | None = None,
         sha256_after: str | None = None,
     ) -> None:
-        """Enter a write of a calibration's gains.
+        """Enter a write of a calibration's gains; the arguments are those of `Event`.
 
-        Args:
-            digest: of the calibration, which was entered before.
-            at: when, with its zone.
-            who: the person or the job.
-            target: the controller's file, as the audit log names it.
-            audit: SHA-256 of its entry in the audit log; by it `drivegain history --verify` notices an audit log
-                whose end was cut off.
-            sha256_after: of the target's content now, by which a rollback to it is recognised.
+        By `audit`, `drivegain history --verify` notices an audit log whose end was cut off. By `sha256_after`, a
+        rollback to this content is recognised.
 
         Raises:
             ValueError: the calibration was never entered, or the time has no zone.
@@ -277,13 +263,9 @@ class HistoryStore:
     ) -> str | None:
         """Enter that the last write to `target` was undone.
 
-        Args:
-            at, who, target, audit: as in `applied`.
-            sha256_after: of the target's content now. The gains of a calibration are recognised by it; numbers that a
-                person entered in between are in no calibration.
-
         Returns:
-            digest of the calibration with these gains, None without one.
+            digest of the calibration whose gains are recognised by `sha256_after`; None for numbers that a person
+            entered in between, which are in no calibration.
         """
         with self._writing() as connection:
             same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
@@ -332,11 +314,7 @@ class HistoryStore:
         return frozenset(sha256 for sha256 in noted if sha256 is not None)
 
     def in_force(self, target: str | None = None) -> str | None:
-        """Return the digest of the calibration of a controller's last write, None for numbers of no calibration.
-
-        Args:
-            target: the controller's file; None for the controller that was written last.
-        """
+        """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""
         events = [event for event in self.events() if target in {None, event.target}]
         return events[-1].digest if events else None
 

@@ -74,10 +74,7 @@ def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = F
     Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
     and rolled back from there, is in its own history.
 
-    Args:
-        cell: whose calibrations.
-        entries: of the audit log.
-        everywhere: also to files that are not the cell's controller (`apply --to`).
+    `everywhere` includes files that are not the cell's controller (`apply --to`).
     """
     file = cell.controller_path
     # Not `resolve_links`: a link that it refuses today was followed on the day of the write.
@@ -135,11 +132,7 @@ def catch_up(
     is never entered behind a later one. A write whose calibration is not known stops its target. Nothing is entered
     from an audit log that was changed.
 
-    Args:
-        cell: whose history it is.
-        place: of audit log and history.
-        store: the history.
-        own: SHA-256 of acknowledgements without the name of a cell that are this cell's.
+    `own` are the SHA-256 of acknowledgements without the name of a cell that are this cell's.
 
     Returns:
         the writes that were entered.

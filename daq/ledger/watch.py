@@ -85,13 +85,7 @@ class Series:
 def watch(
     entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement], chart: Chart = CHART
 ) -> tuple[Series, ...]:
-    """One series an axis, in the order of the axes.
-
-    Args:
-        entries: of one cell, with gains of the same axes and units.
-        acknowledgements: oldest first.
-        chart: limits.
-    """
+    """Return one series an axis, in the order of the axes; entries are of one cell, acknowledgements oldest first."""
     if not entries:
         return ()
     axes = {gain.axis: gain.unit for gain in entries[-1].gains}
@@ -115,10 +109,6 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
     It is estimated from the calibrations that identified an axis, one for the same logs (`of_each_recording`), together
     for axes that the same recordings identified (`ident.drift.change.dispersions`), also where a gain of one of them
     was held fixed when these were fitted again.
-
-    Args:
-        entries: of one cell.
-        axes: names.
 
     Returns:
         at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
@@ -180,13 +170,12 @@ def _series(
     points = []
     for index, (entry, gain) in enumerate(known):
         before = known[index - 1][1] if index else None
-        points.append(Point(entry, gain, None if before is None else _change(before, gain, dispersion)))
+        change = None
+        if before is not None:
+            change = change_significance(before.value, before.std, gain.value, gain.std, dispersion=dispersion)
+        points.append(Point(entry, gain, change))
     watching = bool(stretches) and len(known) not in starts
     return Series(axis, unit, dispersion, tuple(points), tuple(stretches), watching, tuple(acknowledged))
-
-
-def _change(before: Gain, after: Gain, dispersion: float) -> Change:
-    return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
 
 
 # Questions, not verdicts: a gain shows that the torque for a current has changed, not why.
@@ -252,10 +241,6 @@ def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
             found = [_MORE if rose[0] else _LESS]
         case Pattern.SEVERAL:
             found = [_SEVERAL]
-    changed = len({entry for s in all_series for entry in _configurations(s)}) > 1
+    configurations = {point.entry.configuration_sha256 for s in all_series for point in s.points[s.began :]}
+    changed = len(configurations) > 1
     return (*found, *(["the cell's configuration changed in this time: what was changed?"] if changed else []))
-
-
-def _configurations(series: Series) -> tuple[str, ...]:
-    """Digests of the cell configuration from the baseline on."""
-    return tuple(point.entry.configuration_sha256 for point in series.points[series.began :])

@@ -183,11 +183,7 @@ def backups(target: Path) -> tuple[Backup, ...]:
 def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
     """Write a complete backup, later in order than every other; the caller holds the file's lock.
 
-    Args:
-        target: the controller file; mode and owner are taken from it.
-        before: its content.
-        after: the content that will replace it.
-        now: time for the name.
+    Mode and owner are taken from the file.
 
     Raises:
         OSError: from the file system; no backup is left.
@@ -206,11 +202,8 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
 def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
     """Return time and count for the name of a backup, later in order than all others.
 
-    A clock that was set back, or two writes in one second, must not make an older one look newer.
-
-    Args:
-        taken: time and count of the others, in order.
-        now: wall-clock time.
+    A clock that was set back, or two writes in one second, must not make an older one look newer. `taken` has time and
+    count of the others, in order.
     """
     stamp, count = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ"), 0
     if taken and taken[-1] >= (stamp, count):

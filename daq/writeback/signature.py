@@ -36,10 +36,7 @@ _LARGEST_BYTES = 16_384
 def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicKey]:
     """Make a key pair: `<name>.key`, readable by its owner alone, and `<name>.pub` for all.
 
-    Args:
-        folder: made where it is missing.
-        name: of the person.
-        password: of the secret key; empty for one that only the file's mode protects.
+    Without a password only the file's mode protects the secret key. A missing folder is made.
 
     Returns:
         File of the secret key, and the public key, whose `line` goes into the cell file.

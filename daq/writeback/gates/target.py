@@ -7,7 +7,6 @@ import unicodedata
 from collections.abc import Iterator
 
 from daq.config.cell import Axis
-from daq.config.policy import ApplyPolicy
 from daq.errors import SignatureInvalid
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import Finding, GainChange, parse_base, short_digest
@@ -124,25 +123,24 @@ def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, Axis]]:
 
 def base(context: GateContext) -> Iterator[Finding]:
     """Require the content that the target should have, or that the operator has reviewed (`--base`)."""
-    edit = context.edit
-    before = edit.before or b""
-    reviewed = parse_base(context.request.base, before)
+    edit, base = context.edit, context.request.base
+    reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
     if edit.keeps_all:
         return
-    if reviewed.base_sha256 is None:
+    if reviewed is None:
         yield from edit.unexpected
-    elif reviewed.base_sha256 != edit.base_sha256:
+    elif reviewed != edit.base_sha256:
         yield (
             edit.subject,
             f"content {edit.base_sha256[:12]}…",
-            f"{reviewed.base_sha256[:12]}…, as --base says",
+            f"{reviewed[:12]}…, as --base says",
             "the content has changed since that review: take a new dry run, without --base",
         )
-    elif reviewed.after_digest not in {None, short_digest(edit.after)}:
+    elif after_digest not in {None, short_digest(edit.after)}:
         yield (
             edit.subject,
             f"a change to {short_digest(edit.after)}…",
-            f"to {reviewed.after_digest}…, as --base says",
+            f"to {after_digest}…, as --base says",
             "the calibration, the keys or the factors have changed since the dry run: take a new one",
         )
 
@@ -167,7 +165,8 @@ def signature(context: GateContext) -> Iterator[Finding]:
         return
     *given, login = request.appliers or ("",)
     for name in given:
-        if not _is_known(name, login, policy):
+        known = {_as_read(other) for other in (*policy.signers, login)}
+        if not _is_legible(name) or _as_read(name) not in known:
             yield (
                 "operator",
                 ascii(name),
@@ -195,10 +194,6 @@ def _as_read(name: str) -> str:
 def _is_legible(name: str) -> bool:
     """Whether every character shows: no control, format, private or unassigned one."""
     return bool(name) and not any(unicodedata.category(character).startswith("C") for character in name)
-
-
-def _is_known(name: str, login: str, policy: ApplyPolicy) -> bool:
-    return _is_legible(name) and _as_read(name) in {_as_read(other) for other in (*policy.signers, login)}
 
 
 def _others(names: tuple[str, ...], applying: set[str]) -> list[str]:

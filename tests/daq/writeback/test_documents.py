@@ -603,8 +603,8 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path: Path) -> None:
     for path, says in (
         (pipe, "no regular file"),
         (Path("/dev/zero"), "no regular file"),
-        (folder, "no regular file"),
-        (large, "more than 4 MiB"),
+        (folder, "is a directory"),
+        (large, "at most 4 MiB"),
         (tmp_path / "none", "no such file"),
     ):
         with pytest.raises(ControllerUnfit, match=says):
