@@ -50,11 +50,6 @@ class AuditedWrite:
         """SHA-256 of its entries; an event of the history names one of them."""
         return frozenset(one.sha256 for one in (self.begun, self.ended) if one is not None)
 
-    @property
-    def changed_nothing(self) -> bool:
-        """Whether the target held the same before it: drives are written again to let them save."""
-        return self.begun is not None and self.sha256_after == _text(self.begun, "sha256_before") is not None
-
     def __str__(self) -> str:
         one = self.ended
         written = f", calibration {self.calibration[:12]}…" if self.calibration else ""
@@ -110,9 +105,11 @@ def unknown_writes(
         target = write.ended.subject
         after, after_known = following.get(target, (None, False))
         known = not write.digests.isdisjoint(named)
-        # Drives that were written once more with the same: who has that event has their content.
-        again = after is not None and after.changed_nothing and after.sha256_after == write.sha256_after
-        known = known or (after_known and again and after is not None and after.calibration == write.calibration)
+        if after_known and after is not None and after.begun is not None:
+            # Drives that were written once more with the same, to let them save: that event has their content too.
+            contents = {after.sha256_after, _text(after.begun, "sha256_before"), write.sha256_after}
+            again = len(contents) == 1 and None not in contents
+            known = known or (again and after.calibration == write.calibration)
         following[target] = write, known
         if known:
             some_known.add(target)

@@ -60,18 +60,12 @@ class DriveNote(StrictModel):
 class DriveRecord(StrictModel):
     """One write to the drives of a cell."""
 
-    format: Literal["drivegain drive record 1"] = "drivegain drive record 1"
+    format: Literal["drivegain drive record 1"]
     cell: str  #: name of the cell
     at: str  #: time, ISO 8601
     who: str  #: the operator or the job
     drives: tuple[DriveNote, ...]  #: one for each axis
-
-
-class _RecordFile(DriveRecord):
-    """The record as it is on the disk, with its own digest."""
-
-    format: Literal["drivegain drive record 1"]
-    sha256: str
+    sha256: str  #: of all of the above
 
 
 def record_folder(cell: Cell) -> Path:
@@ -100,7 +94,8 @@ def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple
     folder.mkdir(parents=True, exist_ok=True)
     taken = [_order(path.name) for path in read_records(folder)]
     path = folder / f"{next_order([one for one in taken if one is not None], now)}.json"
-    body = DriveRecord(cell=cell, at=now.isoformat(), who=who, drives=drives).model_dump(mode="json")
+    body: dict[str, Any] = {"format": "drivegain drive record 1", "cell": cell, "at": now.isoformat(), "who": who}
+    body["drives"] = [note.model_dump(mode="json") for note in drives]
     text = json.dumps({**body, "sha256": _digest(body)}, indent=1, ensure_ascii=False)
     replace_file(path, (text + "\n").encode())
     return path
@@ -128,7 +123,7 @@ def read_record(path: Path) -> DriveRecord:
     """
     try:
         content = read_regular(path, _MAX_BYTES)
-        record = _RecordFile.model_validate_json(content)
+        record = DriveRecord.model_validate_json(content)
         body: dict[str, Any] = json.loads(content)
     except (OSError, ValueError) as error:
         raise _unfit(path, str(error).splitlines()[0][:200]) from error

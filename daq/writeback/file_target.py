@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ from daq.writeback.file_access import (
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes, short_digest
-from daq.writeback.target import Written, audited_change
+from daq.writeback.target import Written
 from ident.calibration import Calibration
 
 
@@ -204,7 +205,12 @@ class FileTarget:
         """See `Target.details`."""
         if edit.source is not None:
             return {"restored": edit.source.name}
-        return {"changes": [audited_change(change) for change in edit.changes]}
+        changes = []
+        for change in edit.changes:
+            numbers = {"old": change.old, "new": change.new, "std": change.std}
+            finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+            changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
+        return {"changes": changes}
 
     def write(self, edit: FileEdit, now: datetime, who: str) -> Written:
         """See `Target.write`; `who` is in the audit alone."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -22,7 +21,7 @@ from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
 from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
-from daq.writeback.request import Edit, GainChange, Request
+from daq.writeback.request import Edit, Request
 from drivers.canopen.parameters import ParameterChange
 from ident.calibration import Calibration
 
@@ -260,10 +259,3 @@ class _Recorder:
             refusal = {"gate": "file", "subject": error.subject, "found": error.found}
             self.end(AuditAction.REFUSED, {"refusals": [refusal], **details})
             raise
-
-
-def audited_change(change: GainChange) -> dict[str, object]:
-    """One gain for the audit, which takes finite numbers only."""
-    numbers = {"old": change.old, "new": change.new, "std": change.std}
-    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return {"axis": change.axis, "key": change.key, "unit": change.unit, **finite}
