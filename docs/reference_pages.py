@@ -268,8 +268,8 @@ def api() -> str:
 
 def gates() -> str:
     """Return the table of all gates, in the order in which they are checked."""
-    head = "| gate | refuses if | default limit | do |\n|---|---|---|---|\n"
-    rows = [f"| {row.gate.value} | {row.fails_if} | {row.limit} | {row.remedy} |" for row in GATES]
+    head = "| gate | check | default limit | do |\n|---|---|---|---|\n"
+    rows = [f"| {row.gate.value} | {row.text} | {row.limit} | {row.remedy} |" for row in GATES]
     return head + "\n".join(rows)
 
 

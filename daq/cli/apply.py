@@ -291,7 +291,7 @@ def rollback_drives(
     """Show the values in the drives before the last write, and restore them with `yes`; a second time undoes it."""
     from daq.report.proposal import describe_drive_rollback, show_drive_rollback
     from daq.writeback import target
-    from daq.writeback.drive_record import record_folder
+    from daq.writeback.drive_target import record_folder
 
     written: Written | None = None
     console = Console(soft_wrap=True, highlight=False, markup=False)

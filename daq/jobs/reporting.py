@@ -22,7 +22,6 @@ from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, JudgedGain, Outcome, Session, SessionState
 from daq.ledger.audit import AuditAction, AuditEntry, append
-from daq.ledger.judgement import digests_in_force
 from daq.ledger.store import HistoryStore
 from drivers.errors import WHILE
 from ident.calibration import Calibration
@@ -118,7 +117,8 @@ def _report(
 def _remove_old(context: JobContext) -> None:
     try:
         with HistoryStore(context.target.history.store) as store:
-            in_force = digests_in_force(store.events())
+            newest = {event.target: event.digest for event in store.events()}
+        in_force = frozenset(digest for digest in newest.values() if digest is not None)
     except HistoryUnreadable as error:
         # The calibrations in force are unknown: keep all sessions.
         context.journal.say(Level.WARNING, "no old session removed", text=str(error))

@@ -1,65 +1,144 @@
 """The audit log of a cell: entries are appended and never removed.
 
-One JSON line an entry, each with the digest of the one before. An entry is on the disk before `append` returns, written
-in one piece under a lock. A killed writer leaves at most an unfinished line. That line stays; the next entry begins on
-a line of its own and records its digest.
+One JSON line an entry, each with the digest of the one before: the chain reveals lines that were edited, removed,
+moved or added. An entry is on the disk before `append` returns, written in one piece under a lock. A killed writer
+leaves at most an unfinished line. That line stays; the next entry begins on a line of its own and records its digest.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import logging
+import json
 import os
 import stat
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from enum import Enum
 from pathlib import Path
-from typing import TypeVar
 
-from daq.errors import AuditUnusable, CalibrationRefused
-from daq.files import fsync_folder, sha256, sha256_of
-from daq.ledger.audit_chain import (
-    FIRST,
-    GONE,
-    AuditAction,
-    AuditEntry,
-    AuditFlaw,
-    AuditVerdict,
-    Content,
-    Flaw,
-    OpenWrite,
-    decode,
-    encode,
-    entry,
-    is_fragment,
-    judge,
-    lines_of,
-    torn_details,
-)
-from daq.writeback.gates.gate import Refusal
-
-__all__ = [
-    "AuditAction",
-    "AuditEntry",
-    "AuditFlaw",
-    "AuditVerdict",
-    "Content",
-    "Flaw",
-    "OpenWrite",
-    "append",
-    "digest_now",
-    "find_write_entry",
-    "read",
-    "verify",
-]
+from daq.errors import AuditUnusable
+from daq.files import fsync_folder, open_regular, sha256, sha256_of
 
 _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
-_LOG = logging.getLogger("drivegain")
-_NOT_WRITTEN = (OSError, AuditUnusable)
-_Done = TypeVar("_Done")
+FIRST = "0" * 64  #: Previous digest of the first entry
+GONE = "gone"  #: Takes the place of a missing file's digest
+_BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
+
+
+class AuditAction(Enum):
+    """Kinds of entries."""
+
+    PROPOSED = "proposed"
+    REFUSED = "refused"
+    APPLY_BEGUN = "apply begun"
+    APPLIED = "applied"
+    ROLLBACK_BEGUN = "rollback begun"
+    ROLLED_BACK = "rolled back"
+    FAILED = "failed"
+    NOTHING_TO_DO = "nothing to do"  #: A write was asked for, and the target had this content already
+    RECALIBRATION_BEGUN = "recalibration begun"
+    RECALIBRATION_ENDED = "recalibration ended"
+    ACKNOWLEDGED = "acknowledged"
+    CALIBRATION_ENTERED = "calibration entered"
+    """The history has this calibration; details: SHA-256 of its file, cell, time, and the whole document."""
+    WRITE_FOUND = "write found"
+    """A controller has these gains, though no entry ends the write that put them there; details as of its begin."""
+    TORN_LINE = "torn line"
+    """The line before was left by a writer that was killed or had no room; details: its length and SHA-256."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditEntry:
+    """One entry."""
+
+    number: int  #: from 1, without gaps
+    at: str  #: ISO 8601 time with its zone
+    who: str  #: the person or the job
+    action: AuditAction  #: kind of entry
+    subject: str  #: for a write, the controller file with symbolic links followed, or the drives
+    details: dict[str, object]  #: plain JSON; see docs/reference/audit-and-history.md
+    previous: str  #: `sha256` of the entry before, `FIRST` for the first
+    sha256: str  #: of the canonical JSON of all of the above, hexadecimal
+
+    @property
+    def holds(self) -> bool:
+        """Whether the entry is what its digest was computed from."""
+        return self.sha256 == sha256(_canonical(_content(self)))
+
+
+def entry(
+    number: int, at: str, who: str, action: AuditAction, subject: str, details: Mapping[str, object], previous: str
+) -> AuditEntry:
+    """Make an entry with its digest.
+
+    Raises:
+        TypeError, ValueError: the details are no JSON, or have a number that is not finite.
+    """
+    # As it will be read: with lists for tuples, so that what is returned is what is in the file.
+    plain: dict[str, object] = json.loads(_canonical(dict(details)))
+    unsigned = AuditEntry(number, at, who, action, subject, plain, previous, "")
+    return AuditEntry(number, at, who, action, subject, plain, previous, sha256(_canonical(_content(unsigned))))
+
+
+def encode(one: AuditEntry) -> bytes:
+    """Return the line without its end."""
+    return _canonical({**_content(one), "sha256": one.sha256})
+
+
+_TYPES = {
+    **dict.fromkeys(("at", "who", "action", "subject", "previous", "sha256"), str),
+    **{"number": int, "details": dict},
+}
+
+
+def decode(line: bytes) -> AuditEntry | None:
+    """Return the entry of a line, its digest unchecked; None for a line that `encode` could not write."""
+    try:
+        tree = json.loads(line)
+        if not isinstance(tree, dict) or {name: type(value) for name, value in tree.items()} != _TYPES:
+            return None
+        found = AuditEntry(**{**tree, "action": AuditAction(tree["action"])})
+        return found if encode(found) == line else None
+    except (ValueError, TypeError, RecursionError):
+        return None
+
+
+def _is_fragment(line: bytes) -> bool:
+    """Whether a line can be the begin of an unfinished entry, which is never JSON.
+
+    Zeros behind it, or alone, are left by a power cut. Any other text is from another file.
+    """
+    begun = line.rstrip(b"\0")
+    if not begun.startswith(_BEGINNING) and not _BEGINNING.startswith(begun):
+        return False
+    try:
+        json.loads(line)
+    except ValueError:
+        return True
+    except RecursionError:
+        return False
+    return False
+
+
+def _content(one: AuditEntry) -> dict[str, object]:
+    return {
+        "number": one.number,
+        "at": one.at,
+        "who": one.who,
+        "action": one.action.value,
+        "subject": one.subject,
+        "details": one.details,
+        "previous": one.previous,
+    }
+
+
+def _canonical(tree: object) -> bytes:
+    """Encode as JSON with one spelling for one content: sorted keys, no spaces, ASCII, no NaN."""
+    return json.dumps(tree, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def append(
@@ -67,20 +146,13 @@ def append(
 ) -> AuditEntry:
     """Append an entry durably; a new file is made in an existing folder.
 
-    Args:
-        path: of the audit log.
-        action: what happened.
-        at: time with its zone.
-        who: the person or the job.
-        subject: the file, drives or cell that it happened to.
-        details: plain JSON with finite numbers.
-
     Raises:
         AuditUnusable: no regular file, locked for long, or its last line is not what was written.
         OSError: from the file system; at most an unfinished line was left.
     """
     with _locked(path) as descriptor:
-        content = _read_all(descriptor)
+        with os.fdopen(descriptor, "rb", closefd=False) as stream:
+            content = stream.read()
         new: list[AuditEntry] = []
 
         def add(kind: AuditAction, says: Mapping[str, object]) -> None:
@@ -90,7 +162,7 @@ def append(
 
         last, unfinished = _end_of(content, path)
         if unfinished:
-            add(AuditAction.TORN_LINE, torn_details(unfinished))
+            add(AuditAction.TORN_LINE, _torn_details(unfinished))
         add(action, details)
         begin = b"" if not content or content.endswith(b"\n") else b"\n"
         line = begin + b"".join(encode(one) + b"\n" for one in new)
@@ -108,117 +180,19 @@ def read(path: Path) -> tuple[AuditEntry, ...]:
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return tuple(one for one in map(decode, lines_of(_content(path))) if one is not None)
+    return tuple(one for one in map(decode, _lines_of(_content_of(path))) if one is not None)
 
 
 def verify(path: Path, heads: Collection[str] = ()) -> AuditVerdict:
     """Check that the audit log is what was written, and find writes that were begun and never ended.
 
-    Args:
-        path: of the audit log; a missing file is an empty one.
-        heads: `sha256` of entries noted elsewhere. A chain alone cannot show that its last lines are missing.
+    A chain alone cannot show that its last lines are missing: `heads` are the digests of entries noted elsewhere. A
+    missing file is an empty one.
 
     Raises:
         AuditUnusable: no regular file, or it cannot be read.
     """
-    return judge(_content(path), digest_now, heads)
-
-
-def find_write_entry(path: Path, subject: str, sha256_after: str) -> str | None:
-    """Return the SHA-256 of the newest entry about a write of that content to that subject, None without one.
-
-    Raises:
-        AuditUnusable: no regular file, or it cannot be read.
-    """
-    digests = [
-        one.sha256 for one in read(path) if (one.subject, one.details.get("sha256_after")) == (subject, sha256_after)
-    ]
-    return digests[-1] if digests else None
-
-
-@dataclass(frozen=True, slots=True)
-class AuditRecorder:
-    """Record writes to controllers: that one begins, before anything is replaced, and how it ended."""
-
-    audit: Path | None  #: file of the audit log; None records nothing
-    who: str  #: the person or the job
-    at: datetime  #: time with its zone
-
-    def record_write(
-        self,
-        begun: AuditAction,
-        ended: AuditAction,
-        target: Path,
-        before: bytes | None,
-        after: bytes,
-        details: Mapping[str, object],
-        write: Callable[[], _Done],
-    ) -> tuple[_Done, str | None]:
-        """Call `write` between two entries.
-
-        Args:
-            begun, ended: actions of the entry before, and of the one after success.
-            target: the file, with symbolic links followed, or the drives.
-            before, after: content; before is None where the file is gone.
-            details: of the first entry, besides the digests.
-            write: replaces the content.
-
-        Returns:
-            the result of `write`, and the SHA-256 of the last entry, None without an audit log. Kept elsewhere, it
-            reveals an audit log whose end was cut off.
-
-        Raises:
-            AuditUnusable, OSError: the first entry could not be written; the target is unchanged.
-            Exception: from `write`.
-        """
-        if self.audit is None:
-            return write(), None
-        digests = {"sha256_before": None if before is None else sha256(before), "sha256_after": sha256(after)}
-        entry = self._append(self.audit, begun, target, {**digests, **details})
-        try:
-            done = write()
-        except BaseException as error:  # an interrupt ends a write too
-            # An interrupt may come when all is done: the digest shows the content, whatever the error says.
-            found = {"begun": entry.number, "error": _said(error), "sha256_found": digest_now(str(target))}
-            self._end(self.audit, AuditAction.FAILED, target, found)
-            raise
-        end_entry = self._end(self.audit, ended, target, {"begun": entry.number})
-        return done, (end_entry or entry).sha256
-
-    def record_refusal(self, target: Path, refusals: Sequence[Refusal], details: Mapping[str, object]) -> None:
-        """Record a write that gates refused."""
-        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in refusals]
-        self._refused(target, {"refusals": listed, **details})
-
-    def record_no_change(self, target: Path, content: bytes, details: Mapping[str, object]) -> None:
-        """Record that the target had this content already."""
-        if self.audit is not None:
-            self._end(self.audit, AuditAction.NOTHING_TO_DO, target, {"sha256_found": sha256(content), **details})
-
-    @contextlib.contextmanager
-    def record_refusal_of(self, target: Path, details: Mapping[str, object]) -> Iterator[None]:
-        """Record a refusal that is raised within the context."""
-        try:
-            yield
-        except CalibrationRefused as error:
-            documented = {"gate": "file", "subject": error.subject, "found": error.found}
-            self._refused(target, {"refusals": [documented], **details})
-            raise
-
-    def _refused(self, target: Path, details: Mapping[str, object]) -> None:
-        if self.audit is not None:
-            self._end(self.audit, AuditAction.REFUSED, target, details)
-
-    def _append(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry:
-        return append(audit, action, at=self.at, who=self.who, subject=str(target), details=details)
-
-    def _end(self, audit: Path, action: AuditAction, target: Path, details: Mapping[str, object]) -> AuditEntry | None:
-        try:
-            return self._append(audit, action, target, details)
-        except _NOT_WRITTEN as error:
-            # The write is done, and the first entry has its digests: no reason to call it undone.
-            _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
-            return None
+    return judge(_content_of(path), digest_now, heads)
 
 
 def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]:
@@ -228,11 +202,11 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
         AuditUnusable: the last line is something else.
     """
     unfinished: list[bytes] = []
-    for number, line in reversed(list(enumerate(lines_of(content), start=1))):
+    for number, line in reversed(list(enumerate(_lines_of(content), start=1))):
         one = decode(line)
         if one is not None and one.holds:
             return one, unfinished[::-1]
-        if one is not None or not is_fragment(line):
+        if one is not None or not _is_fragment(line):
             raise AuditUnusable(
                 str(path),
                 found=f"line {number}, which drivegain did not write",
@@ -254,7 +228,8 @@ def _locked(path: Path) -> Iterator[int]:
     except IsADirectoryError as error:
         raise _no_file(path, "a folder") from error
     try:
-        _check_regular(descriptor, path)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise _no_file(path, "something that is no regular file")
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -272,23 +247,14 @@ def _locked(path: Path) -> Iterator[int]:
         os.close(descriptor)
 
 
-def _content(path: Path) -> bytes:
+def _content_of(path: Path) -> bytes:
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        with open_regular(path) as stream:
+            return stream.read()
     except FileNotFoundError:
         return b""
     except OSError as error:
         raise _no_file(path, (error.strerror or type(error).__name__).lower()) from error
-    try:
-        _check_regular(descriptor, path)
-        return _read_all(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _check_regular(descriptor: int, path: Path) -> None:
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        raise _no_file(path, "something that is no regular file")
 
 
 def _no_file(path: Path, found: str) -> AuditUnusable:
@@ -300,14 +266,6 @@ def _no_file(path: Path, found: str) -> AuditUnusable:
     )
 
 
-def _read_all(descriptor: int) -> bytes:
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    pieces = []
-    while piece := os.read(descriptor, 1 << 20):
-        pieces.append(piece)
-    return b"".join(pieces)
-
-
 def digest_now(subject: str) -> str | None:
     """Return the SHA-256 of a file as it is now, `GONE` without one, None where it cannot be read."""
     path = Path(subject)
@@ -317,5 +275,183 @@ def digest_now(subject: str) -> str | None:
         return None
 
 
-def _said(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"[:500]
+_BEGUN = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
+_ENDS = (AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED)
+
+
+class Flaw(Enum):
+    """Kinds of changes to a line."""
+
+    EDITED = "edited"
+    REMOVED = "removed"
+    MOVED = "moved"
+    ADDED = "added"
+    CUT_OFF = "cut off"
+
+
+@dataclass(frozen=True, slots=True)
+class AuditFlaw:
+    """One place where the audit log is not what was written."""
+
+    line: int  #: in the file, from 1; of a removed line, the line that is in its place
+    flaw: Flaw  #: its kind, as far as the chain shows it
+    says: str  #: the same as a sentence
+
+
+class Content(Enum):
+    """Content of a controller file after a write that was begun and not ended."""
+
+    BEFORE = "as before the write"
+    AFTER = "the new content"
+    OTHER = "neither: it was changed or removed since"
+    UNKNOWN = "not known: the file cannot be read, or the entry has no digests"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenWrite:
+    """A write without an entry that ends it: its writer was killed."""
+
+    begun: AuditEntry  #: the entry
+    content: Content  #: of the file afterwards: as the next write found it, or, where there was none, as it is now
+
+
+@dataclass(frozen=True, slots=True)
+class AuditVerdict:
+    """Result of checking a chain."""
+
+    entries: tuple[AuditEntry, ...]  #: all of them, in the order of the file
+    flaws: tuple[AuditFlaw, ...]  #: by their lines; empty for an intact chain
+    torn: tuple[int, ...]  #: lines, from 1, that a killed writer left unfinished; they are no flaw
+    open_writes: tuple[OpenWrite, ...]  #: begun and not ended
+
+    @property
+    def holds(self) -> bool:
+        """Whether every entry is what was written and none is missing, as far as a chain can show it."""
+        return not self.flaws
+
+    @property
+    def broken(self) -> int | None:
+        """First line that is not what was written; None where there is none."""
+        return self.flaws[0].line if self.flaws else None
+
+
+def judge(content: bytes, digest_now: Callable[[str], str | None], heads: Collection[str] = ()) -> AuditVerdict:
+    """Check a chain.
+
+    Args:
+        content: of the audit log.
+        digest_now: SHA-256 of a controller file by its path, `GONE` where there is none, None where it cannot be read.
+        heads: digests of entries that were noted elsewhere. One that is not in the chain shows that its end is missing.
+    """
+    chain = _Chain(content)
+    for index, one in enumerate(chain.found):
+        if one is None:
+            chain.unfinished.append(index)
+        else:
+            chain.take(index, one)
+    chain.settle(None)
+    entries = tuple(one for one in chain.found if one is not None)
+    unknown = sorted(set(heads) - {one.sha256 for one in entries})
+    if unknown:
+        says = f"{len(unknown)} entries that were noted elsewhere are missing: {', '.join(h[:12] for h in unknown)}"
+        chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
+    flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
+    return AuditVerdict(entries, flaws, tuple(chain.torn), tuple(_open_writes(entries, digest_now)))
+
+
+def _lines_of(content: bytes) -> list[bytes]:
+    """Split into lines; the last one may lack its end."""
+    lines = content.split(b"\n")
+    return lines if lines[-1] else lines[:-1]
+
+
+def _torn_details(fragments: Sequence[bytes]) -> dict[str, object]:
+    """Return the details of the entry after unfinished lines."""
+    joined = b"\n".join(fragments)
+    return {"torn_bytes": len(joined), "torn_sha256": sha256(joined)}
+
+
+class _Chain:
+    """A walk from line to line, with the entry that must come next."""
+
+    def __init__(self, content: bytes) -> None:
+        self.lines = _lines_of(content)
+        self.found = [decode(line) for line in self.lines]
+        self.numbers = Counter(one.number for one in self.found if one is not None)
+        self.flaws: list[AuditFlaw] = []
+        self.torn: list[int] = []
+        self.unfinished: list[int] = []
+        """Lines that are no entries, since the last one that is."""
+        self.number = 1
+        self.previous: str | None = FIRST
+        """Digest that the next entry must follow; None behind a broken line."""
+        self.place = 1
+        """Line of the entry before."""
+
+    def take(self, index: int, one: AuditEntry) -> None:
+        """The next line, which is an entry."""
+        self.settle(one)
+        place = index + 1
+        if not one.holds:
+            self._add_flaw(place, Flaw.EDITED, f"the digest of entry {one.number} is not that of its content")
+            self.number, self.previous, self.place = self.number + 1, None, place
+            return
+        if one.number < self.number:
+            twice = self.numbers[one.number] > 1
+            says = f"entry {one.number} {'is there more than once' if twice else 'is after a later one'}"
+            self._add_flaw(place, Flaw.ADDED if twice else Flaw.MOVED, says)
+            return
+        if one.number > self.number:
+            missing = range(self.number, one.number)
+            gone = [number for number in missing if number not in self.numbers]
+            if gone:
+                which = f"entry {gone[0]} is" if len(gone) == 1 else f"entries {gone[0]} to {gone[-1]} are"
+                self._add_flaw(place, Flaw.REMOVED, f"{which} missing before entry {one.number}")
+            else:
+                self._add_flaw(place, Flaw.MOVED, f"entry {one.number} is before entry {missing[0]}")
+        elif self.previous is not None and one.previous != self.previous:
+            says = f"entry {one.number} follows another entry than the one before it, which was put in its place"
+            self._add_flaw(self.place, Flaw.EDITED, says)
+        self.number, self.previous, self.place = one.number + 1, one.sha256, place
+
+    def settle(self, follower: AuditEntry | None) -> None:
+        """Judge lines that are no entries: left by a killed writer, or changed."""
+        fragments = [self.lines[index] for index in self.unfinished]
+        is_torn = follower is not None and follower.action is AuditAction.TORN_LINE
+        if follower is not None and is_torn and follower.details != _torn_details(fragments):
+            says = f"entry {follower.number} reports an unfinished line that is not there as it was"
+            self._add_flaw(self.unfinished[0] + 1 if fragments else self.place + 1, Flaw.EDITED, says)
+        elif is_torn or (follower is None and all(map(_is_fragment, fragments))):
+            self.torn += [index + 1 for index in self.unfinished]
+        else:
+            for index in self.unfinished:
+                self._add_flaw(index + 1, Flaw.EDITED, "no entry as drivegain writes them")
+            if fragments:
+                self.number, self.previous = self.number + len(fragments), None
+        self.unfinished = []
+
+    def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
+        self.flaws.append(AuditFlaw(line, flaw, says))
+
+
+def _open_writes(entries: Sequence[AuditEntry], digest_now: Callable[[str], str | None]) -> Iterator[OpenWrite]:
+    # A forged chain can hold: a value that is no number names no entry.
+    ended = {begun for one in entries if one.action in _ENDS and isinstance(begun := one.details.get("begun"), int)}
+    begins = [one for one in entries if one.action in _BEGUN]
+    for place, one in enumerate(begins):
+        if one.number in ended:
+            continue
+        # The next write read the file under its lock, before it changed anything: that is nearer than the file now.
+        witness = next((later for later in begins[place + 1 :] if later.subject == one.subject), None)
+        found = digest_now(one.subject) if witness is None else _digest_before(witness)
+        before, after = _digest_before(one), one.details.get("sha256_after")
+        if found is None or before is None or not isinstance(after, str):
+            yield OpenWrite(one, Content.UNKNOWN)
+        else:
+            yield OpenWrite(one, {before: Content.BEFORE, after: Content.AFTER}.get(found, Content.OTHER))
+
+
+def _digest_before(begun: AuditEntry) -> str | None:
+    """Return the digest of the file when the write began, `GONE` without a file, None for an entry without one."""
+    recorded = begun.details.get("sha256_before", 0)
+    return GONE if recorded is None else recorded if isinstance(recorded, str) else None

@@ -1,18 +1,14 @@
-"""Rows of a history: calibrations, writes to controllers, and acknowledged changes; and the checks of these rows."""
+"""Rows of a history: calibrations, writes to controllers, and acknowledged changes."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import Enum
-from itertools import islice
-from typing import Any
 
-from daq.errors import DaqError
-from daq.workflow.calibration_file import decode
 from ident.calibration import Calibration, Gain, Source
 
 
@@ -74,6 +70,11 @@ class Acknowledgement:
     audit: str  #: SHA-256 of its entry in the audit log
 
 
+def drives_of(cell: str) -> str:
+    """Return the name of a cell's drives in audit and history."""
+    return f"drives of cell {cell}"
+
+
 def recorded_at(calibration: Calibration, otherwise: datetime) -> datetime:
     """Return when the newest log of a fit was recorded, UTC; `otherwise` where no log has a time."""
     times_s = [one.recording.recorded_s for one in _fitted(calibration) if one.recording is not None]
@@ -125,103 +126,37 @@ def zoned(text: str) -> datetime:
     return found
 
 
-COLUMNS = (
-    "created",
-    "recorded",
-    "logs",
-    "entered",
-    "cell",
-    "configuration_sha256",
-    "method",
-    "software",
-    "error_percent",
-    "holdout_percent",
-    "rows",
-)
-GAIN_COLUMNS = ("axis", "value", "std", "unit", "nameplate")
-
-
-def columns_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
-    """Return the columns of a calibration's row, besides digest and document."""
+def row_of(calibration: Calibration, digest: str, entered: datetime) -> dict[str, object]:
+    """Return the columns of a calibration's row, besides its document."""
     holdout, created = calibration.holdout_error_percent, utc(calibration.created, entered)
-    values = (
-        iso(created),
-        iso(recorded_at(calibration, created)),
-        logs_of(calibration, digest),
-        iso(entered),
-        calibration.cell,
-        calibration.configuration_sha256,
-        calibration.method,
-        calibration.software,
-        calibration.relative_error_percent.total,
-        None if holdout is None else holdout.total,
-        calibration.rows,
-    )
-    return dict(zip(COLUMNS, values, strict=True))
+    return {
+        "digest": digest,
+        "created": iso(created),
+        "recorded": iso(recorded_at(calibration, created)),
+        "logs": logs_of(calibration, digest),
+        "entered": iso(entered),
+        "cell": calibration.cell,
+        "configuration_sha256": calibration.configuration_sha256,
+        "method": calibration.method,
+        "software": calibration.software,
+        "error_percent": calibration.relative_error_percent.total,
+        "holdout_percent": None if holdout is None else holdout.total,
+        "rows": calibration.rows,
+    }
 
 
-def gain_columns_of(calibration: Calibration) -> list[dict[str, object]]:
-    """Return the columns of its gains' rows, in the order of the axes."""
-    return [{name: getattr(gain, name) for name in GAIN_COLUMNS} for gain in calibration.gains]
-
-
-def calibration_flaws(calibrations: Sequence[tuple[Any, ...]], gains: Sequence[tuple[Any, ...]]) -> Iterator[str]:
-    """Report rows of calibrations that contradict their own document, as sentences.
-
-    Args:
-        calibrations: digest, document, and `COLUMNS` of each.
-        gains: digest of the calibration, and `GAIN_COLUMNS` of each.
-
-    Raises:
-        ValueError: a row has no valid time.
-    """
-    rows_of: dict[str, list[tuple[Any, ...]]] = {}
-    for digest, *gain in gains:
-        rows_of.setdefault(digest, []).append(tuple(gain))
-    for digest, document, *columns in calibrations:
-        name = f"calibration {digest[:12]}…"
-        found_row = dict(zip(COLUMNS, columns, strict=True))
-        entered = zoned(found_row["entered"])
-        try:
-            calibration = decode(document.encode(), f"document of {name}")
-        except DaqError as error:
-            yield f"{name}: its document is {error.found}, expected {error.expected}"
-            continue
-        yield from _differences(f"row of {name}", found_row, columns_of(calibration, digest, entered))
-        expected = gain_columns_of(calibration)
-        rows = [dict(zip(GAIN_COLUMNS, row, strict=True)) for row in rows_of.get(digest, [])]
-        axes, wanted = ([row["axis"] for row in some] for some in (rows, expected))
-        if axes != wanted:
-            yield f"gains of {name}: found {_listed(axes)}, expected {_listed(wanted)} as its document says"
-            continue
-        for row, expected_row in zip(rows, expected, strict=True):
-            yield from _differences(f"gain of {row['axis']} in {name}", row, expected_row)
-
-
-def gap_flaws(table: str, there: set[int], last: int) -> Iterator[str]:
-    """Report missing rows: `there` are the numbers of a table's rows, which go from 1 to `last` without gaps."""
-    missing = list(islice((number for number in range(1, last + 1) if number not in there), 5))
-    if missing:
-        yield f"{table} {_listed(missing)}: found no such row, expected all from 1 to {last}"
-
-
-def early_flaws(acknowledgements: Iterable[Acknowledgement]) -> Iterator[str]:
-    """Report acknowledgements that would silence an axis beforehand."""
-    for noted in acknowledgements:
-        if noted.since > noted.at:
-            yield (
-                f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}, "
-                "expected one that does not begin later than the acknowledgement itself"
-            )
-
-
-def _differences(name: str, found_row: dict[str, Any], expected: dict[str, Any]) -> Iterator[str]:
-    for column, expected_value in expected.items():
+def differences(
+    name: str, found: Mapping[str, object], expected: Mapping[str, object], source: str, but: Collection[str] = ()
+) -> Iterator[str]:
+    """Report values that differ from the expected ones of the same name, as sentences; those in `but` may."""
+    for key, value in expected.items():
         # SQLite has no NaN: it keeps NULL.
-        wanted = None if isinstance(expected_value, float) and math.isnan(expected_value) else expected_value
-        if found_row[column] != wanted:
-            yield f"{name}: found {column} {found_row[column]!r}, expected {wanted!r} as its document says"
+        wanted = None if isinstance(value, float) and math.isnan(value) else value
+        if found[key] != wanted and key not in but:
+            one, other = ((iso(v) if isinstance(v, datetime) else v) for v in (found[key], wanted))
+            yield f"{name}: found {key} {one!r}, expected {other!r} {source}"
 
 
-def _listed(names: Iterable[object]) -> str:
+def listed(names: Iterable[object]) -> str:
+    """Join names with commas; `none` without one."""
     return ", ".join(map(str, names)) or "none"

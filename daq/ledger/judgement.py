@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from daq.ledger.entry import Entry, Event
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import dispersions_of
 from daq.writeback.request import GainChange
@@ -14,32 +13,6 @@ from ident.drift.change import DISPERSION, ChangeDecision, decide
 
 SAME_SIGMAS = 0.5
 """A number in the controller's file that is as near to a gain of the history is that gain, rounded for the file."""
-
-
-def stds_in_force(entries: Iterable[Entry], in_force: str | None, gains: Mapping[str, float]) -> dict[str, float]:
-    """Return the σ of the gains in a controller, by axis.
-
-    It is that of the calibration in force where the number is still that calibration's. Else it is that of the newest
-    calibration with this number: the history lacks a write after a kill, or when a backup was copied back by hand. It
-    is 0 for a number of no calibration, which a person entered.
-
-    Args:
-        entries: of the history, oldest first.
-        in_force: digest of the calibration that is in force according to the history, None without one.
-        gains: in the controller now, by axis.
-    """
-    stds = dict.fromkeys(gains, 0.0)
-    for entry in sorted(entries, key=lambda entry: entry.digest == in_force):  # the last one that fits counts
-        for gain in entry.gains:
-            if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
-                stds[gain.axis] = gain.std
-    return stds
-
-
-def digests_in_force(events: Iterable[Event]) -> frozenset[str]:
-    """Return the digests of the calibrations in force in any controller; events oldest first."""
-    newest = {event.target: event.digest for event in events}
-    return frozenset(digest for digest in newest.values() if digest is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,31 +32,30 @@ NOTHING = Known()
 def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Known:
     """Return the figures of a history for the gains in a controller.
 
-    Args:
-        store: of the cell.
-        target: the controller's file, or the drives, as events name it.
-        digest: of the calibration that is judged, which is left out: a number that is near to it is another one unless
-            it is in force, and the scatter is that of the others.
-        changes: one an axis.
+    The σ of a gain is that of the calibration in force where the number is still that calibration's. Else it is that of
+    the newest calibration with this number: the history lacks a write after a kill, or when a backup was copied back by
+    hand. It is 0 for a number of no calibration, which a person entered.
+
+    The calibration that is judged, by its digest, is left out: a number that is near to it is another one unless it is
+    in force, and the scatter is that of the others.
 
     Raises:
         HistoryUnreadable: see `daq.ledger.store`.
     """
     entries, in_force = store.entries(), store.in_force(target)
     others = [entry for entry in entries if entry.digest != digest]
-    whose = entries if in_force == digest else others
     gains = {change.axis: change.old for change in changes}
-    return Known(stds_in_force(whose, in_force, gains), dispersions_of(others, tuple(gains)))
+    stds = dict.fromkeys(gains, 0.0)
+    # Oldest first, then the one in force: the last one that fits counts.
+    for entry in sorted(entries if in_force == digest else others, key=lambda entry: entry.digest == in_force):
+        for gain in entry.gains:
+            if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
+                stds[gain.axis] = gain.std
+    return Known(stds, dispersions_of(others, tuple(gains)))
 
 
 def judge(changes: Sequence[GainChange], known: Known) -> ChangeDecision:
-    """Decide whether any change is more than noise (`ident.drift.change.decide`); numbers that are not finite have a
-    gate of their own.
-
-    Args:
-        changes: one an axis.
-        known: by a history.
-    """
+    """Decide whether any change is more than noise; numbers that are not finite have a gate of their own."""
     comparable = [
         change
         for change in changes

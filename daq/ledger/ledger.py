@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import shutil
 import sqlite3
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -18,16 +18,14 @@ from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import AuditUnusable, DataError, HistoryUnreadable, OutputFailed
 from daq.files import fsync_folder
-from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, find_write_entry, read, verify
+from daq.ledger.audit import AuditAction, AuditEntry, AuditVerdict, append, read, verify
 from daq.ledger.entry import Acknowledgement, Event, iso
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import (
     AuditedWrite,
-    acknowledgement_flaws,
-    calibration_flaws,
     catch_up,
+    contradictions,
     entered_calibration,
-    event_flaws,
     is_end,
     unknown_writes,
     writes_to,
@@ -59,11 +57,6 @@ class Ledger(HistoryStore):
 
     Where the audit log cannot be written, the history has what was added all the same, a warning says so, and `rebuild`
     enters it in the audit log later: a write that was made must not be called undone.
-
-    Args:
-        cell: whose ledger it is.
-        place: of audit log and history.
-        who: the person or the job.
     """
 
     def __init__(self, cell: Cell, place: HistoryPlace, who: str) -> None:
@@ -84,13 +77,8 @@ class Ledger(HistoryStore):
     ) -> None:
         """Enter that a controller has the gains of a calibration; before it what other processes could not enter.
 
-        Args:
-            digest: of the calibration, which was added before.
-            at: when, with its zone.
-            target: the controller's file or the drives, as the audit log names it.
-            sha256_after: of the target's content with these gains.
-            entry: SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may have
-                been killed before it entered the write, or entered it.
+        `entry` is the SHA-256 of the audit log's entry of the write; None where an earlier process wrote, which may
+        have been killed before it entered the write, or entered it.
 
         Raises:
             AuditUnusable, HistoryUnreadable, OutputFailed: see `HistoryStore.applied`.
@@ -98,7 +86,9 @@ class Ledger(HistoryStore):
         if entry is None:
             if self.in_force(target) == digest:
                 return
-            entry = find_write_entry(self.place.audit, target, sha256_after)
+            for one in read(self.place.audit):
+                if (one.subject, one.details.get("sha256_after")) == (target, sha256_after):
+                    entry = one.sha256  # the newest one counts
         if not any(entry in write.digests for write in self.catch_up()):
             self.applied(digest, at=at, who=self.who, target=target, audit=entry, sha256_after=sha256_after)
 
@@ -115,9 +105,7 @@ class Ledger(HistoryStore):
         """
         details = {"axis": axis, "cell": self.cell.name, "since": since.isoformat(), "why": why}
         try:
-            entry = append(
-                self.place.audit, AuditAction.ACKNOWLEDGED, at=at, who=who, subject=f"gain of {axis}", details=details
-            )
+            entry = self._append(AuditAction.ACKNOWLEDGED, at, who, f"gain of {axis}", details)
         except OSError as error:
             raise OutputFailed.of(self.place.audit, error) from error
         self.acknowledge(Acknowledgement(axis, since, at, who, why, entry.sha256))
@@ -138,17 +126,8 @@ class Ledger(HistoryStore):
         verdict, broken = verify(self.place.audit, self.audited().union(heads)), self.integrity()
         if not verdict.holds:  # its entries prove nothing
             return Verification(self.place, verdict, broken)
-        entries, audited = verdict.entries, self.audited()
-        by_digest = {one.sha256: one for one in entries}
-        for number, event in enumerate(self.events(), start=1):
-            if (entry := by_digest.get(event.audit or "")) is not None:
-                broken += tuple(f"event {number}: {flaw}" for flaw in event_flaws(event, entry, entries))
-        for noted in self.acknowledgements():
-            if (entry := by_digest.get(noted.audit)) is not None:
-                name = f"acknowledgement of {noted.axis} at {iso(noted.at)}"
-                broken += tuple(f"{name}: {flaw}" for flaw in acknowledgement_flaws(noted, entry))
-        broken += tuple(calibration_flaws(entries, self.cell.name, self))
-        unknown, new = unknown_writes(writes_to(self.cell, entries), audited)
+        broken += tuple(contradictions(verdict.entries, self.cell.name, self))
+        unknown, new = unknown_writes(writes_to(self.cell, verdict.entries), self.audited())
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
     def enter_in_audit(self, at: datetime) -> None:
@@ -162,13 +141,13 @@ class Ledger(HistoryStore):
         }
         for event in self.events():
             if (event.target, event.at.isoformat(), event.who) not in found:
-                self._with_entry(event, event.who, {"migrated": True})
+                self._with_entry(event, {"migrated": True})
 
     def _note(self, connection: sqlite3.Connection, event: Event) -> None:
         """Enter a write; one that no entry of the audit log ends is entered there as found."""
-        super()._note(connection, self._with_entry(event, event.who, {}))
+        super()._note(connection, self._with_entry(event, {}))
 
-    def _with_entry(self, event: Event, who: str, more: dict[str, object]) -> Event:
+    def _with_entry(self, event: Event, more: dict[str, object]) -> Event:
         try:
             entries = {one.sha256: one for one in read(self.place.audit)}
             named = entries.get(event.audit or "")
@@ -181,9 +160,7 @@ class Ledger(HistoryStore):
                 "sha256_after": event.sha256_after,
                 **more,
             }
-            found = append(
-                self.place.audit, AuditAction.WRITE_FOUND, at=event.at, who=who, subject=event.target, details=details
-            )
+            found = self._append(AuditAction.WRITE_FOUND, event.at, event.who, event.target, details)
             return replace(event, audit=found.sha256)
         except (AuditUnusable, OSError) as error:
             _LOG.warning("the audit log does not have this write: %s", error)
@@ -191,28 +168,24 @@ class Ledger(HistoryStore):
 
     def _enter_calibration(self, calibration: Calibration, digest: str, entered: datetime, at: datetime) -> None:
         try:
-            if any(_has(one, digest, self.cell.name) for one in read(self.place.audit)):
+            known = [found for one in read(self.place.audit) for found in entered_calibration(one, self.cell.name)]
+            if any(digest == one for one, _, _ in known):
                 return
-            append(
-                self.place.audit,
-                AuditAction.CALIBRATION_ENTERED,
-                at=at,
-                who=self.who,
-                subject=f"history of {self.cell.name}",
-                details={
-                    "sha256": digest,
-                    "cell": self.cell.name,
-                    "entered": iso(entered),
-                    "document": encode(calibration).decode(),
-                },
-            )
+            details = {
+                "sha256": digest,
+                "cell": self.cell.name,
+                "entered": iso(entered),
+                "document": encode(calibration).decode(),
+            }
+            subject = f"history of {self.cell.name}"
+            self._append(AuditAction.CALIBRATION_ENTERED, at, self.who, subject, details)
         except (AuditUnusable, OSError) as error:
             _LOG.warning("the audit log does not have this calibration: %s", error)
 
-
-def _has(entry: AuditEntry, digest: str, cell: str) -> bool:
-    found = entered_calibration(entry, cell)
-    return found is not None and found.digest == digest
+    def _append(
+        self, action: AuditAction, at: datetime, who: str, subject: str, details: Mapping[str, object]
+    ) -> AuditEntry:
+        return append(self.place.audit, action, at=at, who=who, subject=subject, details=details)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,12 +205,7 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
     Calibrations and writes that only the history has, which an earlier version wrote, are entered in the audit log
     first, unless the history contradicts itself or the audit log.
 
-    Args:
-        cell: whose history it is.
-        place: of audit log and history.
-        who: the person.
-        at: now, with its zone.
-        heads: SHA-256 of entries of the audit log that were noted elsewhere.
+    `heads` are the SHA-256 of entries of the audit log that were noted elsewhere.
 
     Raises:
         DataError: the audit log is not what was written; nothing was changed.
@@ -263,7 +231,13 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
         with HistoryStore(new) as index:
             catch_up(cell, place, index, own)
             counts = len(index.entries()), len(index.events()), len(index.acknowledgements())
-        kept = _keep(place.store, at) if place.store.exists() else None
+        kept = None
+        if place.store.exists():
+            kept = place.store.with_name(f"{place.store.name}.{at:%Y%m%dT%H%M%SZ}.bak")
+            shutil.copyfile(place.store, kept)
+            journal = place.store.with_name(f"{place.store.name}-journal")
+            if journal.exists():  # SQLite would apply it to the new history
+                journal.rename(kept.with_name(f"{kept.name}-journal"))
         if new.exists():
             new.replace(place.store)
         else:
@@ -272,16 +246,6 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
     except OSError as error:
         raise OutputFailed.of(place.store, error) from error
     return Rebuilt(*counts, kept, trusted)
-
-
-def _keep(store: Path, at: datetime) -> Path:
-    """Copy a history, and move the journal that SQLite would otherwise apply to the new one."""
-    kept = store.with_name(f"{store.name}.{at:%Y%m%dT%H%M%SZ}.bak")
-    shutil.copyfile(store, kept)
-    journal = store.with_name(f"{store.name}-journal")
-    if journal.exists():
-        journal.rename(kept.with_name(f"{kept.name}-journal"))
-    return kept
 
 
 def audit_error(place: HistoryPlace, verdict: AuditVerdict) -> DataError:

@@ -10,93 +10,146 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
 from datetime import datetime
-from enum import Enum
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 from urllib.parse import quote
 
-from daq.errors import DataError, HistoryUnreadable, OutputFailed
-from daq.ledger import schema
+from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
 from daq.ledger.entry import (
-    COLUMNS,
-    GAIN_COLUMNS,
     Acknowledgement,
     Entry,
     Event,
     WriteAction,
-    calibration_flaws,
-    columns_of,
-    early_flaws,
-    gain_columns_of,
-    gap_flaws,
+    differences,
     iso,
+    listed,
+    row_of,
     zoned,
 )
-from daq.workflow.calibration_file import encode
+from daq.workflow.calibration_file import decode, encode
 from ident.calibration import Calibration, Gain
 
 BUSY_S = 20.0  #: How long to wait for another process' transaction: each is a few rows
 
+APPLICATION_ID = 0x64726776  #: In the header of every history (PRAGMA application_id); read as text it says drgv
+VERSION = 1
+
+_TABLES = """
+CREATE TABLE calibration (
+    digest               TEXT NOT NULL PRIMARY KEY,  -- SHA-256 of calibration.yaml
+    created              TEXT NOT NULL,              -- ISO 8601, UTC, as all times here
+    recorded             TEXT NOT NULL,              -- newest log of the fit; as created without one
+    logs                 TEXT NOT NULL,              -- SHA-256 of the digests of the fit's logs, sorted
+    entered              TEXT NOT NULL,
+    cell                 TEXT NOT NULL,
+    configuration_sha256 TEXT NOT NULL,
+    method               TEXT NOT NULL,
+    software             TEXT NOT NULL,
+    error_percent        REAL NOT NULL,
+    holdout_percent      REAL,
+    rows                 INTEGER NOT NULL,
+    document             TEXT NOT NULL               -- calibration.yaml: also parameters, effects, logs' digests
+) STRICT;
+CREATE TABLE gain (
+    digest    TEXT NOT NULL REFERENCES calibration,
+    place     INTEGER NOT NULL,
+    axis      TEXT NOT NULL,
+    value     REAL NOT NULL,
+    std       REAL NOT NULL,                         -- 0 where the fit held it fixed
+    unit      TEXT NOT NULL,
+    nameplate REAL NOT NULL,
+    PRIMARY KEY (digest, axis)
+) STRICT;
+CREATE TABLE event (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    digest TEXT REFERENCES calibration,              -- whose gains the target had afterwards, NULL where unknown
+    deed   TEXT NOT NULL CHECK (deed IN ('applied', 'rolled back')),
+    at     TEXT NOT NULL,
+    who    TEXT NOT NULL,
+    target TEXT NOT NULL,
+    audit  TEXT,                                     -- SHA-256 of its entry in the audit log
+    sha256_after TEXT                                -- of its content afterwards, NULL where unknown
+) STRICT;
+CREATE TABLE acknowledgement (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    axis   TEXT NOT NULL,
+    since  TEXT NOT NULL,                            -- calibrations from then on make the new baseline
+    at     TEXT NOT NULL,
+    who    TEXT NOT NULL,
+    why    TEXT NOT NULL,
+    audit  TEXT NOT NULL
+) STRICT;
+"""
+
+
+_COLUMNS = ", ".join(one.name for one in fields(Entry) if one.name not in ("gains", "events"))
 _NOT_WRITABLE = ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN")
 
 
-class Access(Enum):
-    """Access to the file; the value is SQLite's `mode` of a URI."""
-
-    READ = "rw"
-    """Opens an existing file, read-only where it cannot be written. Not "ro", which could not undo an unfinished
-    transaction."""
-    WRITE = "rwc"
-
-
-def connect(path: Path, access: Access) -> sqlite3.Connection:
-    """Open the file and check that it is a history.
+def _connect(path: Path, *, write: bool = False) -> sqlite3.Connection:
+    """Open the file, made where it is missing and is to be written, and check that it is a history.
 
     Raises:
         HistoryUnreadable: it is none, of another version, broken, or locked for long.
         OutputFailed: there is none, and none can be made.
     """
-    with translate_sqlite_errors(path, access):
-        address = f"file:{quote(os.fsencode(path.absolute()))}?mode={access.value}"
+    with _translate_sqlite_errors(path, write=write):
+        # Not "ro" to read, which could not undo an unfinished transaction; "rw" opens a read-only file all the same.
+        address = f"file:{quote(os.fsencode(path.absolute()))}?mode={'rwc' if write else 'rw'}"
         connection = sqlite3.connect(address, uri=True, timeout=BUSY_S, isolation_level=None)
         try:
+            connection.row_factory = sqlite3.Row
             connection.execute("PRAGMA foreign_keys = ON")
             connection.execute("PRAGMA trusted_schema = OFF")
             # EXTRA: a power cut behind the commit does not bring the journal, and the old content, back.
             connection.execute("PRAGMA synchronous = EXTRA")
-            if not schema.is_empty(connection):
-                schema.check(connection, path)
+            if not _is_empty(connection):
+                _check(connection, path)
         except BaseException:
             connection.close()
             raise
     return connection
 
 
+def _is_empty(connection: sqlite3.Connection) -> bool:
+    """Whether nothing was ever written: a new file, or one whose first writer was killed before it was done."""
+    (tables,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+    return not tables and not _number(connection, "application_id")
+
+
+def _number(connection: sqlite3.Connection, pragma: str) -> int:
+    (value,) = connection.execute(f"PRAGMA {pragma}").fetchone()
+    return int(value)
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    version = _number(connection, "user_version")
+    if _number(connection, "application_id") != APPLICATION_ID:
+        raise HistoryUnreadable(
+            str(path),
+            found="an SQLite file of another program",
+            expected="the history that drivegain keeps of a cell",
+            remedy="name another file in `history.store` of the cell; nothing was written",
+        )
+    if version != VERSION:
+        later = version > VERSION
+        raise HistoryUnreadable(
+            str(path),
+            found=f"a history of version {version}",
+            expected=f"version {VERSION}",
+            remedy="a later drivegain made it: use that one; nothing was written"
+            if later
+            else "no drivegain ever made this version: restore the file from a backup; nothing was written",
+        )
+
+
 @contextlib.contextmanager
-def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
-    """Write all or nothing; an empty file gets its tables.
-
-    Raises:
-        HistoryUnreadable, OutputFailed: see `connect`.
-    """
-    with translate_sqlite_errors(path, Access.WRITE):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            if schema.is_empty(connection):
-                schema.create(connection)
-            yield
-            connection.execute("COMMIT")
-        except BaseException:
-            with contextlib.suppress(sqlite3.Error):
-                connection.execute("ROLLBACK")
-            raise
-
-
-@contextlib.contextmanager
-def translate_sqlite_errors(path: Path, access: Access) -> Iterator[None]:
+def _translate_sqlite_errors(path: Path, *, write: bool = False) -> Iterator[None]:
     """Translate the errors of SQLite.
 
     Raises:
@@ -106,7 +159,7 @@ def translate_sqlite_errors(path: Path, access: Access) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        if access is Access.WRITE:
+        if write:
             raise
         raise _broken(path, f"a row that drivegain did not write: {error}") from error
     except sqlite3.Error as error:
@@ -118,7 +171,7 @@ def translate_sqlite_errors(path: Path, access: Access) -> Iterator[None]:
                 expected="a lock for as long as a row takes",
                 remedy="see who has it open (`fuser`), and try again",
             ) from error
-        if name.startswith(_NOT_WRITABLE) and access is Access.WRITE:
+        if name.startswith(_NOT_WRITABLE) and write:
             raise OutputFailed(
                 str(path),
                 found=f"{error} ({name})",
@@ -152,7 +205,7 @@ class HistoryStore:
             HistoryUnreadable: it is no history, of another version, broken, or locked for long.
         """
         if self.path.exists():
-            self._connection = connect(self.path, Access.READ)
+            self._connection = _connect(self.path)
         return self
 
     def __exit__(
@@ -164,15 +217,7 @@ class HistoryStore:
             self._connection = None
 
     def add(self, calibration: Calibration, *, digest: str, at: datetime) -> bool:
-        """Enter a calibration.
-
-        Args:
-            calibration: of this cell.
-            digest: SHA-256 of its file.
-            at: now, with its zone.
-
-        Returns:
-            whether it is new: the same file is entered once.
+        """Enter a calibration, with the SHA-256 of its file; return whether it is new: a file is entered once.
 
         Raises:
             DataError: another cell, other axes, or a gain in another unit than the history's.
@@ -183,15 +228,10 @@ class HistoryStore:
             if connection.execute("SELECT 1 FROM calibration WHERE digest = ?", (digest,)).fetchone():
                 return False
             self._check_like(calibration)
-            connection.execute(
-                f"INSERT INTO calibration (digest, {', '.join(COLUMNS)}, document)"
-                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (digest, *columns_of(calibration, digest, at).values(), encode(calibration).decode()),
-            )
-            connection.executemany(
-                "INSERT INTO gain (digest, place, axis, value, std, unit, nameplate) VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [(digest, place, *gain.values()) for place, gain in enumerate(gain_columns_of(calibration))],
-            )
+            row = {**row_of(calibration, digest, at), "document": encode(calibration).decode()}
+            _insert(connection, "calibration", row)
+            for place, gain in enumerate(calibration.gains):
+                _insert(connection, "gain", {"digest": digest, "place": place, **asdict(gain)})
         return True
 
     def applied(
@@ -204,16 +244,10 @@ class HistoryStore:
         audit: str | None = None,
         sha256_after: str | None = None,
     ) -> None:
-        """Enter a write of a calibration's gains.
+        """Enter a write of a calibration's gains; the arguments are those of `Event`.
 
-        Args:
-            digest: of the calibration, which was entered before.
-            at: when, with its zone.
-            who: the person or the job.
-            target: the controller's file, as the audit log names it.
-            audit: SHA-256 of its entry in the audit log; by it `drivegain history --verify` notices an audit log
-                whose end was cut off.
-            sha256_after: of the target's content now, by which a rollback to it is recognised.
+        By `audit`, `drivegain history --verify` notices an audit log whose end was cut off. By `sha256_after`, a
+        rollback to this content is recognised.
 
         Raises:
             ValueError: the calibration was never entered, or the time has no zone.
@@ -229,13 +263,9 @@ class HistoryStore:
     ) -> str | None:
         """Enter that the last write to `target` was undone.
 
-        Args:
-            at, who, target, audit: as in `applied`.
-            sha256_after: of the target's content now. The gains of a calibration are recognised by it; numbers that a
-                person entered in between are in no calibration.
-
         Returns:
-            digest of the calibration with these gains, None without one.
+            digest of the calibration whose gains are recognised by `sha256_after`; None for numbers that a person
+            entered in between, which are in no calibration.
         """
         with self._writing() as connection:
             same = [event for event in self.events() if (event.target, event.sha256_after) == (target, sha256_after)]
@@ -246,31 +276,36 @@ class HistoryStore:
     def acknowledge(self, noted: Acknowledgement) -> None:
         """Enter an explained change of a gain. Raises as `applied`."""
         with self._writing() as connection:
-            connection.execute(
-                "INSERT INTO acknowledgement (axis, since, at, who, why, audit) VALUES (?, ?, ?, ?, ?, ?)",
-                (noted.axis, iso(noted.since), iso(noted.at), noted.who, noted.why, noted.audit),
-            )
+            row = {**asdict(noted), "since": iso(noted.since), "at": iso(noted.at)}
+            _insert(connection, "acknowledgement", row)
 
     def entries(self) -> tuple[Entry, ...]:
         """Return all calibrations in the order in which they were fitted."""
         events = self.events()
-        rows = self._rows(f"SELECT digest, {', '.join(COLUMNS)} FROM calibration ORDER BY created, entered, digest")
+        rows = self._rows(f"SELECT {_COLUMNS} FROM calibration ORDER BY created, entered, digest")
         gains: dict[str, list[Gain]] = {}
-        for digest, *gain in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
-            gains.setdefault(digest, []).append(Gain(*gain))
-        with translate_sqlite_errors(self.path, Access.READ):
-            return tuple(_entry(row, gains.get(row[0], []), events) for row in rows)
+        for row in self._rows("SELECT digest, axis, value, std, unit, nameplate FROM gain ORDER BY place"):
+            gains.setdefault(row["digest"], []).append(Gain(*row[1:]))
+        with _translate_sqlite_errors(self.path):
+            return tuple(
+                Entry(
+                    **{**dict(row), **{name: zoned(row[name]) for name in ("created", "recorded", "entered")}},
+                    gains=tuple(gains.get(row["digest"], ())),
+                    events=tuple(event for event in events if event.digest == row["digest"]),
+                )
+                for row in rows
+            )
 
     def events(self) -> tuple[Event, ...]:
         """Return all writes to controllers, oldest first."""
         rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
-        with translate_sqlite_errors(self.path, Access.READ):
+        with _translate_sqlite_errors(self.path):
             return tuple(Event(row[0], WriteAction(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """Return all acknowledgements, oldest first."""
         rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
-        with translate_sqlite_errors(self.path, Access.READ):
+        with _translate_sqlite_errors(self.path):
             return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
 
     def audited(self) -> frozenset[str]:
@@ -279,11 +314,7 @@ class HistoryStore:
         return frozenset(sha256 for sha256 in noted if sha256 is not None)
 
     def in_force(self, target: str | None = None) -> str | None:
-        """Return the digest of the calibration of a controller's last write, None for numbers of no calibration.
-
-        Args:
-            target: the controller's file; None for the controller that was written last.
-        """
+        """Return the digest of the calibration in a target, or in the last written one; None for other numbers."""
         events = [event for event in self.events() if target in {None, event.target}]
         return events[-1].digest if events else None
 
@@ -305,22 +336,43 @@ class HistoryStore:
         found = [text for text in found if text != "ok"]
         if found:  # rows of a broken file prove nothing
             return tuple(found)
-        calibrations = self._rows(
-            f"SELECT digest, document, {', '.join(COLUMNS)} FROM calibration ORDER BY created, digest"
-        )
-        gains = self._rows(f"SELECT digest, {', '.join(GAIN_COLUMNS)} FROM gain ORDER BY digest, place")
-        with translate_sqlite_errors(self.path, Access.READ):
-            return (
-                *calibration_flaws(calibrations, gains),
-                *(flaw for table in ("event", "acknowledgement") for flaw in gap_flaws(table, *self._numbers(table))),
-                *early_flaws(self.acknowledgements()),
-            )
+        with _translate_sqlite_errors(self.path):
+            return (*self._calibration_flaws(), *self._gap_flaws("event"), *self._gap_flaws("acknowledgement"))
 
-    def _numbers(self, table: str) -> tuple[set[int], int]:
-        """Return the numbers of a table's rows, and the last one that SQLite gave."""
+    def _calibration_flaws(self) -> Iterator[str]:
+        """Report rows of calibrations that contradict their own document, and acknowledgements of the future."""
+        for row in self._rows("SELECT * FROM calibration ORDER BY created, digest"):
+            digest, name = row["digest"], f"calibration {row['digest'][:12]}…"
+            entered = zoned(row["entered"])
+            try:
+                calibration = decode(row["document"].encode(), f"document of {name}")
+            except DaqError as error:
+                yield f"{name}: its document is {error.found}, expected {error.expected}"
+                continue
+            said = "as its document says"
+            yield from differences(f"row of {name}", dict(row), row_of(calibration, digest, entered), said)
+            gains = self._rows("SELECT * FROM gain WHERE digest = ? ORDER BY place", (digest,))
+            axes, wanted = [gain["axis"] for gain in gains], [gain.axis for gain in calibration.gains]
+            if axes != wanted:
+                yield f"gains of {name}: found {listed(axes)}, expected {listed(wanted)} {said}"
+                continue
+            for found, expected in zip(gains, calibration.gains, strict=True):
+                yield from differences(f"gain of {expected.axis} in {name}", dict(found), asdict(expected), said)
+        for noted in self.acknowledgements():
+            if noted.since > noted.at:
+                yield (
+                    f"acknowledgement of {noted.axis} at {iso(noted.at)}: found a baseline since {iso(noted.since)}, "
+                    "expected one that does not begin later than the acknowledgement itself"
+                )
+
+    def _gap_flaws(self, table: str) -> Iterator[str]:
+        """Report missing rows of a table: their numbers go from 1 to the last that SQLite gave, without gaps."""
         there = {int(row[0]) for row in self._rows(f"SELECT number FROM {table}")}
         given = self._rows("SELECT seq FROM sqlite_sequence WHERE name = ?", (table,))
-        return there, max([*there, *(int(row[0]) for row in given), 0])
+        last = max([*there, *(int(row[0]) for row in given), 0])
+        missing = list(islice((number for number in range(1, last + 1) if number not in there), 5))
+        if missing:
+            yield f"{table} {listed(missing)}: found no such row, expected all from 1 to {last}"
 
     def _check_like(self, calibration: Calibration) -> None:
         entries = self.entries()
@@ -350,37 +402,40 @@ class HistoryStore:
         )
 
     def _note(self, connection: sqlite3.Connection, event: Event) -> None:
-        connection.execute(
-            "INSERT INTO event (digest, deed, at, who, target, audit, sha256_after) VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (
-                event.digest,
-                event.action.value,
-                iso(event.at),
-                event.who,
-                event.target,
-                event.audit,
-                event.sha256_after,
-            ),
-        )
+        row = {**asdict(event), "at": iso(event.at), "deed": event.action.value}
+        del row["action"]
+        _insert(connection, "event", row)
 
-    def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
+    def _rows(self, query: str, values: tuple[object, ...] = ()) -> list[sqlite3.Row]:
         if self._connection is None:
             return []
-        with translate_sqlite_errors(self.path, Access.READ):
-            if schema.is_empty(self._connection):
+        with _translate_sqlite_errors(self.path):
+            if _is_empty(self._connection):
                 return []
             return self._connection.execute(query, values).fetchall()
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
+        """Write all or nothing; an empty file gets its tables."""
         if self._connection is None:
-            self._connection = connect(self.path, Access.WRITE)
-        with transaction(self._connection, self.path):
-            yield self._connection
+            self._connection = _connect(self.path, write=True)
+        connection = self._connection
+        with _translate_sqlite_errors(self.path, write=True):
+            connection.execute("BEGIN IMMEDIATE")
+            try:
+                if _is_empty(connection):
+                    for statement in filter(str.strip, _TABLES.split(";\n")):
+                        connection.execute(statement)
+                    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+                    connection.execute(f"PRAGMA user_version = {VERSION}")
+                yield connection
+                connection.execute("COMMIT")
+            except BaseException:
+                with contextlib.suppress(sqlite3.Error):
+                    connection.execute("ROLLBACK")
+                raise
 
 
-def _entry(row: tuple[Any, ...], gains: list[Gain], events: tuple[Event, ...]) -> Entry:
-    columns: dict[str, Any] = dict(zip(("digest", *COLUMNS), row, strict=True))
-    columns |= {name: zoned(columns[name]) for name in ("created", "recorded", "entered")}
-    own = tuple(event for event in events if event.digest == columns["digest"])
-    return Entry(**columns, gains=tuple(gains), events=own)
+def _insert(connection: sqlite3.Connection, table: str, row: Mapping[str, object]) -> None:
+    places = ", ".join("?" * len(row))
+    connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({places})", tuple(row.values()))

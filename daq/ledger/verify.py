@@ -5,17 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 
 from daq.config.cell import Cell
 from daq.config.policy import HistoryPlace
 from daq.errors import DataError
 from daq.ledger.audit import AuditAction, AuditEntry, verify
-from daq.ledger.entry import Acknowledgement, Event, WriteAction, iso, utc
+from daq.ledger.entry import Acknowledgement, Event, WriteAction, differences, drives_of, iso, utc
 from daq.ledger.store import HistoryStore
 from daq.workflow.calibration_file import decode
-from daq.writeback.drive_record import drives_of
 
 _ENDS = {AuditAction.APPLIED: WriteAction.APPLIED, AuditAction.ROLLED_BACK: WriteAction.ROLLED_BACK}
 _BEGINS = (AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN)
@@ -39,14 +38,7 @@ class AuditedWrite:
     @property
     def calibration(self) -> str | None:
         """SHA-256 of the calibration, None where the audit log has none."""
-        return None if self.begun is None else calibration_of(self.begun)
-
-    @property
-    def cell(self) -> str | None:
-        """Name of the calibration's cell, None where the audit log has none."""
-        recorded = None if self.begun is None else self.begun.details.get("calibration")
-        found = recorded.get("cell") if isinstance(recorded, dict) else None
-        return found if isinstance(found, str) else None
+        return None if self.begun is None else _calibration(self.begun, "sha256")
 
     @property
     def sha256_after(self) -> str | None:
@@ -57,11 +49,6 @@ class AuditedWrite:
     def digests(self) -> frozenset[str]:
         """SHA-256 of its entries; an event of the history names one of them."""
         return frozenset(one.sha256 for one in (self.begun, self.ended) if one is not None)
-
-    @property
-    def changed_nothing(self) -> bool:
-        """Whether the target held the same before it: drives are written again to let them save."""
-        return self.begun is not None and self.sha256_after == _text(self.begun, "sha256_before") is not None
 
     def __str__(self) -> str:
         one = self.ended
@@ -82,10 +69,7 @@ def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = F
     Another cell may have the same audit log, and even the same controller file: what was written with its calibrations,
     and rolled back from there, is in its own history.
 
-    Args:
-        cell: whose calibrations.
-        entries: of the audit log.
-        everywhere: also to files that are not the cell's controller (`apply --to`).
+    `everywhere` includes files that are not the cell's controller (`apply --to`).
     """
     file = cell.controller_path
     # Not `resolve_links`: a link that it refuses today was followed on the day of the write.
@@ -98,18 +82,16 @@ def writes_to(cell: Cell, entries: Sequence[AuditEntry], *, everywhere: bool = F
             continue
         write = AuditedWrite(one if one.action is AuditAction.WRITE_FOUND else begun.get(_number(one)), one)
         if write.action is WriteAction.APPLIED:
-            owners[one.subject] = write.cell or (cell.name if one.subject in targets else "")
+            owner = None if write.begun is None else _calibration(write.begun, "cell")
+            owners[one.subject] = owner or (cell.name if one.subject in targets else "")
         if owners.get(one.subject) == cell.name:
             later = len(found)
-            if one.details.get("migrated") is True:  # its entry is younger than the write
-                later = next((i for i, other in enumerate(found) if _is_later(other.ended, one)), later)
+            at = at_of(one)
+            if one.details.get("migrated") is True and at is not None:  # its entry is younger than the write
+                times = [at_of(other.ended) for other in found]
+                later = next((i for i, other in enumerate(times) if other is not None and other > at), later)
             found.insert(later, write)
     return found
-
-
-def _is_later(entry: AuditEntry, than: AuditEntry) -> bool:
-    at, other = at_of(entry), at_of(than)
-    return at is not None and other is not None and at > other
 
 
 def unknown_writes(
@@ -123,9 +105,11 @@ def unknown_writes(
         target = write.ended.subject
         after, after_known = following.get(target, (None, False))
         known = not write.digests.isdisjoint(named)
-        # Drives that were written once more with the same: who has that event has their content.
-        again = after is not None and after.changed_nothing and after.sha256_after == write.sha256_after
-        known = known or (after_known and again and after is not None and after.calibration == write.calibration)
+        if after_known and after is not None and after.begun is not None:
+            # Drives that were written once more with the same, to let them save: that event has their content too.
+            contents = {after.sha256_after, _text(after.begun, "sha256_before"), write.sha256_after}
+            again = len(contents) == 1 and None not in contents
+            known = known or (again and after.calibration == write.calibration)
         following[target] = write, known
         if known:
             some_known.add(target)
@@ -145,11 +129,7 @@ def catch_up(
     is never entered behind a later one. A write whose calibration is not known stops its target. Nothing is entered
     from an audit log that was changed.
 
-    Args:
-        cell: whose history it is.
-        place: of audit log and history.
-        store: the history.
-        own: SHA-256 of acknowledgements without the name of a cell that are this cell's.
+    `own` are the SHA-256 of acknowledgements without the name of a cell that are this cell's.
 
     Returns:
         the writes that were entered.
@@ -163,15 +143,14 @@ def catch_up(
         return ()
     known = {entry.digest for entry in store.entries()}
     for one in verdict.entries:
-        if one.action is AuditAction.ACKNOWLEDGED and one.sha256 not in audited:
-            noted = acknowledgement_of(one)
-            if noted is not None and (one.sha256 in own or _text(one, "cell") == cell.name):
-                store.acknowledge(noted)
-        found = entered_calibration(one, cell.name)
-        if found is not None and found.digest not in known:
-            with contextlib.suppress(DataError):  # not comparable: of a history that was begun earlier
-                store.add(decode(found.document, f"entry {one.number}"), digest=found.digest, at=found.at)
-                known.add(found.digest)
+        noted = None if one.sha256 in audited else acknowledgement_of(one)
+        if noted is not None and (one.sha256 in own or _text(one, "cell") == cell.name):
+            store.acknowledge(noted)
+        for digest, entered_at, document in entered_calibration(one, cell.name):
+            if digest not in known:
+                with contextlib.suppress(DataError):  # not comparable: of a history that was begun earlier
+                    store.add(decode(document, f"entry {one.number}"), digest=digest, at=entered_at)
+                    known.add(digest)
     _, new = unknown_writes(writes_to(cell, verdict.entries, everywhere=True), audited)
     stopped, entered = set[str](), []
     for write in new:
@@ -189,71 +168,65 @@ def catch_up(
     return tuple(entered)
 
 
-@dataclass(frozen=True, slots=True)
-class EnteredCalibration:
-    """A calibration in the audit log."""
-
-    digest: str  #: SHA-256 of its file
-    at: datetime  #: when it was entered in the history, UTC
-    document: bytes  #: the file as drivegain spells it
-
-
-def entered_calibration(entry: AuditEntry, cell: str) -> EnteredCalibration | None:
-    """Return the calibration that an entry has, None where it has none of this cell."""
+def entered_calibration(entry: AuditEntry, cell: str) -> list[tuple[str, datetime, bytes]]:
+    """Return the calibration of this cell that an entry has: SHA-256 of its file, time of entry, file; [] without."""
     digest, document, at = _text(entry, "sha256"), _text(entry, "document"), utc(_text(entry, "entered") or "", _NEVER)
     if entry.action is not AuditAction.CALIBRATION_ENTERED or _text(entry, "cell") != cell:
-        return None
-    return (
-        None
-        if digest is None or document is None or at == _NEVER
-        else EnteredCalibration(digest, at, document.encode())
-    )
+        return []
+    return [] if digest is None or document is None or at == _NEVER else [(digest, at, document.encode())]
 
 
 def acknowledgement_of(entry: AuditEntry) -> Acknowledgement | None:
     """Return the acknowledgement of an entry, None where it lacks a part or would silence an axis beforehand."""
     axis, why, at = _text(entry, "axis"), _text(entry, "why"), at_of(entry)
     since = utc(_text(entry, "since") or "", _NEVER)
-    if axis is None or why is None or at is None or not _NEVER < since <= at:
+    if entry.action is not AuditAction.ACKNOWLEDGED or axis is None or why is None or at is None:
+        return None
+    if not _NEVER < since <= at:
         return None
     return Acknowledgement(axis, since, at, entry.who, why, entry.sha256)
 
 
-def calibration_flaws(entries: Sequence[AuditEntry], cell: str, store: HistoryStore) -> Iterator[str]:
-    """Report calibrations of the audit log that the history lacks or has otherwise, as sentences."""
+def contradictions(entries: Sequence[AuditEntry], cell: str, store: HistoryStore) -> Iterator[str]:
+    """Report rows of the history that are not what the audit log says, as sentences."""
+    by_digest = {one.sha256: one for one in entries}
+    for number, event in enumerate(store.events(), start=1):
+        if (entry := by_digest.get(event.audit or "")) is not None:
+            yield from _event_flaws(f"event {number}", event, entry, entries)
+    for noted in store.acknowledgements():
+        if (entry := by_digest.get(noted.audit)) is None:
+            continue
+        name, expected = f"acknowledgement of {noted.axis} at {iso(noted.at)}", acknowledgement_of(entry)
+        if expected is None:
+            yield f"{name}: found entry {entry.number} of the audit, {entry.action.value}, expected an acknowledgement"
+        else:
+            yield from differences(name, asdict(noted), asdict(expected), _named(entry))
     documents = {entry.digest: store.document(entry.digest) for entry in store.entries()}
     for one in entries:
-        found = entered_calibration(one, cell)
-        if found is None:
-            continue
-        name, said = f"calibration {found.digest[:12]}…", f"as entry {one.number} of the audit says"
-        if found.digest not in documents:
-            yield f"{name}: found no such row, expected one {said}"
-        elif documents[found.digest] != found.document:
-            yield f"document of {name}: found another one, expected it {said}"
+        for digest, _, document in entered_calibration(one, cell):
+            name, said = f"calibration {digest[:12]}…", f"as entry {one.number} of the audit says"
+            if digest not in documents:
+                yield f"{name}: found no such row, expected one {said}"
+            elif documents[digest] != document:
+                yield f"document of {name}: found another one, expected it {said}"
 
 
-def event_flaws(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:
-    """Report where an event contradicts the entry of the audit log that it names, as sentences."""
-    named = f"as entry {entry.number} of the audit, which it names"
+def _event_flaws(name: str, event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> Iterator[str]:
     begun = next((one for one in entries if one.number == _number(entry)), entry) if entry.action in _ENDS else entry
-    action = AuditedWrite(begun, entry).action if is_end(entry) else event.action
-    after = _text(begun, "sha256_after")
-    if action is not event.action:
-        yield f"found {event.action.value}, expected {action.value} {named}"
-    if event.target != entry.subject:
-        yield f"found target {event.target}, expected {entry.subject} {named}"
-    if after is not None and event.sha256_after is not None and event.sha256_after != after:
-        yield f"found sha256_after {event.sha256_after[:12]}…, expected {after[:12]}… {named}"
-    if entry.action in (AuditAction.APPLIED, AuditAction.WRITE_FOUND) and event.digest != (
-        calibration_of(begun) or event.digest
-    ):
-        yield f"found calibration {event.digest}, expected {calibration_of(begun)} {named}"
-    if (event.who, event.at) != (entry.who, at_of(entry)) and not _finished(event, entry, entries):
-        if event.who != entry.who:
-            yield f"found who {event.who!r}, expected {entry.who!r} {named}"
-        if event.at != at_of(entry):
-            yield f"found time {iso(event.at)}, expected {entry.at} {named}"
+    expected: dict[str, object] = {"target": entry.subject, "who": entry.who, "at": at_of(entry)}
+    if is_end(entry):
+        expected["action"] = AuditedWrite(begun, entry).action.value
+    if event.sha256_after is not None and (after := _text(begun, "sha256_after")) is not None:
+        expected["sha256_after"] = after
+    if entry.action in (AuditAction.APPLIED, AuditAction.WRITE_FOUND) and (digest := _calibration(begun, "sha256")):
+        expected["digest"] = digest
+    found = {**asdict(event), "action": event.action.value}
+    may_differ = ("who", "at") if _finished(event, entry, entries) else ()
+    yield from differences(name, found, expected, _named(entry), may_differ)
+
+
+def _named(entry: AuditEntry) -> str:
+    return f"as entry {entry.number} of the audit, which it names"
 
 
 def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) -> bool:
@@ -279,25 +252,6 @@ def _finished(event: Event, entry: AuditEntry, entries: Sequence[AuditEntry]) ->
     return begun_at is not None and begun_at <= event.at
 
 
-def acknowledgement_flaws(noted: Acknowledgement, entry: AuditEntry) -> Iterator[str]:
-    """Report where an acknowledgement contradicts its entry of the audit log, as sentences."""
-    named = f"as entry {entry.number} of the audit, which it names"
-    if entry.action is not AuditAction.ACKNOWLEDGED:
-        yield f"found entry {entry.number} of the audit, {entry.action.value}, expected an entry acknowledged"
-        return
-    since = utc(_text(entry, "since") or "", _NEVER)
-    pairs: tuple[tuple[str, object, object], ...] = (
-        ("who", noted.who, entry.who),
-        ("axis", noted.axis, _text(entry, "axis")),
-        ("why", noted.why, _text(entry, "why")),
-        ("since", iso(noted.since), iso(since)),
-        ("time", iso(noted.at), iso(utc(entry.at, _NEVER))),
-    )
-    for name, found, expected in pairs:
-        if found != expected:
-            yield f"found {name} {found!r}, expected {expected!r} {named}"
-
-
 def at_of(entry: AuditEntry) -> datetime | None:
     """Return when an entry was written, UTC; None where its time is none."""
     found = utc(entry.at, _NEVER)
@@ -315,8 +269,8 @@ def _number(entry: AuditEntry) -> int:
     return found if isinstance(found, int) else 0
 
 
-def calibration_of(begun: AuditEntry) -> str | None:
-    """Return the SHA-256 of the calibration of an entry, None without one."""
+def _calibration(begun: AuditEntry, key: str) -> str | None:
+    """Return what an entry says of its calibration, None without it."""
     recorded = begun.details.get("calibration")
-    found = recorded.get("sha256") if isinstance(recorded, dict) else None
+    found = recorded.get(key) if isinstance(recorded, dict) else None
     return found if isinstance(found, str) else None

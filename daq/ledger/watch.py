@@ -12,7 +12,7 @@ import numpy as np
 from daq.ledger.entry import Acknowledgement, Entry
 from ident.calibration import Gain
 from ident.drift.change import Change, Pattern, change_significance, dispersions, pattern
-from ident.drift.chart import CHART, Alarm, AlarmKind, Chart, Drift, cusum
+from ident.drift.chart import Alarm, AlarmKind, Drift, cusum
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,31 +82,30 @@ class Series:
         return next((alarm for alarm in stretch.drift.alarms if stretch.began + alarm.index == index), None)
 
 
-def watch(
-    entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement], chart: Chart = CHART
-) -> tuple[Series, ...]:
-    """One series an axis, in the order of the axes.
-
-    Args:
-        entries: of one cell, with gains of the same axes and units.
-        acknowledgements: oldest first.
-        chart: limits.
-    """
+def watch(entries: Sequence[Entry], acknowledgements: Sequence[Acknowledgement]) -> tuple[Series, ...]:
+    """Return one series an axis, in the order of the axes; entries are of one cell, acknowledgements oldest first."""
     if not entries:
         return ()
     axes = {gain.axis: gain.unit for gain in entries[-1].gains}
-    factors = dispersions_of(entries, tuple(axes))
-    return tuple(
-        _series(
-            axis,
-            unit,
-            _known(entries, axis),
-            factors[axis],
-            [noted for noted in acknowledgements if noted.axis == axis],
-            chart,
-        )
-        for axis, unit in axes.items()
-    )
+    found = []
+    for axis, dispersion in dispersions_of(entries, tuple(axes)).items():
+        known, acknowledged = _known(entries, axis), tuple(noted for noted in acknowledgements if noted.axis == axis)
+        starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
+        stretches = []
+        for began, ended in pairwise(sorted({0, *starts, len(known)})):
+            gains = [gain for _, gain in known[began:ended]]
+            drift = cusum([g.value for g in gains], [g.std for g in gains], dispersion=dispersion)
+            stretches.append(Stretch(began, drift))
+        points = []
+        for index, (entry, gain) in enumerate(known):
+            change = None
+            if index:
+                before = known[index - 1][1]
+                change = change_significance(before.value, before.std, gain.value, gain.std, dispersion=dispersion)
+            points.append(Point(entry, gain, change))
+        watching = bool(stretches) and len(known) not in starts
+        found.append(Series(axis, axes[axis], dispersion, tuple(points), tuple(stretches), watching, acknowledged))
+    return tuple(found)
 
 
 def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, float]:
@@ -115,10 +114,6 @@ def dispersions_of(entries: Sequence[Entry], axes: Sequence[str]) -> dict[str, f
     It is estimated from the calibrations that identified an axis, one for the same logs (`of_each_recording`), together
     for axes that the same recordings identified (`ident.drift.change.dispersions`), also where a gain of one of them
     was held fixed when these were fitted again.
-
-    Args:
-        entries: of one cell.
-        axes: names.
 
     Returns:
         at least 1 each, `ident.drift.change.DISPERSION` before there are five recordings of the axis.
@@ -159,34 +154,6 @@ def of_each_recording(entries: Sequence[Entry]) -> tuple[Entry, ...]:
     for entry in sorted(entries, key=lambda one: (one.applied, one.created, one.entered)):
         chosen[entry.logs] = entry
     return tuple(sorted(chosen.values(), key=lambda one: (one.recorded, one.created, one.entered)))
-
-
-def _series(
-    axis: str,
-    unit: str,
-    known: list[tuple[Entry, Gain]],
-    dispersion: float,
-    acknowledged: list[Acknowledgement],
-    chart: Chart,
-) -> Series:
-    starts = {sum(entry.recorded < a.since for entry, _ in known) for a in acknowledged}
-    bounds = sorted({0, *starts, len(known)})
-    stretches = []
-    for began, ended in pairwise(bounds):
-        gains = [gain for _, gain in known[began:ended]]
-        stretches.append(
-            Stretch(began, cusum([g.value for g in gains], [g.std for g in gains], dispersion=dispersion, chart=chart))
-        )
-    points = []
-    for index, (entry, gain) in enumerate(known):
-        before = known[index - 1][1] if index else None
-        points.append(Point(entry, gain, None if before is None else _change(before, gain, dispersion)))
-    watching = bool(stretches) and len(known) not in starts
-    return Series(axis, unit, dispersion, tuple(points), tuple(stretches), watching, tuple(acknowledged))
-
-
-def _change(before: Gain, after: Gain, dispersion: float) -> Change:
-    return change_significance(before.value, before.std, after.value, after.std, dispersion=dispersion)
 
 
 # Questions, not verdicts: a gain shows that the torque for a current has changed, not why.
@@ -252,10 +219,6 @@ def questions(all_series: Sequence[Series]) -> tuple[str, ...]:
             found = [_MORE if rose[0] else _LESS]
         case Pattern.SEVERAL:
             found = [_SEVERAL]
-    changed = len({entry for s in all_series for entry in _configurations(s)}) > 1
+    configurations = {point.entry.configuration_sha256 for s in all_series for point in s.points[s.began :]}
+    changed = len(configurations) > 1
     return (*found, *(["the cell's configuration changed in this time: what was changed?"] if changed else []))
-
-
-def _configurations(series: Series) -> tuple[str, ...]:
-    """Digests of the cell configuration from the baseline on."""
-    return tuple(point.entry.configuration_sha256 for point in series.points[series.began :])

@@ -15,14 +15,13 @@ from rich.table import Table
 from daq.config.cell import Cell
 from daq.errors import ControllerUnfit
 from daq.ledger.audit import AuditEntry
-from daq.ledger.entry import Entry, Event, WriteAction
+from daq.ledger.entry import Entry, Event, WriteAction, drives_of
 from daq.ledger.ledger import Verification
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, pattern_of, questions
 from daq.report.gains import with_deviation
 from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
 from daq.report.text import inert_row, picked, plain_table, printable
-from daq.writeback.drive_record import drives_of
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import Scalar, rewrite_gain

@@ -1,37 +1,150 @@
 """The drives of a cell as a target: one object in each drive holds the gain of its axis.
 
-`drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. The values before are on
-the disk before the first drive is touched (`daq.writeback.drive_record`).
+`drivers.canopen.parameters` writes them: without power, read back, saved, all of them or none. A record of the write,
+with the values before it, is on the disk before the first drive is touched. It is called <time>.json and is never
+changed. It carries the digest of its content: a rollback writes its numbers back into the drives.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from daq.config.cell import Cell
 from daq.config.controller import GainObject
+from daq.config.yaml_file import StrictModel
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
-from daq.writeback.drive_record import (
-    DriveNote,
-    DriveRecord,
-    drives_of,
-    read_record,
-    read_records,
-    record_folder,
-    write_record,
-)
-from daq.writeback.file_access import exclusive_writer
+from daq.files import read_regular, replace_file, sha256
+from daq.ledger.entry import drives_of
+from daq.writeback.file_access import exclusive_writer, next_order
 from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes
 from daq.writeback.target import Written
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
-from drivers.profiles.profile import Axis, Parameter
+from drivers.profiles.profile import Axis, Parameter, ParameterKind
 from ident.calibration import Calibration, Gain
+
+_NAME = re.compile(r"([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.json")
+_MAX_BYTES = 2**20
+_U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+class DriveNote(StrictModel):
+    """One drive in a record."""
+
+    axis: str  #: which
+    node_id: Annotated[int, Field(ge=1, le=127)]  #: which
+    vendor_id: _U32  #: identity that the drive reported (1018h)
+    product_code: _U32  #: identity that the drive reported (1018h)
+    serial: _U32 | None  #: identity that the drive reported (1018h)
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: the object that was to be written
+    subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: the object that was to be written
+    type: ParameterKind  #: the object that was to be written
+    old: _U32  #: its bits before the write, and as they were to be
+    new: _U32  #: its bits before the write, and as they were to be
+
+    @property
+    def parameter(self) -> Parameter:
+        """The object."""
+        return Parameter(self.index, self.subindex, self.type)
+
+
+class DriveRecord(StrictModel):
+    """One write to the drives of a cell."""
+
+    format: Literal["drivegain drive record 1"]
+    cell: str  #: name of the cell
+    at: str  #: time, ISO 8601
+    who: str  #: the operator or the job
+    drives: tuple[DriveNote, ...]  #: one for each axis
+    sha256: str  #: of all of the above
+
+
+def record_folder(cell: Cell) -> Path:
+    """Return the folder of a cell's records: `demo.drives` beside `demo.history.sqlite`.
+
+    Raises:
+        ConfigurationInconsistent: the cell was read from a log, and has no folder.
+    """
+    if cell.history is None:
+        raise ConfigurationInconsistent(
+            f"cell {cell.name!r}",
+            found="no folder of its own",
+            expected="the cell's file",
+            remedy="use the cell file, not the copy in a log",
+        )
+    store = cell.history.store
+    return store.with_name(store.name.removesuffix(".sqlite").removesuffix(".history") + ".drives")
+
+
+def write_record(folder: Path, cell: str, now: datetime, who: str, drives: tuple[DriveNote, ...]) -> Path:
+    """Put a record on the disk, later in order than every other.
+
+    Raises:
+        OSError: from the file system.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    taken = [_order(path.name) for path in read_records(folder)]
+    path = folder / f"{next_order([one for one in taken if one is not None], now)}.json"
+    body: dict[str, Any] = {"format": "drivegain drive record 1", "cell": cell, "at": now.isoformat(), "who": who}
+    body["drives"] = [note.model_dump(mode="json") for note in drives]
+    text = json.dumps({**body, "sha256": _digest(body)}, indent=1, ensure_ascii=False)
+    replace_file(path, (text + "\n").encode())
+    return path
+
+
+def read_records(folder: Path) -> tuple[Path, ...]:
+    """List the records of a folder, oldest first; none where there is no folder."""
+    if not folder.is_dir():
+        return ()
+    found = [(order, path) for path in folder.iterdir() if (order := _order(path.name)) is not None]
+    return tuple(path for _, path in sorted(found))
+
+
+def _order(name: str) -> tuple[str, int] | None:
+    """Return time and count of a record's name; None for another file."""
+    match = _NAME.fullmatch(name)
+    return None if match is None else (match[1], int(match[2] or 0))
+
+
+def read_record(path: Path) -> DriveRecord:
+    """Read a record.
+
+    Raises:
+        ControllerUnfit: it cannot be read, is no record, or was changed.
+    """
+    try:
+        content = read_regular(path, _MAX_BYTES)
+        record = DriveRecord.model_validate_json(content)
+        body: dict[str, Any] = json.loads(content)
+    except (OSError, ValueError) as error:
+        raise _unfit(path, str(error).splitlines()[0][:200]) from error
+    del body["sha256"]
+    if record.sha256 != _digest(body):
+        raise _unfit(path, f"content with SHA-256 {_digest(body)[:12]}…, not {record.sha256[:12]}… as it says")
+    return record
+
+
+def _digest(body: dict[str, Any]) -> str:
+    return sha256(json.dumps(body, sort_keys=True).encode())
+
+
+def _unfit(path: Path, found: str) -> ControllerUnfit:
+    return ControllerUnfit(
+        str(path),
+        found=found,
+        expected="the record of a write to drives, as drivegain wrote it",
+        remedy="nothing was written; enter the old gains with the drives' own tool",
+    )
+
 
 _REVIEW = "take a dry run, review it, and repeat it with the --base that it prints"
 
@@ -84,7 +197,15 @@ class DriveTarget:
             ControllerUnfit: an object cannot hold a gain to within its σ.
             DriverError: see `drivers.canopen.parameters.read_parameters`.
         """
-        objects = self._objects()
+        objects = () if self.cell.controller is None else self.cell.controller.objects
+        if not objects:
+            raise ConfigurationInconsistent(
+                f"cell {self.cell.name!r}: controller",
+                found="no objects in the drives",
+                expected="the object of each axis's gain",
+                remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: ...}, ...]}` to the "
+                "cell file, one for each axis (docs/how-to/write-gains.md)",
+            )
         require_axes(calibration, self.cell.axis_names)
         gains = {gain.axis: gain for gain in calibration.gains}
         pairs = [(axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)]
@@ -177,22 +298,25 @@ class DriveTarget:
                     expected="those that the change was planned for",
                     remedy="take a new dry run; nothing was written",
                 )
-            records.append(write_record(edit.folder, self.cell.name, now, who, _notes(found, edit.writes)))
+            drives = tuple(
+                DriveNote(
+                    axis=value.axis.name,
+                    node_id=value.axis.node_id,
+                    vendor_id=value.identity.vendor_id,
+                    product_code=value.identity.product_code,
+                    serial=value.identity.serial,
+                    index=value.parameter.index,
+                    subindex=value.parameter.subindex,
+                    type=value.parameter.kind,
+                    old=value.word,
+                    new=write.word,
+                )
+                for value, write in zip(found, edit.writes, strict=True)
+            )
+            records.append(write_record(edit.folder, self.cell.name, now, who, drives))
 
         parameters = write_parameters(self.network, edit.writes, self.saving, begin)
         return Written(edit, records[0], parameters)
-
-    def _objects(self) -> tuple[GainObject, ...]:
-        objects = () if self.cell.controller is None else self.cell.controller.objects
-        if not objects:
-            raise ConfigurationInconsistent(
-                f"cell {self.cell.name!r}: controller",
-                found="no objects in the drives",
-                expected="the object of each axis's gain",
-                remedy="add `controller: {objects: [{index: ..., subindex: ..., type: ..., factor: ...}, ...]}` to the "
-                "cell file, one for each axis (docs/how-to/write-gains.md)",
-            )
-        return objects
 
     def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, Parameter]]:
         axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
@@ -224,32 +348,27 @@ def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple
     key, word = f"node {value.axis.node_id}, {parameter}", value.word
     planned = None
     if is_writable(gain):
-        word = _word(key, gain, gain_object)
-        planned = (parameter.value(word) / factor, f"{parameter.value(word):.9g}")
+        wanted, std = factor * gain.value, abs(factor) * gain.std
+        try:
+            word = parameter.word(wanted)
+        except ValueError as error:
+            raise ControllerUnfit(
+                key,
+                found=str(error),
+                expected="a gain that fits",
+                remedy="check `type` and `factor` in `controller.objects` of the cell file; nothing was written",
+            ) from error
+        held = parameter.value(word)
+        if held == 0 or 0 < std < abs(held - wanted):
+            raise ControllerUnfit(
+                key,
+                found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
+                expected="a rounding below σ",
+                remedy="this object is too coarse for the gain: use another one, or another factor in "
+                "`controller.objects`; nothing was written",
+            )
+        planned = (held / factor, f"{held:.9g}")
     return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(value.axis, parameter, word)
-
-
-def _word(key: str, gain: Gain, gain_object: GainObject) -> int:
-    wanted, std = gain_object.factor * gain.value, abs(gain_object.factor) * gain.std
-    try:
-        word = gain_object.parameter.word(wanted)
-    except ValueError as error:
-        raise ControllerUnfit(
-            key,
-            found=str(error),
-            expected="a gain that fits",
-            remedy="check `type` and `factor` in `controller.objects` of the cell file; nothing was written",
-        ) from error
-    held = gain_object.parameter.value(word)
-    if held == 0 or 0 < std < abs(held - wanted):
-        raise ControllerUnfit(
-            key,
-            found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
-            expected="a rounding below σ",
-            remedy="this object is too coarse for the gain: use another one, or another factor in "
-            "`controller.objects`; nothing was written",
-        )
-    return word
 
 
 def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tuple[Finding, ...]:
@@ -295,21 +414,3 @@ def _check_untouched(path: Path, record: DriveRecord, base: tuple[ParameterValue
                 f"{note.parameter.value(note.old):.9g} as before",
                 remedy=f"nothing was written: the gain was changed since; {path} has the old values",
             )
-
-
-def _notes(found: tuple[ParameterValue, ...], writes: tuple[ParameterWrite, ...]) -> tuple[DriveNote, ...]:
-    return tuple(
-        DriveNote(
-            axis=value.axis.name,
-            node_id=value.axis.node_id,
-            vendor_id=value.identity.vendor_id,
-            product_code=value.identity.product_code,
-            serial=value.identity.serial,
-            index=value.parameter.index,
-            subindex=value.parameter.subindex,
-            type=value.parameter.kind,
-            old=value.word,
-            new=write.word,
-        )
-        for value, write in zip(found, writes, strict=True)
-    )

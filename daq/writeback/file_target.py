@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import combinations
@@ -18,21 +19,19 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.controller import ControllerFormat
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
-from daq.files import replace_file, sha256
+from daq.files import fsync_folder, replace_file, sha256
 from daq.writeback.file_access import (
-    Backup,
     back_up,
     backups,
     exclusive_writer,
-    put_back,
     require_existing,
     resolve_links,
 )
 from daq.writeback.formats.document import decode, read_bytes
-from daq.writeback.formats.scalar import ControllerDocument, Scalar, rewrite_gain
+from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
 from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes, short_digest
-from daq.writeback.target import Written, audited_change
-from ident.calibration import Calibration, Gain
+from daq.writeback.target import Written
+from ident.calibration import Calibration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,22 +117,39 @@ class FileTarget:
     def plan(self, calibration: Calibration) -> FileEdit:
         """See `Target.plan`."""
         require_axes(calibration, self.keys)
-        self._check_keys()
+        keys = list(self.keys.values())
+        doubled = sorted({key for key in keys if keys.count(key) > 1})
+        if doubled:
+            raise ControllerUnfit(
+                "controller.gains",
+                found=f"{', '.join(doubled)} for more than one axis",
+                expected="a key of its own for each axis",
+                remedy="correct the cell configuration",
+            )
         require_existing(self.file)
         content = read_bytes(self.file)
         now = decode(content, str(self.file), self.format)
         scalars = now.locate(tuple(self.keys[gain.axis] for gain in calibration.gains))
-        changes = tuple(
-            _change(gain, scalar, self.factors.get(gain.axis, 1.0))
-            for gain, scalar in zip(calibration.gains, scalars, strict=True)
-        )
-        self._check_apart(scalars)
+        changes = []
+        for gain, scalar in zip(calibration.gains, scalars, strict=True):
+            factor = self.factors.get(gain.axis, 1.0)
+            put = rewrite_gain(scalar, gain.value, gain.std, factor) if is_writable(gain) else None
+            planned = None if put is None else (put.new, put.spelling)
+            changes.append(GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned))
+        for one, other in combinations(scalars, 2):
+            if one.start < other.end and other.start < one.end:  # an axis would get the gain of the other
+                raise ControllerUnfit(
+                    f"{self.file}, line {one.line}",
+                    found=f"{one.key} and {other.key}, which name the same number",
+                    expected="a number of its own for each axis",
+                    remedy="correct `controller.gains` of the cell configuration; nothing was written",
+                )
         after = now.with_values({change.key: change.spelling for change in changes if change.spelling})
         return FileEdit(
             subject=self.subject,
             before=content,
             after=after.content,
-            changes=changes,
+            changes=tuple(changes),
             unexpected=_changed_since_recording(calibration, str(self.file), sha256(content)),
             file=self.file,
             format=self.format,
@@ -143,7 +159,17 @@ class FileTarget:
         """See `Target.plan_rollback`: the newest backup that differs from the file."""
         target = Path(self.subject)
         before = read_bytes(target) if target.exists() else None
-        backup = self._backup_to_restore(target, before)
+        found = backups(target)
+        # A writer that was killed before it replaced the file leaves a backup of the present content.
+        others = [one for one in found if before is None or one.was != short_digest(before)]
+        if not others:
+            raise CalibrationRefused(
+                str(self.file),
+                found=f"{len(found)} backups with the same content" if found else "no backup beside it",
+                expected=f"{target.name}.<time>.<digests>.bak with another content",
+                remedy="nothing was changed",
+            )
+        backup = others[-1]
         after = backup.content()
         if before is not None and short_digest(before) != backup.after_digest:
             one, other = shlex.quote(str(backup.path)), shlex.quote(str(self.file))
@@ -179,13 +205,23 @@ class FileTarget:
         """See `Target.details`."""
         if edit.source is not None:
             return {"restored": edit.source.name}
-        return {"changes": [audited_change(change) for change in edit.changes]}
+        changes = []
+        for change in edit.changes:
+            numbers = {"old": change.old, "new": change.new, "std": change.std}
+            finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+            changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
+        return {"changes": changes}
 
     def write(self, edit: FileEdit, now: datetime, who: str) -> Written:
         """See `Target.write`; `who` is in the audit alone."""
         target = Path(edit.subject)
         if edit.before is None:
-            _restore_deleted(target, edit)
+            try:
+                replace_file(target, edit.after, check=_last_check(target, edit), like=edit.source)
+            except BaseException:  # an interrupt too: the file comes back whole, or not at all
+                if _content(target) == edit.after:  # and not one that another program has made
+                    target.unlink()
+                raise
             return Written(edit, None)
         backup = back_up(target, edit.before, edit.after, now)
         try:
@@ -200,50 +236,11 @@ class FileTarget:
             if found == edit.before:
                 backup.unlink()
             elif found == edit.after:
-                put_back(backup, target)
+                backup.replace(target)
+                with contextlib.suppress(OSError):  # the name is there
+                    fsync_folder(target.parent)
             raise
         return Written(edit, backup)
-
-    def _check_keys(self) -> None:
-        keys = list(self.keys.values())
-        doubled = sorted({key for key in keys if keys.count(key) > 1})
-        if doubled:
-            raise ControllerUnfit(
-                "controller.gains",
-                found=f"{', '.join(doubled)} for more than one axis",
-                expected="a key of its own for each axis",
-                remedy="correct the cell configuration",
-            )
-
-    def _check_apart(self, scalars: Sequence[Scalar]) -> None:
-        """Refuse two keys that name one number: an axis would get the gain of the other."""
-        for one, other in combinations(scalars, 2):
-            if one.start < other.end and other.start < one.end:
-                raise ControllerUnfit(
-                    f"{self.file}, line {one.line}",
-                    found=f"{one.key} and {other.key}, which name the same number",
-                    expected="a number of its own for each axis",
-                    remedy="correct `controller.gains` of the cell configuration; nothing was written",
-                )
-
-    def _backup_to_restore(self, target: Path, before: bytes | None) -> Backup:
-        found = backups(target)
-        for backup in reversed(found):
-            # A writer that was killed before it replaced the file leaves a backup of the present content.
-            if before is None or backup.was != short_digest(before):
-                return backup
-        raise CalibrationRefused(
-            str(self.file),
-            found=f"{len(found)} backups with the same content" if found else "no backup beside it",
-            expected=f"{target.name}.<time>.<digests>.bak with another content",
-            remedy="nothing was changed",
-        )
-
-
-def _change(gain: Gain, scalar: Scalar, factor: float) -> GainChange:
-    put = rewrite_gain(scalar, gain.value, gain.std, factor) if is_writable(gain) else None
-    planned = None if put is None else (put.new, put.spelling)
-    return GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned)
 
 
 def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[Finding, ...]:
@@ -258,15 +255,6 @@ def _changed_since_recording(calibration: Calibration, file: str, base_sha256: s
             expected = f"{recorded[:12]}…, as when {log.name} was recorded"
             return ((file, f"content {base_sha256[:12]}…", expected, remedy),)
     return ()
-
-
-def _restore_deleted(target: Path, edit: FileEdit) -> None:
-    try:
-        replace_file(target, edit.after, check=_last_check(target, edit), like=edit.source)
-    except BaseException:  # an interrupt too: the file comes back whole, or not at all
-        if _content(target) == edit.after:  # and not one that another program has made
-            target.unlink()
-        raise
 
 
 def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:

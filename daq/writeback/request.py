@@ -88,13 +88,7 @@ class GainChange:
 
     @classmethod
     def of(cls, gain: Gain, key: str, line: int, old: float, planned: tuple[float, str] | None) -> GainChange:
-        """Make the change of one gain.
-
-        Args:
-            gain: identified.
-            key, line, old: as the attributes.
-            planned: gain as it will be read back [unit], and its spelling; None where there is none to write.
-        """
+        """Make the change of one gain; `planned` is `new` and `spelling`, None where there is none to write."""
         new, spelling = planned or (gain.value, "")
         return cls(gain.axis, key, line, old, new, gain.std, gain.unit, gain.nameplate, spelling)
 
@@ -185,30 +179,22 @@ def change_digest(before: bytes, after: bytes) -> str:
     return f"{short_digest(before)}-{short_digest(after)}"
 
 
-@dataclass(frozen=True, slots=True)
-class ReviewedChange:
-    """The change that the operator has reviewed."""
-
-    base_sha256: str | None  #: digest of the content before it; None where nothing was reviewed
-    after_digest: str | None  #: first digits of the digest of the content after it; None where any is accepted
-
-
-def parse_base(base: str | None, before: bytes) -> ReviewedChange:
-    """Read the value of --base.
+def parse_base(base: str, before: bytes) -> tuple[str, str | None]:
+    """Read the value of --base: `change_digest` of a change, or the whole SHA-256 of the content before it.
 
     Args:
-        base: `change_digest` of a change, or the whole SHA-256 of the content before it; None where nothing was
-            reviewed.
+        base: as the operator gave it.
         before: content now; a short digest that fits it means this content.
+
+    Returns:
+        SHA-256 of the reviewed content, and the first digits of that after the change; None where any is accepted.
 
     Raises:
         UsageError: it is neither.
     """
-    if base is None:
-        return ReviewedChange(None, None)
     was, joined, after_digest = base.strip().lower().partition("-")
     if not joined and len(was) == len(sha256(before)) and _is_hex(was):
-        return ReviewedChange(was, None)
+        return was, None
     if not (len(was) == len(after_digest) == _DIGITS and _is_hex(was + after_digest)):
         raise UsageError(
             f"--base {base}",
@@ -216,7 +202,7 @@ def parse_base(base: str | None, before: bytes) -> ReviewedChange:
             expected=f"the value that a dry run prints: {_DIGITS} digits, a hyphen, {_DIGITS} digits",
             remedy="copy it from the last line of the dry run",
         )
-    return ReviewedChange(sha256(before) if was == short_digest(before) else was, after_digest)
+    return sha256(before) if was == short_digest(before) else was, after_digest
 
 
 def _is_hex(text: str) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -36,10 +37,7 @@ _LARGEST_BYTES = 16_384
 def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicKey]:
     """Make a key pair: `<name>.key`, readable by its owner alone, and `<name>.pub` for all.
 
-    Args:
-        folder: made where it is missing.
-        name: of the person.
-        password: of the secret key; empty for one that only the file's mode protects.
+    Without a password only the file's mode protects the secret key. A missing folder is made.
 
     Returns:
         File of the secret key, and the public key, whose `line` goes into the cell file.
@@ -67,10 +65,8 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
 
 def needs_password(secret_key: Path) -> bool:
     """Whether a secret key is encrypted. Raises UsageError as `sign`."""
-    try:
-        return is_encrypted(_read_key(secret_key))
-    except ValueError as error:
-        raise _unfit(secret_key, error) from error
+    with _reading_key(secret_key):
+        return is_encrypted(_text_of(secret_key))
 
 
 def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: datetime | None = None) -> Path:
@@ -96,12 +92,18 @@ def sign(file: Path, secret_key: Path, name: str, *, password: str = "", at: dat
     path = signature_path(file, _checked(name))
     key = _secret_key(secret_key, password)
     content = _read_signed(file)
-    if _is_in_the_way(path):
-        raise UsageError(
-            str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
-        )
+    if path.exists():
+        try:
+            is_signature = _text_of(path).startswith(UNTRUSTED)
+        except (OSError, ValueError):  # a pipe, a folder, a file of another kind
+            is_signature = False
+        if not is_signature:
+            raise UsageError(
+                str(path), found="no signature", expected="no file, or an earlier signature", remedy="move it away"
+            )
     when = [] if at is None else [f"timestamp:{int(at.timestamp())}", f"at:{at.isoformat(timespec='seconds')}"]
-    signature = key.sign(content, "\t".join([*when, f"file:{_one_line(file.name)}", f"signer:{name}", "hashed"]))
+    shown = "".join(c if c.isprintable() else "?" for c in file.name)
+    signature = key.sign(content, "\t".join([*when, f"file:{shown}", f"signer:{name}", "hashed"]))
     try:
         replace_file(path, signature.text.encode())
     except OSError as error:
@@ -188,12 +190,10 @@ def _checked(name: str) -> str:
 
 
 def _secret_key(path: Path, password: str) -> SecretKey:
-    text = _read_key(path)
-    try:
+    with _reading_key(path):
+        text = _text_of(path)
         plain = not is_encrypted(text)
         key = parse_secret_key(text, password)
-    except (ValueError, MemoryError) as error:
-        raise _unfit(path, error) from error
     mode = stat.S_IMODE(path.stat().st_mode)
     if plain and mode & 0o077:
         raise UsageError(
@@ -205,34 +205,21 @@ def _secret_key(path: Path, password: str) -> SecretKey:
     return key
 
 
-def _read_key(path: Path) -> str:
+@contextlib.contextmanager
+def _reading_key(path: Path) -> Iterator[None]:
     try:
-        return _text_of(path)
-    except (OSError, ValueError) as error:
-        raise _unfit(path, error) from error
-
-
-def _unfit(path: Path, error: Exception) -> UsageError:
-    return UsageError(
-        str(path),
-        found=_spelled(error),
-        expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",
-        remedy="check the name (the file that ends in .key is the secret one) and the password",
-    )
+        yield
+    except (OSError, ValueError, MemoryError) as error:
+        raise UsageError(
+            str(path),
+            found=_spelled(error),
+            expected="a secret key of `drivegain sign key` or `minisign -G`, and its password if it has one",
+            remedy="check the name (the file that ends in .key is the secret one) and the password",
+        ) from error
 
 
 def _spelled(error: Exception) -> str:
     return (error.strerror or type(error).__name__).lower() if isinstance(error, OSError) else str(error)
-
-
-def _is_in_the_way(path: Path) -> bool:
-    """Whether the name is taken by another thing than a signature: a pipe, a folder, a file of another kind."""
-    if not path.exists():
-        return False
-    try:
-        return not _text_of(path).startswith(UNTRUSTED)
-    except (OSError, ValueError):
-        return True
 
 
 def _text_of(path: Path) -> str:
@@ -259,7 +246,3 @@ def _write_new(path: Path, text: str, mode: int) -> None:
         stream.write(text.encode())
         stream.flush()
         os.fsync(descriptor)
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)

@@ -8,23 +8,24 @@ audit before and after the write, and the refusal.
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import CalibrationRefused
-from daq.ledger.audit import AuditAction, AuditRecorder
-from daq.writeback.gates.gate import GateContext, Refusal, refusal_error
+from daq.errors import AuditUnusable, CalibrationRefused
+from daq.files import sha256
+from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
+from daq.writeback.gates.gate import GateContext, Refusal
 from daq.writeback.gates.table import check_gates
-from daq.writeback.request import Edit, GainChange, Request
+from daq.writeback.request import Edit, Request
 from drivers.canopen.parameters import ParameterChange
 from ident.calibration import Calibration
 
+_LOG = logging.getLogger("drivegain")
 E = TypeVar("E", bound=Edit)
 
 
@@ -113,8 +114,17 @@ class Proposal(Generic[E]):
 
     @property
     def error(self) -> CalibrationRefused:
-        """The error for a proposal with failed checks."""
-        return refusal_error(self.edit.subject, self.refusals)
+        """The error for a proposal with failed checks; several are listed one a line."""
+        if len(self.refusals) == 1:
+            only = self.refusals[0]
+            return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
+        listed = "".join(f"\n  {refusal}" for refusal in self.refusals)
+        return CalibrationRefused(
+            self.edit.subject,
+            found=f"{len(self.refusals)} failed checks{listed}\n ",
+            expected="none",
+            remedy="nothing was written",
+        )
 
 
 def propose(target: Target[E], request: Request) -> Proposal[E]:
@@ -147,13 +157,15 @@ def apply(proposal: Proposal[E], now: datetime, *, audit: Path | None = None, wh
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
-    edit, recorder = proposal.edit, AuditRecorder(audit, who, now)
+    edit = proposal.edit
+    recorder = _Recorder(audit, who, now, edit.subject)
     details = {**proposal.target.details(edit), **proposal.evidence}
     if proposal.refusals:
-        recorder.record_refusal(Path(edit.subject), proposal.refusals, details)
+        listed = [{"gate": one.gate.value, "subject": one.subject, "found": one.found} for one in proposal.refusals]
+        recorder.end(AuditAction.REFUSED, {"refusals": listed, **details})
         raise proposal.error
     if not edit.has_effect:
-        recorder.record_no_change(Path(edit.subject), edit.after, details)
+        recorder.end(AuditAction.NOTHING_TO_DO, {"sha256_found": sha256(edit.after), **details})
         return None
     actions = (AuditAction.APPLY_BEGUN, AuditAction.APPLIED)
     return _write(proposal.target, edit, recorder, actions, details, details)
@@ -177,11 +189,10 @@ def rollback(
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
-    recorder, asked = AuditRecorder(audit, who, now), {"asked": "rollback"}
-    edit = planned
-    if edit is None:
-        with recorder.record_refusal_of(Path(target.subject), asked):
-            edit = target.plan_rollback()
+    asked = {"asked": "rollback"}
+    recorder = _Recorder(audit, who, now, target.subject if planned is None else planned.subject)
+    with recorder.refusals(asked):
+        edit = planned or target.plan_rollback()
     actions = (AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK)
     return _write(target, edit, recorder, actions, target.details(edit), asked)
 
@@ -189,25 +200,62 @@ def rollback(
 def _write(
     target: Target[E],
     edit: E,
-    recorder: AuditRecorder,
+    recorder: _Recorder,
     actions: tuple[AuditAction, AuditAction],
     details: Mapping[str, object],
     refused_details: Mapping[str, object],
 ) -> Written:
     """Write under the lock, between the two entries of the audit."""
-    subject = Path(edit.subject)
     with contextlib.ExitStack() as held:
-        with recorder.record_refusal_of(subject, refused_details):
+        with recorder.refusals(refused_details):
             held.enter_context(target.lock(edit))
-        written, audit_sha256 = recorder.record_write(
-            *actions, subject, edit.before, edit.after, details,
-            partial(target.write, edit, recorder.at, recorder.who),
-        )  # fmt: skip
-    return replace(written, audit_sha256=audit_sha256)
+        before = None if edit.before is None else sha256(edit.before)
+        digests = {"sha256_before": before, "sha256_after": sha256(edit.after)}
+        begun = recorder.begin(actions[0], {**digests, **details})
+        try:
+            written = target.write(edit, recorder.at, recorder.who)
+        except BaseException as error:  # an interrupt ends a write too
+            if begun is not None:
+                # An interrupt may come when all is done: the digest shows the content, whatever the error says.
+                said, found = f"{type(error).__name__}: {error}"[:500], digest_now(edit.subject)
+                recorder.end(AuditAction.FAILED, {"begun": begun.number, "error": said, "sha256_found": found})
+            raise
+        if begun is None:
+            return written
+        ended = recorder.end(actions[1], {"begun": begun.number})
+        return replace(written, audit_sha256=(ended or begun).sha256)
 
 
-def audited_change(change: GainChange) -> dict[str, object]:
-    """One gain for the audit, which takes finite numbers only."""
-    numbers = {"old": change.old, "new": change.new, "std": change.std}
-    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return {"axis": change.axis, "key": change.key, "unit": change.unit, **finite}
+@dataclass(frozen=True, slots=True)
+class _Recorder:
+    """Record one write to a controller: that it begins, before anything is replaced, and how it ended."""
+
+    audit: Path | None  #: file of the audit log; None records nothing
+    who: str  #: the person or the job
+    at: datetime  #: time with its zone
+    subject: str  #: the file, with symbolic links followed, or the drives
+
+    def begin(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
+        """Append an entry; where that fails, nothing may be written."""
+        if self.audit is None:
+            return None
+        return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+
+    def end(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
+        """Append the last entry about the write; a failure is a warning."""
+        try:
+            return self.begin(action, details)
+        except (OSError, AuditUnusable) as error:
+            # The write is done, and the first entry has its digests: no reason to call it undone.
+            _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
+            return None
+
+    @contextlib.contextmanager
+    def refusals(self, details: Mapping[str, object]) -> Iterator[None]:
+        """Record a refusal that is raised within the context."""
+        try:
+            yield
+        except CalibrationRefused as error:
+            refusal = {"gate": "file", "subject": error.subject, "found": error.found}
+            self.end(AuditAction.REFUSED, {"refusals": [refusal], **details})
+            raise

@@ -60,7 +60,15 @@ class DcfDocument(ControllerDocument):
 
     def readings(self) -> tuple[Leaves, Leaves]:
         """Read with our parser and with configparser."""
-        return _read(self), _parsed(self)
+        leaves: dict[KeyPath, str] = {}
+        for section in _sections(self.text):
+            for entry in section.entries:
+                path, again = (section.title, entry.name), 1
+                while path in leaves:
+                    again += 1
+                    path = (section.title, f"{entry.name} ({again})")
+                leaves[path] = entry.value
+        return leaves, _parsed(self)
 
     def leaf(self, key: str) -> KeyPath:
         """Return section and entry of an object's value."""
@@ -71,7 +79,12 @@ class DcfDocument(ControllerDocument):
         if match is None:
             raise unfit(self.name, key, "a key that names no object", f"{CORRECT_KEY}: 6076, 2003:01 or 2003sub1")
         index, subindex = int(match[1], 16), int(match[2] or "0", 16)
-        found = [section for section in sections if _named(section.title) == (index, subindex)]
+        found = [
+            section
+            for section in sections
+            if (title := _TITLE.fullmatch(section.title))  # 2003sub1 and 2003sub01 are one object
+            and (int(title[1], 16), int(title[2] or "0", 16)) == (index, subindex)
+        ]
         if len(found) > 1:
             lines = " and ".join(str(section.line) for section in found)
             raise unfit(self.name, key, f"it {len(found)} times, on lines {lines}", "remove all but one")
@@ -186,12 +199,6 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
     return DcfDocument(name, content.decode("latin-1"))
 
 
-def _named(title: str) -> tuple[int, int] | None:
-    """Parse index and subindex of a title (`2003sub1` and `2003sub01` are one object); None where it names none."""
-    match = _TITLE.fullmatch(title)
-    return None if match is None else (int(match[1], 16), int(match[2] or "0", 16))
-
-
 def _sections(text: str) -> list[_Section]:
     """Split the text into sections; comments and lines other than `name=value` are skipped."""
     sections: list[_Section] = []
@@ -206,18 +213,6 @@ def _sections(text: str) -> list[_Section]:
             start = line.end(1) - len(written) + entry.start(2)
             sections[-1].entries.append(_Entry(entry[1].lower(), entry[2], start, start + len(entry[2]), number))
     return sections
-
-
-def _read(document: DcfDocument) -> dict[KeyPath, str]:
-    leaves: dict[KeyPath, str] = {}
-    for section in _sections(document.text):
-        for entry in section.entries:
-            path, again = (section.title, entry.name), 1
-            while path in leaves:
-                again += 1
-                path = (section.title, f"{entry.name} ({again})")
-            leaves[path] = entry.value
-    return leaves
 
 
 def _parsed(document: DcfDocument) -> dict[KeyPath, str]:

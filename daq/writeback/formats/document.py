@@ -19,6 +19,7 @@ from pathlib import Path
 
 from daq.config.controller import ControllerFormat
 from daq.errors import ControllerUnfit
+from daq.files import read_regular
 from daq.writeback.formats.dcf_document import dcf_document
 from daq.writeback.formats.json_document import json_document
 from daq.writeback.formats.scalar import ControllerDocument
@@ -46,12 +47,7 @@ def format_of(name: str) -> ControllerFormat:
 
 
 def decode(content: bytes, name: str, format: ControllerFormat | None = None) -> ControllerDocument:  # noqa: A002
-    """Parse a controller file.
-
-    Args:
-        content: of the file.
-        name: of the file, for messages.
-        format: of the file; None where its name says it.
+    """Parse a controller file; without a format, its name says it.
 
     Raises:
         ControllerUnfit: the bytes are no text of that format; other flaws are found by `locate`.
@@ -67,26 +63,11 @@ def read_bytes(path: Path) -> bytes:
         ControllerUnfit: there is none, it is no regular file, is too large, or cannot be read.
     """
     try:
-        # Checked before it is opened: opening a pipe waits for its other end.
-        if path.is_file():
-            content = _bounded(path)
-            if content is not None:
-                return content
-            found = f"more than {MAX_BYTES >> 20} MiB"
-        else:
-            found = "something that is no regular file" if path.exists() else "no such file"
+        return read_regular(path, MAX_BYTES)
     except OSError as error:
-        found = (error.strerror or type(error).__name__).lower()
-    raise ControllerUnfit(
-        str(path),
-        found=found,
-        expected="the controller's file",
-        remedy="correct `controller.file` of the cell configuration, or give --to FILE",
-    )
-
-
-def _bounded(path: Path) -> bytes | None:
-    """Read the content; None where it is too large, whatever size the file system reports."""
-    with path.open("rb") as stream:
-        content = stream.read(MAX_BYTES + 1)
-    return content if len(content) <= MAX_BYTES else None
+        raise ControllerUnfit(
+            str(path),
+            found=(error.strerror or type(error).__name__).lower(),
+            expected=f"the controller's file, at most {MAX_BYTES >> 20} MiB",
+            remedy="correct `controller.file` of the cell configuration, or give --to FILE",
+        ) from error

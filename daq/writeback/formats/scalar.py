@@ -101,11 +101,7 @@ class Scalar:
         return float(text) if self.integer is None else float(self.integer.read(text))
 
     def spell(self, value: float, std: float) -> str:
-        """Format a number for this place.
-
-        Args:
-            value: finite, not zero [unit of the document].
-            std: its standard deviation, which bounds the error of rounding to an integer.
+        """Format a number for this place: finite, not zero; σ bounds the error of rounding to an integer.
 
         Raises:
             ControllerUnfit: only integers are allowed here, and none is near enough or in range.
@@ -141,13 +137,7 @@ class RewrittenGain:
 
 
 def rewrite_gain(scalar: Scalar, value: float, std: float, factor: float = 1.0) -> RewrittenGain:
-    """Put a gain in the place of a number.
-
-    Args:
-        scalar: the number now.
-        value: gain, finite and not zero [gain unit].
-        std: its standard deviation [gain unit].
-        factor: number in the document = gain × factor.
+    """Put a gain in the place of a number; gain, finite and not zero, × factor = number in the document.
 
     Raises:
         ControllerUnfit: see `Scalar.spell`.
@@ -196,10 +186,7 @@ class ControllerDocument(ABC):
         return leaf
 
     def with_values(self, spelling: Mapping[str, str]) -> Self:
-        """Replace some numbers in the text, and check the result with `check_against`.
-
-        Args:
-            spelling: the new number, as text, by its key.
+        """Replace some numbers, each by the text for its key, and check the result with `check_against`.
 
         Raises:
             ControllerUnfit: as `locate`, or the new text has another change than these.
@@ -259,11 +246,6 @@ def unfit(
 
 def utf8(content: bytes, name: str, kind: str) -> str:
     """Decode a file.
-
-    Args:
-        content: of the file.
-        name: of the file, for messages.
-        kind: its format.
 
     Raises:
         ControllerUnfit: it is not UTF-8.

@@ -18,14 +18,14 @@ two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
 
 
 def cell(context: GateContext) -> Iterator[Finding]:
-    """Compare the calibration's cell with the controller's."""
+    """Refuse a calibration of another cell."""
     found = context.calibration.cell
     if context.cell is not None and found != context.cell.name:
         yield "calibration", f"cell {found!r}", f"cell {context.cell.name!r}", "give its own --cell"
 
 
 def configuration(context: GateContext) -> Iterator[Finding]:
-    """Compare the digest of the cell's configuration at the recording with that of now."""
+    """Refuse after a change of URDF, drive profile or cell file since the recording, in what a recording depends on."""
     if context.cell is None or context.request.configuration_changed:
         return
     found, expected = context.calibration.recording_configuration_sha256, context.cell.recording_digest
@@ -42,7 +42,7 @@ def configuration(context: GateContext) -> Iterator[Finding]:
 
 
 def finite_errors(context: GateContext) -> Iterator[Finding]:
-    """Require relative errors that are finite and not below zero."""
+    """Require relative errors that are finite and not negative."""
     if not _errors_are_finite(context.calibration):
         yield (
             "calibration",
@@ -53,7 +53,7 @@ def finite_errors(context: GateContext) -> Iterator[Finding]:
 
 
 def error(context: GateContext) -> Iterator[Finding]:
-    """Bound the relative error of the torques, in total and on each axis; on the hold-out where there is one."""
+    """Bound the relative error of the torques, on the held-out run if there is one; in total, and on each axis."""
     calibration, policy = context.calibration, context.policy
     if not _errors_are_finite(calibration):
         return
@@ -86,7 +86,7 @@ def error(context: GateContext) -> Iterator[Finding]:
 
 
 def holdout(context: GateContext) -> Iterator[Finding]:
-    """Require that the calibration predicts the held-out runs no worse than the nameplate's gains do."""
+    """Require a held-out error no worse than with the nameplate's gains, in total and on each axis."""
     calibration = context.calibration
     if not _errors_are_finite(calibration):
         return
@@ -130,7 +130,7 @@ def holdout(context: GateContext) -> Iterator[Finding]:
 
 
 def holdout_log(context: GateContext) -> Iterator[Finding]:
-    """Require a held-out log with each error on held-out data, and the error with each held-out log."""
+    """Require an error and a log of the held-out run, or neither."""
     calibration = context.calibration
     if context.cell is None or not calibration.sources:
         return
@@ -141,7 +141,7 @@ def holdout_log(context: GateContext) -> Iterator[Finding]:
 
 
 def holdout_motion(context: GateContext) -> Iterator[Finding]:
-    """Require that every axis moves in the held-out run."""
+    """Require that every axis moves in the held-out run: otherwise nothing tests its gain."""
     held = context.calibration.holdout_error_percent
     for name, number in zip(context.axis_names, () if held is None else held.axes, strict=False):
         if math.isnan(number):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
-from daq.errors import CalibrationRefused
 from daq.writeback.request import Edit, Request
 from ident.calibration import Calibration
 
@@ -76,22 +74,3 @@ class GateContext:
     def axis_names(self) -> list[str]:
         """Axes of the calibration, in its order."""
         return [gain.axis for gain in self.calibration.gains]
-
-
-def refusal_error(target: str, refusals: Sequence[Refusal]) -> CalibrationRefused:
-    """Make the error for at least one failed check; several are listed one a line.
-
-    Args:
-        target: what was not written.
-        refusals: the failed checks.
-    """
-    if len(refusals) == 1:
-        only = refusals[0]
-        return CalibrationRefused(only.subject, found=only.found, expected=only.expected, remedy=only.remedy)
-    listed = "".join(f"\n  {refusal}" for refusal in refusals)
-    return CalibrationRefused(
-        target,
-        found=f"{len(refusals)} failed checks{listed}\n ",
-        expected="none",
-        remedy="nothing was written",
-    )

@@ -21,7 +21,7 @@ _LONGEST_DAYS = 1e5  #: Some 270 years: no log is so old
 
 
 def sources(context: GateContext) -> Iterator[Finding]:
-    """Require finished logs with a digest, and with all that a recording reports of each axis."""
+    """Require logs with their digests and recording data, for every axis (not those of an earlier drivegain)."""
     if not context.calibration.sources:
         yield "calibration", "no logs it rests on", "at least one", "fit from logs of this cell"
     for source in context.calibration.sources:
@@ -63,7 +63,7 @@ def _incomplete(recording: Recording, name: str, axes: int) -> Iterator[Finding]
 
 
 def roles(context: GateContext) -> Iterator[Finding]:
-    """Require a bare and a loaded run in the fit, and every recording once."""
+    """Require two logs in the fit, one with a payload; each recording once, with the role `fit` or `holdout`."""
     logs = context.calibration.sources
     if context.cell is None or not logs:
         return
@@ -97,7 +97,7 @@ def roles(context: GateContext) -> Iterator[Finding]:
 
 
 def partial(context: GateContext) -> Iterator[Finding]:
-    """Refuse salvaged logs, and those whose losses were accepted."""
+    """Refuse a log that was salvaged, or whose losses were accepted."""
     for source in context.calibration.sources:
         if source.partial:
             yield (
@@ -109,7 +109,7 @@ def partial(context: GateContext) -> Iterator[Finding]:
 
 
 def losses(context: GateContext) -> Iterator[Finding]:
-    """Refuse logs with missing cycles or answers."""
+    """Refuse a log in which cycles or answers are missing."""
     for source, recording, name in _recordings(context):
         # A log whose losses were accepted is partial: one refusal is enough.
         if not source.partial and (recording.lost_cycles or any(recording.missing)):
@@ -122,7 +122,7 @@ def losses(context: GateContext) -> Iterator[Finding]:
 
 
 def age(context: GateContext) -> Iterator[Finding]:
-    """Bound the age of the logs."""
+    """Refuse a log that is too old, dated in the future, or has no valid date (imports)."""
     longest = context.policy.max_age_days
     if context.cell is None or longest is None:
         return
@@ -152,7 +152,7 @@ def _span(days: float) -> str:
 
 
 def serials(context: GateContext) -> Iterator[Finding]:
-    """Compare the serial numbers of the recorded drives with the cell's, and between the logs."""
+    """Require the drives of the cell file, and the same drives in all logs of the fit."""
     axes = context.axis_names
     of_cell = {} if context.cell is None else {axis.name: axis.identity for axis in context.cell.axes}
     declared = {name: identity.serial for name, identity in of_cell.items() if identity is not None}
@@ -184,7 +184,7 @@ def serials(context: GateContext) -> Iterator[Finding]:
 
 
 def saturation(context: GateContext) -> Iterator[Finding]:
-    """Bound the share of samples in which a limit of the drive acted."""
+    """Bound the share of samples of an axis in which a limit of the drive acted."""
     bound = context.policy.max_saturated_percent
     for _, recording, name in _recordings(context):
         for axis, percent in zip(context.axis_names, recording.saturated_percent, strict=False):
@@ -198,7 +198,7 @@ def saturation(context: GateContext) -> Iterator[Finding]:
 
 
 def mass(context: GateContext) -> Iterator[Finding]:
-    """Compare the fitted mass of each payload with the weighed one and with the cell file."""
+    """Require a mass entered twice, and in the fit and the cell file as it is now, alike within the tolerance."""
     if context.cell is None:
         return
     payloads = context.cell.payloads

@@ -7,7 +7,6 @@ import unicodedata
 from collections.abc import Iterator
 
 from daq.config.cell import Axis
-from daq.config.policy import ApplyPolicy
 from daq.errors import SignatureInvalid
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.request import Finding, GainChange, parse_base, short_digest
@@ -19,7 +18,7 @@ _CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the 
 
 
 def finite_gains(context: GateContext) -> Iterator[Finding]:
-    """Require gains that are finite and not zero."""
+    """Require finite numbers: gain (not zero), σ (not negative), number in the controller, nameplate."""
     for change in context.edit.changes:
         if not _is_finite(change):
             found = f"gain {change.new:g} ± {change.std:g}, {change.old:g} now, nameplate {change.nameplate:g}"
@@ -27,7 +26,7 @@ def finite_gains(context: GateContext) -> Iterator[Finding]:
 
 
 def identified(context: GateContext) -> Iterator[Finding]:
-    """Refuse gains that the fit held fixed."""
+    """Refuse a gain that the fit held fixed (σ = 0)."""
     for change in _finite_changes(context):
         if change.std == 0:
             remedy = "fit with a loaded run and free gains"
@@ -35,7 +34,7 @@ def identified(context: GateContext) -> Iterator[Finding]:
 
 
 def uncertainty(context: GateContext) -> Iterator[Finding]:
-    """Bound the relative standard deviation."""
+    """Bound σ, relative to the gain."""
     bound = context.policy.max_std_percent
     for change in _finite_changes(context):
         if change.std_percent > bound:
@@ -56,7 +55,7 @@ def sign(context: GateContext) -> Iterator[Finding]:
 
 
 def change_bound(context: GateContext) -> Iterator[Finding]:
-    """Bound the change from the gain in the controller, in per cent and in the gain's unit."""
+    """Bound the change from the number in the controller."""
     policy = context.policy
     for change in filter(_keeps_sign, _finite_changes(context)):
         if abs(change.change_percent) > policy.max_change_percent:
@@ -82,7 +81,7 @@ def nameplate_bound(context: GateContext) -> Iterator[Finding]:
 
 
 def same_nameplate(context: GateContext) -> Iterator[Finding]:
-    """Require the cell's nameplate in the calibration: bounds and hold-out are compared with it."""
+    """Refuse a comparison with another nameplate than the cell's."""
     for gain, axis in _axes_of_cell(context):
         # A nameplate that is no number has a gate of its own.
         if math.isfinite(gain.nameplate) and not math.isclose(gain.nameplate, axis.nameplate_gain, rel_tol=_SPELLING):
@@ -95,7 +94,7 @@ def same_nameplate(context: GateContext) -> Iterator[Finding]:
 
 
 def unit(context: GateContext) -> Iterator[Finding]:
-    """Require gains in the cell's units."""
+    """Refuse a gain in another unit than the cell's."""
     for gain, axis in _axes_of_cell(context):
         if gain.unit != axis.gain_unit:
             expected = f"{axis.gain_unit!r}, as the cell file has it"
@@ -123,32 +122,31 @@ def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, Axis]]:
 
 
 def base(context: GateContext) -> Iterator[Finding]:
-    """Require the content that the target should have, or that the operator has reviewed (`--base`)."""
-    edit = context.edit
-    before = edit.before or b""
-    reviewed = parse_base(context.request.base, before)
+    """Require the content that the target had at the recording, or after the last write; or that of `--base`."""
+    edit, base = context.edit, context.request.base
+    reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
     if edit.keeps_all:
         return
-    if reviewed.base_sha256 is None:
+    if reviewed is None:
         yield from edit.unexpected
-    elif reviewed.base_sha256 != edit.base_sha256:
+    elif reviewed != edit.base_sha256:
         yield (
             edit.subject,
             f"content {edit.base_sha256[:12]}…",
-            f"{reviewed.base_sha256[:12]}…, as --base says",
+            f"{reviewed[:12]}…, as --base says",
             "the content has changed since that review: take a new dry run, without --base",
         )
-    elif reviewed.after_digest not in {None, short_digest(edit.after)}:
+    elif after_digest not in {None, short_digest(edit.after)}:
         yield (
             edit.subject,
             f"a change to {short_digest(edit.after)}…",
-            f"to {reviewed.after_digest}…, as --base says",
+            f"to {after_digest}…, as --base says",
             "the calibration, the keys or the factors have changed since the dry run: take a new one",
         )
 
 
 def signature(context: GateContext) -> Iterator[Finding]:
-    """Require signatures of persons other than the operator.
+    """Require signatures of others than the operator; `--by` must be a signer or the login.
 
     Names are compared without case and blanks, and however they are encoded (NFKC). The operator's name must be a
     signer's, or the login: a look-alike of their own name would make two persons of one.
@@ -167,7 +165,8 @@ def signature(context: GateContext) -> Iterator[Finding]:
         return
     *given, login = request.appliers or ("",)
     for name in given:
-        if not _is_known(name, login, policy):
+        known = {_as_read(other) for other in (*policy.signers, login)}
+        if not _is_legible(name) or _as_read(name) not in known:
             yield (
                 "operator",
                 ascii(name),
@@ -195,10 +194,6 @@ def _as_read(name: str) -> str:
 def _is_legible(name: str) -> bool:
     """Whether every character shows: no control, format, private or unassigned one."""
     return bool(name) and not any(unicodedata.category(character).startswith("C") for character in name)
-
-
-def _is_known(name: str, login: str, policy: ApplyPolicy) -> bool:
-    return _is_legible(name) and _as_read(name) in {_as_read(other) for other in (*policy.signers, login)}
 
 
 def _others(names: tuple[str, ...], applying: set[str]) -> list[str]:

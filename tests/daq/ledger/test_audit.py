@@ -21,8 +21,18 @@ from hypothesis import strategies as st
 
 from daq.errors import AuditUnusable, exit_code
 from daq.ledger import audit
-from daq.ledger.audit import AuditAction, AuditEntry, Content, Flaw, append, read, verify
-from daq.ledger.audit_chain import encode, entry, judge
+from daq.ledger.audit import (
+    AuditAction,
+    AuditEntry,
+    Content,
+    Flaw,
+    append,
+    encode,
+    entry,
+    judge,
+    read,
+    verify,
+)
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 TREES = st.recursive(

@@ -26,13 +26,12 @@ from daq.jobs.decision import GainHistory
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
-from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, logs_of, recorded_at
+from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, logs_of, recorded_at
 from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
 from daq.workflow.calibration_file import save
-from daq.writeback.drive_record import drives_of
 from daq.writeback.formats.document import decode as read_controller
 from daq.writeback.formats.scalar import rewrite_gain
 from daq.writeback.request import GainChange
@@ -660,19 +659,19 @@ def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsy
     ("change", "says"),
     [
         ("event SET who = 'kim'", "event 1: found who 'kim', expected 'anna' as entry 2"),
-        ("event SET target = '/other.yaml'", "event 1: found target /other.yaml, expected"),
-        ("event SET at = '2026-02-02T00:00:00.000000+00:00'", "event 1: found time 2026-02-02T00:00:00"),
-        ("event SET deed = 'rolled back'", "event 1: found rolled back, expected applied"),
-        ("event SET digest = NULL", "event 1: found calibration None, expected"),
-        ("event SET sha256_after = 'ab'", "event 1: found sha256_after ab…, expected"),
+        ("event SET target = '/other.yaml'", "event 1: found target '/other.yaml', expected"),
+        ("event SET at = '2026-02-02T00:00:00.000000+00:00'", "event 1: found at '2026-02-02T00:00:00"),
+        ("event SET deed = 'rolled back'", "event 1: found action 'rolled back', expected 'applied'"),
+        ("event SET digest = NULL", "event 1: found digest None, expected"),
+        ("event SET sha256_after = 'ab'", "event 1: found sha256_after 'ab', expected"),
         ("event SET audit = NULL", "no event of entry 2 of the audit, applied by anna"),
         ("event SET number = 7", "event 1, 2, 3, 4, 5: found no such row, expected all from 1 to 7"),
         ("acknowledgement SET who = 'kim'", "found who 'kim', expected 'anna (login"),
         ("acknowledgement SET axis = 'J2'", "found axis 'J2', expected 'J4' as entry 3"),
         ("acknowledgement SET why = 'x'", "found why 'x', expected 'gearbox changed'"),
         ("acknowledgement SET since = '2026-01-01T00:00:00.000000+00:00'", "found since '2026-01-01T00:00:00"),
-        ("acknowledgement SET at = '2026-03-01T00:00:00.000000+00:00'", "found time '2026-03-01T00:00:00"),
-        ("acknowledgement SET audit = (SELECT audit FROM event)", "applied, expected an entry acknowledged"),
+        ("acknowledgement SET at = '2026-03-01T00:00:00.000000+00:00'", "found at '2026-03-01T00:00:00"),
+        ("acknowledgement SET audit = (SELECT audit FROM event)", "applied, expected an acknowledgement"),
         ("gain SET value = value * 1.01 WHERE axis = 'J4'", "gain of J4 in calibration"),
     ],
 )
@@ -731,7 +730,7 @@ def test_a_write_that_a_job_entered_holds_within_the_job(cell: Path, capsys: pyt
     with closing(sqlite3.connect(_place(cell).store)) as other:
         other.execute("UPDATE event SET at = '2026-02-02T00:00:00.000000+00:00'")
         other.commit()
-    assert "found time 2026-02-02" in _verified(cell, capsys)
+    assert "found at '2026-02-02" in _verified(cell, capsys)
 
 
 def test_drives_that_are_written_once_more_are_known_again(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,9 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.errors import DataError, HistoryUnreadable, OutputFailed, exit_code
-from daq.ledger import schema
 from daq.ledger.entry import Acknowledgement, WriteAction, iso, utc
-from daq.ledger.store import HistoryStore
+from daq.ledger.store import VERSION, HistoryStore
 from daq.workflow.calibration_file import decode, encode
 from tests.daq.calibrations import AXES, demo_calibration
 from tests.daq.histories import BEGIN, calibration_of, digest_of, enter
@@ -315,7 +314,7 @@ def test_another_version_is_refused_and_left_alone(tmp_path: Path, version: int)
     before = path.read_bytes()
     with pytest.raises(HistoryUnreadable, match=f"version {version}") as refused, HistoryStore(path):
         pass
-    assert ("later drivegain" in refused.value.remedy) == (version > schema.VERSION)
+    assert ("later drivegain" in refused.value.remedy) == (version > VERSION)
     assert path.read_bytes() == before
 
 

@@ -16,7 +16,7 @@ from daq.config.cell import Cell
 from daq.errors import CalibrationRefused, UsageError
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.gates.target import base as base_gate
-from daq.writeback.request import Edit, Finding, Request, ReviewedChange, change_digest, parse_base
+from daq.writeback.request import Edit, Finding, Request, change_digest, parse_base
 from drivers.canopen.bus import BusAddress
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
@@ -30,21 +30,18 @@ def _findings(base: str | None, before: bytes, after: bytes) -> list[Finding]:
 
 @given(st.binary(max_size=20), st.binary(max_size=20), st.binary(max_size=20))
 def test_a_change_is_known_by_both_of_its_ends(before: bytes, after: bytes, another: bytes) -> None:
-    reviewed = parse_base(f" {change_digest(before, after).upper()}\n", before)
-    assert reviewed.base_sha256 == hashlib.sha256(before).hexdigest()
+    reviewed, _ = parse_base(f" {change_digest(before, after).upper()}\n", before)
+    assert reviewed == hashlib.sha256(before).hexdigest()
     assert _findings(change_digest(before, after), before, after) == []
     assert bool(_findings(change_digest(before, after), before, another)) == (another not in (before, after))
-    assert (parse_base(change_digest(another, after), before).base_sha256 == reviewed.base_sha256) == (
-        another == before
-    )
+    assert (parse_base(change_digest(another, after), before)[0] == reviewed) == (another == before)
 
 
 def test_the_whole_digest_alone_names_no_change() -> None:
     digest = hashlib.sha256(b"old").hexdigest()
-    reviewed = parse_base(digest, b"old")
-    assert reviewed == ReviewedChange(digest, None)
+    assert parse_base(digest, b"old") == (digest, None)
     assert _findings(digest, b"old", b"any") == []
-    assert parse_base(None, b"old") == ReviewedChange(None, None)
+    assert _findings(None, b"old", b"any") == []
 
 
 @pytest.mark.parametrize("text", ["", "-", "a" * 63, "g" * 64, "a" * 12, f"{'a' * 12}-", f"{'a' * 12}-{'a' * 64}"])

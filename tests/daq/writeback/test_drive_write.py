@@ -17,8 +17,7 @@ from daq.config.cell import Cell
 from daq.config.controller import GainObject
 from daq.errors import CalibrationRefused, ConfigurationInconsistent, ControllerChanged, ControllerUnfit
 from daq.ledger.audit import AuditAction, read, verify
-from daq.writeback.drive_record import read_record, read_records, record_folder
-from daq.writeback.drive_target import DriveEdit, DriveTarget
+from daq.writeback.drive_target import DriveEdit, DriveTarget, read_record, read_records, record_folder
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written, apply, propose, rollback
