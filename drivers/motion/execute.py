@@ -153,7 +153,7 @@ class _Walk:
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
-            self._stream.send((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
+            self._stream.outgoing.extend((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
 
     def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
@@ -191,7 +191,7 @@ class _Walk:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
             velocity, acceleration = move.velocity_counts_s[axis], move.acceleration_counts_s2[axis]
             node_id = self._nodes[axis].node_id
-            self._stream.send((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
+            self._stream.outgoing.extend((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
@@ -271,7 +271,7 @@ class _Walk:
 
     def stop(self) -> Generator[Sample, None, list[DriverError]]:
         """Quick stop all axes, then remove their power; returns the failures to confirm it."""
-        self._stream.drop_outgoing()  # a set-point that was not sent yet must not start a move now
+        self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
         self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         problems: list[DriverError] = []
         unconfirmed = tuple(self._axes)
