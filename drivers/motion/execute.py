@@ -99,16 +99,16 @@ def execute(
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
-            walk.ended_by(error)
+            walk.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
             problems = _drain(walk.stop())
             if not problems:
                 network.unguard()
         for problem in problems:
             error.add_note(f"{WHILE}stopping: {problem}")
         raise
+    for problem in problems[1:]:
+        problems[0].add_note(f"{WHILE}stopping: {problem}")
     if problems:
-        for problem in problems[1:]:
-            problems[0].add_note(f"{WHILE}stopping: {problem}")
         raise problems[0]
     stream.check()  # faults during the stop
 
@@ -141,10 +141,6 @@ class _Walk:
     def _cycles(self, seconds: float) -> int:
         return max(1, round(seconds * 1e9 / self._stream.pacing.period_ns))
 
-    def _next(self) -> Sample:
-        self._sample = next(self._stream)
-        return self._sample
-
     def _state(self, axis: int) -> State:
         return decode(self._sample.statusword[axis])
 
@@ -155,12 +151,12 @@ class _Walk:
             self._sent[axis] = command
             self._stream.outgoing.extend((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
 
-    def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
+    def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
 
     def enable(self, granted_by: str) -> Iterator[Sample]:
         """Bring all axes to OPERATION ENABLED, each holding where it is."""
-        self._emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
+        self.emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
         for axis in self._axes:
             if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 self._refuse(axis)
@@ -174,7 +170,8 @@ class _Walk:
                 self._send_command(
                     axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0
                 )
-            yield self._next()
+            self._sample = next(self._stream)
+            yield self._sample
         for axis in self._axes:
             if self._state(axis) is not State.OPERATION_ENABLED:
                 self._refuse(axis)
@@ -197,16 +194,20 @@ class _Walk:
             self._targets[axis] = move.target_counts[axis]
             self._send_command(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
         sample = self._checked()
-        self._emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
+        self.emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
         yield from self._handshake(number, moving)
-        durations = move.duration_s(start)
-        allowed = 2 * max(durations) + self._bounds.settle_s
+        allowed = 2 * max(move.duration_s(start)) + self._bounds.settle_s
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed)):
             for axis in data.frozen(self._sample):
                 if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
-                    self._freeze(number, axis)
+                    position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
+                    reason = f"move {number}: position {position} and current {current} do not change during the move"
+                    remedy = "is its data frozen, its encoder or its motor cable off?"
+                    error = DriveFault(self._nodes[axis], reason, remedy=remedy)
+                    self.emit(axis, EventKind.FROZEN, number, str(error))
+                    raise error
             if all(self._arrived(axis, start[axis]) for axis in moving):
                 break
             yield self._checked()
@@ -214,19 +215,9 @@ class _Walk:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
                 raise self._timeout(number, late, allowed)
-        self._emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
+        self.emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
-
-    def _freeze(self, number: int, axis: int) -> None:
-        position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
-        error = DriveFault(
-            self._nodes[axis],
-            f"move {number}: position {position} and current {current} do not change during the move",
-            remedy="is its data frozen, its encoder or its motor cable off?",
-        )
-        self._emit(axis, EventKind.FROZEN, number, str(error))
-        raise error
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
         """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
@@ -257,7 +248,7 @@ class _Walk:
 
     def _checked(self) -> Sample:
         """Return the next sample, in which all axes are still enabled."""
-        sample = self._next()
+        sample = self._sample = next(self._stream)
         for axis in self._axes:
             if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
                 word = sample.statusword[axis]
@@ -265,14 +256,10 @@ class _Walk:
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
-    def ended_by(self, error: BaseException) -> None:
-        """Log why the moves ended early."""
-        self._emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
-
     def stop(self) -> Generator[Sample, None, list[DriverError]]:
         """Quick stop all axes, then remove their power; returns the failures to confirm it."""
         self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
-        self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         problems: list[DriverError] = []
         unconfirmed = tuple(self._axes)
         try:
@@ -281,35 +268,34 @@ class _Walk:
             self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
-            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
             problems.append(error)
         try:
-            silent = self._network.find_silent([self._network.axes[axis] for axis in unconfirmed])
+            silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
         except DriverError as error:
-            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
             return problems or [error]
         if silent is not None:
             problems.append(silent)
         heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
         if heard:
-            self._network.begin_stop([self._network.axes[axis] for axis in heard])
+            self._network.begin_stop([self._nodes[axis] for axis in heard])
         for axis in unconfirmed:
             if axis not in heard:
                 text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
-                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
                 continue
             try:
-                self._network.disable(self._network.axes[axis])
+                self._network.disable(self._nodes[axis])
             except DriverError as error:
-                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
                 problems.append(error)
         return problems
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
         still, rest = [0] * len(self._sent), list(self._sample.position_counts)
-        silent = 0
-        powered = list(self._axes)
+        silent, powered = 0, list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
             for axis in powered:
                 state = self._state(axis)
