@@ -14,9 +14,10 @@ import subprocess
 import sys
 import time
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
+from operator import sub
 from pathlib import Path
+from typing import NamedTuple
 
 import can
 
@@ -38,28 +39,18 @@ _FRAME = struct.Struct("=IB3x8s")
 _PAIR_BYTES = 1 << 18
 
 
-@dataclass(frozen=True, slots=True)
-class Losses:
+class Losses(NamedTuple):
     """Frames that came over the wire and were lost in this machine."""
 
     kernel: int = 0  #: in the socket's receive buffer (SO_RXQ_OVFL)
-    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
     #: Before any socket, in the controller or in the kernel's queue behind its driver (the interface's counters, which
     #: are read five times a second).
     interface: int = 0
-
-    @property
-    def total(self) -> int:
-        """Sum of all losses."""
-        return self.kernel + self.interface + self.backlog
+    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
 
     def since(self, earlier: Losses) -> Losses:
         """Return the losses since an earlier reading."""
-        return Losses(
-            kernel=self.kernel - earlier.kernel,
-            backlog=self.backlog - earlier.backlog,
-            interface=self.interface - earlier.interface,
-        )
+        return Losses(*map(sub, self, earlier))
 
 
 NO_LOSSES = Losses()
@@ -90,9 +81,7 @@ def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
 
 
 def open_socketcan(
-    channel: str,
-    receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES,
-    backlog_records: int = capture.BACKLOG_RECORDS,
+    channel: str, receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES, backlog_records: int = capture.BACKLOG_RECORDS
 ) -> SocketcanBus:
     """Open one end of an interface of the kernel.
 
@@ -107,9 +96,7 @@ def open_socketcan(
     """
     handle = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
-        remarks = _configure(handle, receive_buffer_bytes)
-        handle.bind((channel,))
-        _require_up(handle)
+        remarks = _configure(handle, channel, receive_buffer_bytes)
     except BaseException:
         handle.close()
         raise
@@ -127,11 +114,6 @@ class SocketcanBus(can.BusABC):
 
     Raises:
         can.CanError: the capture process did not start; the socket is closed.
-
-    Attributes:
-        losses: as of the frames received so far.
-        remarks: as given.
-        capture_pid: process id of the capture process.
     """
 
     def __init__(
@@ -142,7 +124,7 @@ class SocketcanBus(can.BusABC):
         remarks: tuple[str, ...] = (),
     ) -> None:
         self.channel_info = f"socketcan {channel}"
-        self.losses = NO_LOSSES
+        self.losses = NO_LOSSES  #: Of the frames received so far
         self.remarks = remarks
         self._channel = channel
         self._received: deque[can.Message] = deque()
@@ -181,7 +163,10 @@ class SocketcanBus(can.BusABC):
         return self._pair.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        frame = _packed(msg)
+        if msg.is_fd:
+            raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
+        flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
+        frame = _FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
         deadline: float | None = None
         while True:
             try:
@@ -247,7 +232,7 @@ class SocketcanBus(can.BusABC):
         chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
         rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
-        lost = [self.losses.kernel, self.losses.interface, self.losses.backlog]
+        lost: list[int] = list(self.losses)
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
@@ -258,7 +243,7 @@ class SocketcanBus(can.BusABC):
                 ready = True
             elif kind == Kind.END:
                 end = _reason(can_id)
-        losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
+        losses = Losses(*lost)
         # No call from here on: the state changes whole, or not at all.
         self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
 
@@ -314,8 +299,8 @@ def _spawn(bus: socket.socket, out: socket.socket, channel: str, backlog_records
     )
 
 
-def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, ...]:
-    """Set the options of a CAN_RAW socket; returns remarks for the operator."""
+def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -> tuple[str, ...]:
+    """Set the options of a CAN_RAW socket and bind it; returns remarks for the operator."""
     for level, option, value in (
         (socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
         (socket.SOL_SOCKET, capture.SO_RXQ_OVFL, 1),
@@ -327,6 +312,9 @@ def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, .
         handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
     except PermissionError:
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    handle.bind((channel,))
+    if number := handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+        raise can.CanInitializationError(_reason(number))
     # The kernel doubles the requested size for its own book-keeping, and reports the double.
     given = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     if given >= receive_buffer_bytes:
@@ -335,24 +323,6 @@ def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, .
         f"the kernel gave {given >> 10} KiB of receive buffer instead of {receive_buffer_bytes >> 10} KiB: "
         "raise net.core.rmem_max, or let the recorder have CAP_NET_ADMIN",
     )
-
-
-def _require_up(handle: socket.socket) -> None:
-    number = handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    if number:
-        raise can.CanInitializationError(_reason(number))
-
-
-def _packed(message: can.Message) -> bytes:
-    """Return a frame as struct can_frame."""
-    if message.is_fd:
-        raise can.CanOperationError(f"no CAN FD frames on this bus: {message}")
-    flags = (
-        (_EXTENDED if message.is_extended_id else 0)
-        | (_REMOTE if message.is_remote_frame else 0)
-        | (_ERROR if message.is_error_frame else 0)
-    )
-    return _FRAME.pack(message.arbitration_id | flags, message.dlc, bytes(message.data))
 
 
 def _reason(number: int) -> str:

@@ -207,7 +207,8 @@ class SyncStream:
             self._link.note_foreign(SYNC_COB_ID)
         now_ns = pacing.clock()
         self._too_late(now_ns - at_ns)
-        pacing.seen(at_ns, periods)
+        if pacing.seen is not None:
+            pacing.seen(at_ns, periods)
         self._last_sync_ns = at_ns
         self.time_ns = pacing.start_ns + at_ns - self._first_sync_ns
         self._cycles += 1

@@ -19,9 +19,9 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import SYNC_COB_ID
@@ -81,10 +81,6 @@ class TimedSync:
     clock: Clock = time.monotonic_ns
 
 
-def ignore(monotonic_ns: int, periods: int) -> None:
-    """Do nothing: for a producer that keeps its period by itself."""
-
-
 @dataclass(frozen=True, slots=True)
 class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
@@ -97,7 +93,8 @@ class FollowedSync:
         in_kernel: the producer is this machine's kernel; a SYNC from the wire is then another device's.
         timeout_s: time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself,
             because the axes are stopped by frames that act on SYNC.
-        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before.
+        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where
+            the producer must be steered.
         start_ns: wall time of the first SYNC [ns since 1970].
         clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
@@ -106,7 +103,7 @@ class FollowedSync:
     producer: str
     in_kernel: bool = False
     timeout_s: float = 0.1
-    seen: Callable[[int, int], None] = ignore
+    seen: Callable[[int, int], None] | None = None
     start_ns: int = 0
     clock: Clock = time.monotonic_ns
 
@@ -136,7 +133,7 @@ def _setup(flags: int, interval_us: int) -> bytes:
     return head + _FRAME.pack(SYNC_COB_ID, 0, bytes(8))
 
 
-class KernelProducer:
+class KernelProducer(AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
     It ends with the process that started it. Each interval counts from the actual time of the last SYNC, so the period
@@ -157,12 +154,7 @@ class KernelProducer:
         self._window = max(8, round(STEERING_S * 1e6 / period_us))
         self._begun_ns = self._phase_ns = self._periods = 0
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self) -> None:
@@ -182,11 +174,7 @@ class KernelProducer:
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC, to keep the average period and the phase of the first one.
-
-        Args:
-            monotonic_ns: its time [ns].
-            periods: since the one before; 0 for the first, where the schedule begins.
+        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase.
 
         Raises:
             OSError: the kernel refuses a new interval.
@@ -212,7 +200,7 @@ class KernelProducer:
         self._socket, self._link.sync_producer = None, None
 
 
-class DriveProducer:
+class DriveProducer(AbstractContextManager["DriveProducer"]):
     """SYNC by a drive of the cell, by its objects 1005h (bit 30) and 1006h; both are restored afterwards.
 
     Args:
@@ -227,9 +215,6 @@ class DriveProducer:
         self._node_id = network.node_ids[axis]
         self._period_us = period_us
         self._before: tuple[int, int] | None = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
