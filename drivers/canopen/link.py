@@ -6,6 +6,7 @@ while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
@@ -196,9 +197,16 @@ class Link:
         self.heard.add(node_id)
         self.silent.discard(node_id)
         if service == HEARTBEAT and message.data:
-            self._note_heartbeat(node_id, message.data[0] & 0x7F)
+            previous, state = self.nmt.get(node_id), message.data[0] & 0x7F
+            self.nmt[node_id], self.heard_ns[node_id] = state, self.clock()
+            if previous != state:
+                self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
         elif service == _EMCY and len(message.data) == 8:
-            self._note_emcy(node_id, message.data)
+            code, register, data = struct.unpack("<HB5s", message.data)
+            # CiA 301: codes 00xxh report the end of an error.
+            kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
+            text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
+            self._events.append((node_id, kind, code, text))
         elif service == _SDO_ANSWER:
             self.answered.add(node_id)
             for client in self._clients.get(node_id, ()):
@@ -206,14 +214,6 @@ class Link:
         else:
             return False
         return True
-
-    def _note_heartbeat(self, node_id: int, state: int) -> None:
-        previous = self.nmt.get(node_id)
-        self.nmt[node_id] = state
-        self.heard_ns[node_id] = self.clock()
-        if previous != state:
-            text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
-            self._events.append((node_id, EventKind.NMT, state, text))
 
     def _note_error_frame(self, message: can.Message) -> None:
         """Report the state of the CAN controller; the kernel sends each change once."""
@@ -236,17 +236,8 @@ class Link:
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
 
-    def _note_emcy(self, node_id: int, data: bytearray) -> None:
-        code, register = int.from_bytes(data[:2], "little"), data[2]
-        # CiA 301: codes 00xxh report the end of an error.
-        kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-        text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data[3:].hex()}"
-        self._events.append((node_id, kind, code, text))
-
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
-        if not self._events:
-            return ()
         taken, self._events = self._events, deque()
         return tuple(
             CellEvent(
@@ -254,19 +245,10 @@ class Link:
                 node_ids.index(node) if node in node_ids else None,
                 kind,
                 code,
-                f"{self.label(node)}: {text}" if node else text,
+                f"{node_label(self.objects(node))}: {text}" if node else text,
             )
             for node, kind, code, text in taken
         )
-
-    @property
-    def has_events(self) -> bool:
-        """Whether take_events would return an event."""
-        return bool(self._events)
-
-    def label(self, node_id: int) -> str:
-        """Name a node in a message, with its axis where it is one of ours."""
-        return node_label(self.objects(node_id))
 
     def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
         """Return access to the object dictionary of a node, with the link's policy or another."""

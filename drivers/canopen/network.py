@@ -152,27 +152,21 @@ class CanopenNetwork:
             ObjectAccessError: a node does not report its identity.
         """
         require(self.link, self.node_ids, self.bounds.answer_s)
-        return tuple(self._check_identity(axis) for axis in self.axes)
-
-    def _check_identity(self, axis: Axis) -> Identity:
-        found = read_identity(self.link.objects(axis.node_id))
-        expected = axis.identity
-        if expected is None:
-            return found
-        pairs = [
-            ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
-            ("product code 1018h:02", expected.product_code, found.product_code),
-        ]
-        if expected.serial is not None:
-            pairs.append(("serial number 1018h:04", expected.serial, found.serial or 0))
-        for name, want, have in pairs:
-            if want != have:
-                raise SetupRefused(
-                    axis,
-                    f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
-                    "correct the configuration only after checking the hardware",
-                )
-        return found
+        identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        for axis, found in zip(self.axes, identities, strict=True):
+            expected = axis.identity or found
+            for name, want, have in (
+                ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
+                ("product code 1018h:02", expected.product_code, found.product_code),
+                ("serial number 1018h:04", expected.serial, found.serial or 0),
+            ):
+                if want is not None and want != have:
+                    raise SetupRefused(
+                        axis,
+                        f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
+                        "correct the configuration only after checking the hardware",
+                    )
+        return identities
 
     def prepare(self) -> None:
         """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
@@ -202,14 +196,7 @@ class CanopenNetwork:
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
-        """Choose the highest node id that no device uses, and that no amplifier waits for.
-
-        Args:
-            watched: entries of 1016h of all amplifiers.
-
-        Raises:
-            BusBusy: there is none.
-        """
+        """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""
         # An amplifier that waits for a device which is off now would take our heartbeat for that device's.
         awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
         left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]

@@ -150,17 +150,12 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
         except ObjectAccessError as error:
             raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
     found = read_record(access, record.direction, record.number)
-    if found is None or not _same(found, record):
+    if (
+        found is None
+        or (found.entries, found.transmission) != (record.entries, record.transmission)
+        or (found.cob_id ^ record.cob_id) & _COB_ID_BITS
+    ):
         raise SetupRefused(access, f"{record.name}: reads back as '{found}', written was '{record}'")
-
-
-def switch_off(access: ObjectAccess, record: PdoRecord) -> None:
-    """Mark a PDO as not valid and leave its mapping alone.
-
-    Raises:
-        SetupRefused: the drive refused.
-    """
-    _write_cob_id(access, record, record.cob_id | NOT_VALID)
 
 
 def restore(access: ObjectAccess, record: PdoRecord) -> None:
@@ -173,12 +168,17 @@ def restore(access: ObjectAccess, record: PdoRecord) -> None:
     if found == record:
         return
     if found is not None and (found.entries, found.transmission) == (record.entries, record.transmission):
-        _write_cob_id(access, record, record.cob_id)
+        write_cob_id(access, record, record.cob_id)
     else:
         write_record(access, record)
 
 
-def _write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
+def write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
+    """Write the COB-ID of a PDO alone, which also switches it on or off, and read it back.
+
+    Raises:
+        SetupRefused: a step was aborted, or it reads back differently.
+    """
     cob_id, _, _ = _parameters(record.direction, record.number)
     try:
         if not value & NOT_VALID:
@@ -189,8 +189,3 @@ def _write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
         raise SetupRefused(access, f"{record.name}: writing {value:#x} to {cob_id}: {error.reason}") from error
     if (found ^ value) & _COB_ID_BITS:
         raise SetupRefused(access, f"{record.name}: {cob_id} reads back as {found:#x}, written was {value:#x}")
-
-
-def _same(one: PdoRecord, other: PdoRecord) -> bool:
-    identical = one.entries == other.entries and one.transmission == other.transmission
-    return identical and (one.cob_id ^ other.cob_id) & _COB_ID_BITS == 0

@@ -93,7 +93,7 @@ def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
 
 def read_identity(access: ObjectAccess) -> Identity:
     """Read object 1018h; the serial is None where a node has none."""
-    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
+    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), access.read_optional(SERIAL, any_abort=True))
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
@@ -131,13 +131,5 @@ def _describe(link: Link, node_id: int, answers: bool) -> FoundNode:
         name = access.read_text(0x1008)
     except ObjectAccessError:
         name = None
-    return FoundNode(node_id, identity, _optional(access, REVISION), name, nmt, _optional(access, STATUSWORD))
-
-
-def _optional(access: ObjectAccess, entry: ObjectEntry) -> int | None:
-    try:
-        return access.read(entry)
-    except ObjectAccessError as error:
-        if error.abort_code is None:
-            raise
-        return None
+    revision, statusword = (access.read_optional(entry, any_abort=True) for entry in (REVISION, STATUSWORD))
+    return FoundNode(node_id, identity, revision, name, nmt, statusword)

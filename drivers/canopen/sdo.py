@@ -59,12 +59,13 @@ class ObjectAccess:
         # Some drives send four bytes whatever the object's size is.
         return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
 
-    def read_optional(self, entry: ObjectEntry) -> int | None:
-        """Read an integer object that a drive need not have; None where it has none."""
+    def read_optional(self, entry: ObjectEntry, *, any_abort: bool = False) -> int | None:
+        """Read an integer object that a drive need not have; None where it has none, or aborts for any reason."""
         try:
             return self.read(entry)
         except ObjectAccessError as error:
-            if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
+            missing = error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX)
+            if missing or (any_abort and error.abort_code is not None):
                 return None
             raise
 

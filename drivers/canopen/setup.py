@@ -18,11 +18,11 @@ from drivers.canopen.pdo import (
     read_record,
     records,
     restore,
-    switch_off,
+    write_cob_id,
     write_record,
 )
 from drivers.errors import SetupRefused, StateRefused
-from drivers.motion.guard import Consumers, Guard, arm, disarm, find_guard
+from drivers.motion.guard import Consumers, Guard
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 from drivers.profiles.scale import ScaleReading
 
@@ -33,14 +33,10 @@ PROFILE_POSITION_MODE = 1
 
 
 class AxisSetup:
-    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone.
-
-    Attributes:
-        guard: how the amplifier watches the recorder; None before `watch_recorder`.
-    """
+    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone."""
 
     def __init__(self, link: Link, axis: Axis) -> None:
-        self.guard: Guard | None = None
+        self.guard: Guard | None = None  #: How the amplifier watches the recorder; None before `watch_recorder`
         self._link = link
         self._axis = axis
         self._access = link.objects(axis.node_id)
@@ -60,8 +56,8 @@ class AxisSetup:
     ) -> None:
         """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py)."""
         if self.guard is None:
-            self.guard = find_guard(self._access, consumers, is_left_over)
-        self.guard = arm(self._access, self.guard, recorder_id, silence_ms)
+            self.guard = Guard(self._access, consumers, is_left_over)
+        self.guard.arm(recorder_id, silence_ms)
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
@@ -81,16 +77,16 @@ class AxisSetup:
         for direction, pdos in wanted.items():
             for number in range(PDOS):
                 found = read_record(self._access, direction, number)
-                if number < len(pdos) and found is None:
-                    raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
                 if found is None:
-                    continue
-                if number < len(pdos):
+                    if number < len(pdos):
+                        raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
+                elif number < len(pdos):
                     self._pdos_before.setdefault(found.name, found)
                     write_record(self._access, pdos[number])
                 elif not found.cob_id & NOT_VALID:
                     self._pdos_before.setdefault(found.name, found)
-                    switch_off(self._access, found)  # a drive's default PDOs would come between ours
+                    # A drive's default PDOs would come between ours.
+                    write_cob_id(self._access, found, found.cob_id | NOT_VALID)
         self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
 
     def set_mode(self, within_s: float) -> None:
@@ -114,7 +110,7 @@ class AxisSetup:
     def stop_watching(self) -> None:
         """Restore the objects of the guard."""
         if self.guard is not None:
-            disarm(self._access, self.guard)
+            self.guard.disarm()
 
     def restoring(self) -> Iterator[Callable[[], object]]:
         """Yield the steps that restore all settings; the heartbeat last."""

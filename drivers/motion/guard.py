@@ -13,7 +13,6 @@ record.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
 
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError
@@ -27,22 +26,6 @@ LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a 
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
-
-
-@dataclass(frozen=True, slots=True)
-class Guard:
-    """How an amplifier can watch the recorder, and the original values of the objects."""
-
-    consumer: ObjectEntry | None  #: entry of 1016h that is used, None when there is none
-    consumer_before: int  #: its original value
-    option_before: int | None  #: original value of 6007h, None when the amplifier has no such object
-    lack: str = ""  #: missing capability, in words; empty when nothing is missing
-
-    def describe(self, silence_ms: int) -> str:
-        """Describe the guard in words, for the log."""
-        if self.consumer is None:
-            return self.lack
-        return f"watches the recorder by {self.consumer}, {silence_ms} ms" + (f"; {self.lack}" if self.lack else "")
 
 
 def producer_of(value: int) -> int:
@@ -78,71 +61,67 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
     return tuple(found)
 
 
-def find_guard(access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> Guard:
-    """Choose a free entry of 1016h; one that still watches a killed recorder is used again.
+class Guard:
+    """The watch of an amplifier over the recorder, by an entry of 1016h that is free or of a killed recorder.
 
     Args:
-        access: to the node.
+        access: to the amplifier.
         consumers: its 1016h.
         left_over: `is_left_over` for the value of an entry.
-
-    Returns:
-        The guard; a missing object is reported in `Guard.lack`.
     """
-    if consumers is None:
-        return Guard(None, 0, None, "no 1016h: it does NOT stop by itself when the recorder is killed")
-    for entry, value in consumers:
-        if (ours := left_over(value)) or not value & 0xFFFF:
-            return Guard(entry, 0 if ours else value, *_option(access))
-    return Guard(None, 0, None, "no free 1016h: it does NOT stop by itself when the recorder is killed")
 
+    def __init__(self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> None:
+        self.lack = ""  #: Missing capability, in words; empty when nothing is missing
+        self._access = access
+        self._consumer: ObjectEntry | None = None
+        self._consumer_before = 0
+        self._option_before: int | None = None
+        for entry, value in consumers or ():
+            if (ours := left_over(value)) or not value & 0xFFFF:
+                self._consumer, self._consumer_before = entry, 0 if ours else value
+                break
+        else:
+            free = "" if consumers is None else "free "
+            self.lack = f"no {free}1016h: it does NOT stop by itself when the recorder is killed"
+            return
+        self._option_before = access.read_optional(ABORT_CONNECTION, any_abort=True)
+        if self._option_before is None:
+            self.lack = "no 6007h: when the recorder is killed it stops in the way that its maker decided"
 
-def _option(access: ObjectAccess) -> tuple[int | None, str]:
-    try:
-        return access.read(ABORT_CONNECTION), ""
-    except ObjectAccessError as error:
-        if error.abort_code is None:
-            raise
-        return None, "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+    def describe(self, silence_ms: int) -> str:
+        """Describe the guard in words, for the log."""
+        if self._consumer is None:
+            return self.lack
+        return f"watches the recorder by {self._consumer}, {silence_ms} ms" + (f"; {self.lack}" if self.lack else "")
 
+    def arm(self, recorder_id: int, silence_ms: int) -> None:
+        """Let the amplifier quick stop after this silence of the recorder, counted from its first heartbeat.
 
-def arm(access: ObjectAccess, guard: Guard, recorder_id: int, silence_ms: int) -> Guard:
-    """Let the amplifier quick stop after this silence of the recorder, counted from its first heartbeat.
+        A refused write is reported in `lack`; the recording goes on.
+        """
+        if self._consumer is None:
+            return
+        if self._option_before is not None and (refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)):
+            before, self._option_before = self._option_before, None
+            self.lack = f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
+        if refused := self._refused(self._consumer, recorder_id << 16 | silence_ms):
+            if self._option_before is not None:
+                self._access.write(ABORT_CONNECTION, self._option_before)
+            self.lack = f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
+            self._consumer = None
 
-    Returns:
-        The guard in force. A refused write is reported in `Guard.lack`; the recording goes on.
-    """
-    consumer = guard.consumer
-    if consumer is None:
-        return guard
-    if guard.option_before is not None:
-        refused = _refused(access, ABORT_CONNECTION, QUICK_STOP_ON_LOSS)
-        if refused:
-            lack = f"6007h = {guard.option_before} rules how it stops when the recorder is killed: 3 is {refused}"
-            guard = replace(guard, option_before=None, lack=lack)
-    refused = _refused(access, consumer, recorder_id << 16 | silence_ms)
-    if refused:
-        if guard.option_before is not None:
-            access.write(ABORT_CONNECTION, guard.option_before)
-        lack = f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
-        guard = replace(guard, consumer=None, option_before=None, lack=lack)
-    return guard
+    def _refused(self, entry: ObjectEntry, value: int) -> str:
+        try:
+            self._access.write(entry, value)
+        except ObjectAccessError as error:
+            if error.abort_code is None:
+                raise
+            return error.reason
+        return ""
 
-
-def _refused(access: ObjectAccess, entry: ObjectEntry, value: int) -> str:
-    try:
-        access.write(entry, value)
-    except ObjectAccessError as error:
-        if error.abort_code is None:
-            raise
-        return error.reason
-    return ""
-
-
-def disarm(access: ObjectAccess, guard: Guard) -> None:
-    """Restore the original values."""
-    if guard.consumer is None:
-        return
-    access.write(guard.consumer, guard.consumer_before)
-    if guard.option_before is not None:
-        access.write(ABORT_CONNECTION, guard.option_before)
+    def disarm(self) -> None:
+        """Restore the original values."""
+        if self._consumer is not None:
+            self._access.write(self._consumer, self._consumer_before)
+            if self._option_before is not None:
+                self._access.write(ABORT_CONNECTION, self._option_before)

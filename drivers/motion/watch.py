@@ -129,8 +129,7 @@ class Watch:
 
     def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
         """Process one cycle: its time in the samples and by the clock, statuswords, and bit i for a missing axis i."""
-        if self._link.has_events:
-            self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
+        self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
         if self._unheard or statuswords != self._statuswords:
             self._note_statuswords(time_ns, statuswords, missing)
         for axis, since_ns in tuple(self._limited_since_ns.items()):
