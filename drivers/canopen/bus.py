@@ -126,9 +126,9 @@ def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
     burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
     if burst is not None:
         burst(messages)
-        return
-    for message in messages:
-        bus.send(message)
+    else:
+        for message in messages:
+            bus.send(message)
 
 
 class SocketcandBus(can.BusABC):
@@ -184,12 +184,7 @@ class SocketcandBus(can.BusABC):
         """Send frames, in one system call if the server accepts them."""
         if self._stuck is not None:
             raise can.CanOperationError(self._stuck)
-        try:
-            self._send_all(memoryview(b"".join(map(send_line, messages))))
-        except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
-
-    def _send_all(self, data: memoryview) -> None:
+        data = memoryview(b"".join(map(_command, messages)))
         end_s: float | None = None
         while data:
             try:
@@ -200,6 +195,8 @@ class SocketcandBus(can.BusABC):
                 if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
                     self._stuck = f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"
                     raise can.CanOperationError(self._stuck) from None
+            except OSError as error:
+                raise can.CanOperationError(f"{self.channel_info}: {error}") from error
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
@@ -260,7 +257,7 @@ class SocketcandBus(can.BusABC):
         self._socket.close()
 
 
-def send_line(message: can.Message) -> bytes:
+def _command(message: can.Message) -> bytes:
     """Return a frame as the protocol's ``send`` command."""
     if message.is_remote_frame or message.is_fd or message.is_error_frame:
         raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")

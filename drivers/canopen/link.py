@@ -152,17 +152,17 @@ class Link:
         self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
         self.wait(0.001)
 
-    def wait(self, seconds: float) -> None:
-        """Handle frames for a time."""
+    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Handle frames for a time, or until a condition holds; returns whether it does."""
         deadline = self.clock() + round(seconds * 1e9)
-        while (left_ns := deadline - self.clock()) > 0:
+        while not (done := until()) and (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
+        return done
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
-        self._beat = can.Message(
-            arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
-        )
+        state = bytes((NmtState.OPERATIONAL,))
+        self._beat = can.Message(arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=state)
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
     def stop_heartbeat(self) -> None:
@@ -239,16 +239,12 @@ class Link:
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
         taken, self._events = self._events, deque()
-        return tuple(
-            CellEvent(
-                time_ns,
-                node_ids.index(node) if node in node_ids else None,
-                kind,
-                code,
-                f"{node_label(self.objects(node))}: {text}" if node else text,
-            )
-            for node, kind, code, text in taken
-        )
+        found = []
+        for node, kind, code, text in taken:
+            axis = node_ids.index(node) if node in node_ids else None
+            whole = f"{node_label(self.objects(node))}: {text}" if node else text
+            found.append(CellEvent(time_ns, axis, kind, code, whole))
+        return tuple(found)
 
     def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
         """Return access to the object dictionary of a node, with the link's policy or another."""
@@ -271,10 +267,10 @@ class Link:
         Raises:
             StateRefused: none came in time; canopen would have believed the command.
         """
-        deadline = self.clock() + round(within_s * 1e9)
-        while self.heard_ns.get(node_id, since_ns - 1) < since_ns or self.nmt[node_id] != state:
-            left_ns = deadline - self.clock()
-            if left_ns <= 0:
-                found = self.nmt.get(node_id) if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
-                raise StateRefused(self.objects(node_id), f"NMT {state}", f"{nmt_name(found)} after {within_s:.3g} s")
-            self.pump(left_ns * 1e-9)
+
+        def found() -> int | None:
+            return self.nmt[node_id] if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+
+        if not self.wait(within_s, lambda: found() == state):
+            shown = f"{nmt_name(found())} after {within_s:.3g} s"
+            raise StateRefused(self.objects(node_id), f"NMT {state}", shown)

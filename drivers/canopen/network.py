@@ -114,7 +114,7 @@ class CanopenNetwork:
         self.recorder_id = next((n for n in range(127, 0, -1) if n not in self.node_ids), 0)
         self._setups: dict[int, AxisSetup] = {}
         self._readback: dict[str, object] = {}
-        self._scales: dict[str, ScaleReading] = {}
+        self._scales: tuple[ScaleReading, ...] = ()
 
     def __enter__(self) -> Self:
         self.link.open()
@@ -187,12 +187,13 @@ class CanopenNetwork:
             setup.send_heartbeats(self.heartbeat_ms)
             setup.watch_recorder(entries, self.was_ours, self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
-        for axis, identity in zip(self.axes, identities, strict=True):
+        for axis in self.axes:
             setup = self._setups[axis.node_id]
             self.disable(axis)
             setup.map_pdos()
             setup.set_mode(self.bounds.mode_s)
-            self._readback[axis.name] = setup.describe(identity, self._scale(axis), self.guard_ms)
+        for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
+            self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
@@ -301,8 +302,7 @@ class CanopenNetwork:
         """Return ampere per raw unit of each axis' current object, from the drives' own scale objects.
 
         Raises:
-            ObjectAccessError: a scale object cannot be read.
-            SetupRefused: the scale is implausible.
+            ObjectAccessError, SetupRefused: as `scales`.
         """
         return tuple(reading.ampere_per_unit for reading in self.scales())
 
@@ -312,12 +312,9 @@ class CanopenNetwork:
         Raises:
             ObjectAccessError, SetupRefused: as `drivers.profiles.scale.read_scale`.
         """
-        return tuple(self._scale(axis) for axis in self.axes)
-
-    def _scale(self, axis: Axis) -> ScaleReading:
-        if axis.name not in self._scales:
-            self._scales[axis.name] = read_scale(self.link.objects(axis.node_id), axis.profile)
-        return self._scales[axis.name]
+        if not self._scales:
+            self._scales = tuple(read_scale(self.link.objects(axis.node_id), axis.profile) for axis in self.axes)
+        return self._scales
 
     def readback(self) -> dict[str, object]:
         """Return what the drives reported during `prepare`, by axis name, for the log."""
@@ -377,7 +374,6 @@ class CanopenNetwork:
         """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever failed before. Returns the failures."""
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
-        silent: NodeMissing | None = None
         for attempt in ("first", "last"):
             try:
                 # One time limit for all: asked in turn, six dead nodes would take a minute and more.

@@ -101,9 +101,7 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     asked = set(node_ids)
     link.answered.clear()
     _ask(link, node_ids)
-    deadline = link.clock() + round(wait_s * 1e9)
-    while not asked <= link.answered and (left_ns := deadline - link.clock()) > 0:
-        link.pump(left_ns * 1e-9)
+    link.wait(wait_s, lambda: asked <= link.answered)
     return tuple(sorted(asked & link.answered))
 
 

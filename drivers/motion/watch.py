@@ -49,8 +49,7 @@ class FrozenData:
 
     def frozen(self, sample: Sample) -> tuple[int, ...]:
         """Return the axes whose values have not changed for too long; takes every sample once."""
-        if self._begin is None:
-            self._begin = sample.cycle
+        self._begin = sample.cycle if self._begin is None else self._begin
         found = []
         for axis, path in self._paths.items():
             values = (sample.position_counts[axis], sample.current_raw[axis])
@@ -81,10 +80,7 @@ class ToggleBits:
     def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, int, DriveFault]]:
         """Yield (index, bit, fault) of each axis whose bit has not toggled for too long; call in every cycle.
 
-        Args:
-            time_ns: of the samples.
-            statuswords: of all axes.
-            missing: bit i is set when axis i did not answer; its interval then starts anew.
+        The interval of a missing axis (bit i for axis i) starts anew.
         """
         for axis, node, bit, allowed_ns in self._bits:
             if missing >> axis & 1:
@@ -98,23 +94,17 @@ class ToggleBits:
             stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
             self._last[axis] = (value, since_ns, cycles + 1, reported or stale)
             if stale and not reported:
-                still_ms = (time_ns - since_ns) * 1e-6
-                reason = (
-                    f"statusword bit {bit} has not toggled for {cycles + 1} cycles, {still_ms:g} ms; its data are old"
-                )
+                still = f"{cycles + 1} cycles, {(time_ns - since_ns) * 1e-6:g} ms"
+                reason = f"statusword bit {bit} has not toggled for {still}; its data are old"
                 remedy = "restart the drive, and check toggle_bit and update_period_us of its profile"
                 yield axis, bit, DriveFault(node, reason, remedy=remedy)
 
 
 class Watch:
-    """Last reports of a network's drives.
-
-    Attributes:
-        faults: not raised yet, in the order in which they were seen.
-    """
+    """Last reports of a network's drives."""
 
     def __init__(self, network: CanopenNetwork, on_event: EventSink) -> None:
-        self.faults: deque[DriverError] = deque()
+        self.faults: deque[DriverError] = deque()  #: Not raised yet, in the order in which they were seen
         self._network = network
         self._link = network.link
         self._on_event = on_event
