@@ -15,11 +15,11 @@ import can
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
 from drivers.canopen.pdo import CONTROLWORD, STATUSWORD
-from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, require, scan
+from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
-from drivers.motion.guard import is_left_over, producer_of, read_consumers
+from drivers.motion.guard import producer_of, read_consumers
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
@@ -27,6 +27,7 @@ from drivers.stream.sample import Sample
 from drivers.stream.split_bus import CellAddress, open_cell_bus
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
+LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
 HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 
@@ -151,7 +152,9 @@ class CanopenNetwork:
             SetupRefused: another amplifier than the configured one.
             ObjectAccessError: a node does not report its identity.
         """
-        require(self.link, self.node_ids, self.bounds.answer_s)
+        answered = answering(self.link, self.node_ids, self.bounds.answer_s)
+        if missing := [axis for axis in self.axes if axis.node_id not in answered]:
+            raise NodeMissing(missing, answered, self.bounds.answer_s)
         identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
         for axis, found in zip(self.axes, identities, strict=True):
             expected = axis.identity or found
@@ -215,8 +218,14 @@ class CanopenNetwork:
         )
 
     def was_ours(self, value: int) -> bool:
-        """Whether an entry of 1016h still watches a recorder that was killed."""
-        return is_left_over(value, self.recorder_id, self.guard_ms, self.link.heard | self.link.names.keys())
+        """Whether an entry of 1016h still watches a recorder that was killed, and no device that is present.
+
+        That recorder may have used another node id, because of another device.
+        """
+        producer = producer_of(value)
+        usual = producer >= LOWEST_USUAL_ID and value & 0xFFFF == self.guard_ms
+        present = {0, *self.link.heard, *self.node_ids}
+        return producer not in present and (producer == self.recorder_id or usual)
 
     def require_quiet(self) -> None:
         """Listen for a while before the first frame is sent.

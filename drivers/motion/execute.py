@@ -33,7 +33,7 @@ from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 
 _LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
-_ENABLED = Command.ENABLE_OPERATION
+_NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class _Walk:
         self.emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
         for axis in self._axes:
             if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-                self._refuse(axis)
+                raise self._refusal(axis)
         for cycle in range(self._cycles(self._bounds.enable_s)):
             waiting = [axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED]
             if not waiting:
@@ -167,18 +167,17 @@ class _Walk:
             for axis in waiting:
                 # A target that is not the position would be a jump on enabling.
                 self._targets[axis] = self._sample.position_counts[axis]
-                self._send_command(
-                    axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0
-                )
+                command = next_command(self._state(axis), Goal.OPERATION_ENABLED)
+                self._send_command(axis, command, repeat=cycle % 10 == 0)
             self._sample = next(self._stream)
             yield self._sample
         for axis in self._axes:
             if self._state(axis) is not State.OPERATION_ENABLED:
-                self._refuse(axis)
+                raise self._refusal(axis)
 
-    def _refuse(self, axis: int) -> None:
+    def _refusal(self, axis: int) -> StateRefused:
         word = self._sample.statusword[axis]
-        raise StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
+        return StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:
         """Make one move of all axes with a distance to go, and the dwell after it."""
@@ -192,7 +191,7 @@ class _Walk:
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
-            self._send_command(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
+            self._send_command(axis, _NEW_SETPOINT)
         sample = self._checked()
         self.emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
@@ -221,20 +220,17 @@ class _Walk:
 
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
         """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
-        rising = _ENABLED | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
-        bound = self._cycles(self._bounds.acknowledge_s)
-        for wanted, controlword in ((STATUS_SETPOINT_ACKNOWLEDGE, rising), (0, int(_ENABLED))):
+        bit = STATUS_SETPOINT_ACKNOWLEDGE
+        for wanted, controlword in ((bit, _NEW_SETPOINT), (0, int(Command.ENABLE_OPERATION))):
             waiting = list(moving)
-            for _ in range(bound):
+            for _ in range(self._cycles(self._bounds.acknowledge_s)):
                 for axis in waiting:
                     # Repeated every cycle until acknowledged: some drives act on the second controlword only.
                     self._send_command(axis, controlword, repeat=True)
                 if not waiting:
                     break
                 yield self._checked()
-                waiting = [
-                    axis for axis in moving if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE != wanted
-                ]
+                waiting = [axis for axis in moving if self._sample.statusword[axis] & bit != wanted]
             if waiting:
                 raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s)
 
@@ -311,9 +307,8 @@ class _Walk:
                 still[axis] = still[axis] + 1 if near and known else 0
                 rest[axis] = rest[axis] if near else position
             silent = silent + 1 if self._sample.missing else 0
-            powered = [
-                axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
-            ]
+            missing = self._sample.missing
+            powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
             if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
                 break

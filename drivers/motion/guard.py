@@ -12,7 +12,7 @@ record.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError
@@ -22,7 +22,6 @@ CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
 ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
 QUICK_STOP_ON_LOSS = 3
 MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
-LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
@@ -31,20 +30,6 @@ Consumers = tuple[tuple[ObjectEntry, int], ...]
 def producer_of(value: int) -> int:
     """Return the node id that an entry of 1016h watches, 0 where it watches none."""
     return value >> 16 & 0x7F if value & 0xFFFF else 0
-
-
-def is_left_over(value: int, recorder_id: int, silence_ms: int, heard: Collection[int]) -> bool:
-    """Whether an entry of 1016h watches a recorder that was killed.
-
-    Args:
-        value: of the entry.
-        recorder_id: of the recorder now. It may have used another id before, because of another device.
-        silence_ms: allowed by the recorder.
-        heard: node ids of present devices: an entry that watches one of them is in use.
-    """
-    producer = producer_of(value)
-    usual = producer >= LOWEST_USUAL_ID and value & 0xFFFF == silence_ms
-    return producer not in {0, *heard} and (producer == recorder_id or usual)
 
 
 def read_consumers(access: ObjectAccess) -> Consumers | None:
@@ -67,7 +52,7 @@ class Guard:
     Args:
         access: to the amplifier.
         consumers: its 1016h.
-        left_over: `is_left_over` for the value of an entry.
+        left_over: whether the value of an entry watches a killed recorder.
     """
 
     def __init__(self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> None:
