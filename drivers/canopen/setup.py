@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 from drivers.canopen.link import Link
@@ -17,8 +18,6 @@ from drivers.canopen.pdo import (
     pack,
     read_record,
     records,
-    restore,
-    write_cob_id,
     write_record,
 )
 from drivers.errors import SetupRefused, StateRefused
@@ -86,7 +85,7 @@ class AxisSetup:
                 elif not found.cob_id & NOT_VALID:
                     self._pdos_before.setdefault(found.name, found)
                     # A drive's default PDOs would come between ours.
-                    write_cob_id(self._access, found, found.cob_id | NOT_VALID)
+                    write_record(self._access, replace(found, cob_id=found.cob_id | NOT_VALID))
         self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
 
     def set_mode(self, within_s: float) -> None:
@@ -115,7 +114,7 @@ class AxisSetup:
     def restoring(self) -> Iterator[Callable[[], object]]:
         """Yield the steps that restore all settings; the heartbeat last."""
         for record in self._pdos_before.values():
-            yield partial(restore, self._access, record)
+            yield partial(write_record, self._access, record)
         if self._mode is not None:
             yield partial(self._access.write, MODE_OF_OPERATION, self._mode)
         yield self.stop_watching
