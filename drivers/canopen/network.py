@@ -15,7 +15,7 @@ import can
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
 from drivers.canopen.pdo import CONTROLWORD, STATUSWORD
-from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan
+from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
@@ -142,7 +142,7 @@ class CanopenNetwork:
 
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
         """Find the nodes on the bus; changes nothing."""
-        return scan(self.link, node_ids, wait_s)
+        return scan_link(self.link, node_ids, wait_s)
 
     def check_identities(self) -> tuple[Identity, ...]:
         """Compare 1018h of every axis with its configuration.

@@ -51,7 +51,7 @@ class FoundNode:
         return None if self.statusword is None else decode(self.statusword)
 
 
-def scan_bus(
+def scan(
     address: CellAddress | str, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5
 ) -> tuple[FoundNode, ...]:
     """Open a bus and find its nodes; changes nothing.
@@ -68,12 +68,12 @@ def scan_bus(
     link = Link(place, SdoPolicy(), time.monotonic_ns)
     link.open()
     try:
-        return scan(link, node_ids, wait_s)
+        return scan_link(link, node_ids, wait_s)
     finally:
         link.close()
 
 
-def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
+def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
     answered = answering(link, node_ids, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
