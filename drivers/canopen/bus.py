@@ -100,11 +100,7 @@ def open_bus(address: BusAddress) -> can.BusABC:
 
 
 def open_answering_bus(address: BusAddress) -> can.BusABC:
-    """As `open_bus`, for a device that answers each frame: on ``socketcan`` without the capture process.
-
-    Raises:
-        BusError: as `open_bus`.
-    """
+    """As `open_bus`, for a device that answers each frame: on ``socketcan`` without the capture process."""
     if address.interface == "socketcand":
         return open_bus(address)
     with bus_errors(address):

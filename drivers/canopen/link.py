@@ -250,7 +250,7 @@ class Link:
         """Return access to the object dictionary of a node, with the link's policy or another."""
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
-            client = SynchronousSdoClient(node_id, self.send, self.pump, self.clock, policy)
+            client = SynchronousSdoClient(node_id, self, policy)
             self._clients.setdefault(node_id, []).append(client)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]

@@ -82,12 +82,11 @@ def read_parameters(network: CanopenNetwork, wanted: Sequence[tuple[Axis, Parame
     """
     network.require_quiet()
     identities = dict(zip(network.node_ids, network.check_identities(), strict=True))
-    return tuple(
-        ParameterValue(
-            axis, identities[axis.node_id], parameter, network.link.objects(axis.node_id).read(parameter.entry)
-        )
-        for axis, parameter in wanted
-    )
+    found = []
+    for axis, parameter in wanted:
+        word = network.link.objects(axis.node_id).read(parameter.entry)
+        found.append(ParameterValue(axis, identities[axis.node_id], parameter, word))
+    return tuple(found)
 
 
 def write_parameters(
@@ -237,11 +236,7 @@ def _undo(
     timeout_s: float,
     error: BaseException,
 ) -> None:
-    """Restore the old values, and save them where the new ones may have been saved.
-
-    Raises:
-        ParametersMixed: not everywhere; its cause is the error before.
-    """
+    """Restore the old values, and save them where the new ones may have been saved; ParametersMixed if not all are."""
     restored, problems = [], []
     try:
         # One time limit for all drives that do not answer.

@@ -88,7 +88,7 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
         with suppress(ObjectAccessError):
             identity = read_identity(access)
         with suppress(ObjectAccessError):
-            name = access.read_text(0x1008)
+            name = access.read_bytes(0x1008, 0).rstrip(b"\0 ").decode("utf-8", "replace")
         revision, statusword = (access.read_optional(entry, any_abort=True) for entry in (REVISION, STATUSWORD))
         found.append(FoundNode(node_id, identity, revision, name, nmt, statusword))
     return tuple(found)

@@ -89,12 +89,7 @@ class AxisSetup:
         self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
 
     def set_mode(self, within_s: float) -> None:
-        """Select profile position mode, and wait until 6061h shows it.
-
-        Raises:
-            StateRefused: it does not show it in time.
-            ObjectAccessError: refused or not answered.
-        """
+        """Select profile position mode, and wait until 6061h shows it; StateRefused where it does not in time."""
         access = self._access
         if self._mode is None:
             self._mode = access.read(MODE_OF_OPERATION)

@@ -103,11 +103,7 @@ class CurrentScale:
     weights: tuple[float, ...] = (1.0,)
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
-        """Return the scale for the values of the objects and of the switch.
-
-        Raises:
-            IndexError: the switch has no such value.
-        """
+        """Return the scale for the values of the objects and of the switch; IndexError for an unknown one."""
         if not 0 <= choice < len(self.weights):
             raise IndexError(choice)
         return self.factor * math.prod(values) * self.weights[choice]

@@ -29,7 +29,7 @@ IDLE_MS = 20  #: Silence after which losses are reported without a following fra
 LOOK_NS = 200_000_000  #: Time between two checks of the interface's own counters, and of the parent's process id
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
-_FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+FRAME = struct.Struct("=IB3x8s")  #: struct can_frame
 _TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
 _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
@@ -127,7 +127,7 @@ class Capture:
         self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
         self._interface_before = self._read_interface()
         self._reported_drops = (0, 0, 0)
-        self._frame = bytearray(_FRAME.size)
+        self._frame = bytearray(FRAME.size)
 
     def run(self, parent: int) -> None:
         """Capture until the parent, given by its process id, or the bus is gone."""
@@ -189,7 +189,7 @@ class Capture:
                     stamp_ns = seconds * 1_000_000_000 + rest_ns
                 elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                     self._drops.see(_U32.unpack(data)[0])
-            can_id, length, payload = _FRAME.unpack(self._frame)
+            can_id, length, payload = FRAME.unpack(self._frame)
             burst.append((can_id, length, payload, stamp_ns, flags))
         before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2

@@ -9,7 +9,6 @@ import errno
 import os
 import select
 import socket
-import struct
 import subprocess
 import sys
 import time
@@ -22,7 +21,7 @@ from typing import NamedTuple
 import can
 
 from drivers.stream import capture
-from drivers.stream.capture import RECORD, Kind
+from drivers.stream.capture import FRAME, RECORD, Kind
 
 RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
 START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
@@ -35,7 +34,6 @@ ERROR_CLASSES = 0x4 | 0x40 | 0x100
 """Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not
 requested: a bus without a second node sends thousands a second."""
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
-_FRAME = struct.Struct("=IB3x8s")
 _PAIR_BYTES = 1 << 18
 
 
@@ -85,11 +83,6 @@ def open_socketcan(
 ) -> SocketcanBus:
     """Open one end of an interface of the kernel.
 
-    Args:
-        channel: name of the interface.
-        receive_buffer_bytes: requested of the kernel.
-        backlog_records: frames that may wait in the capture process.
-
     Raises:
         OSError: there is no such interface, or no permission to use it.
         can.CanInitializationError: the interface is down, or the capture process did not start.
@@ -132,18 +125,14 @@ class SocketcanBus(can.BusABC):
         self._ready = False
         self._end: str | None = None
         self._socket = handle
+        self._process: subprocess.Popen[bytes] | None = None
         self._pair, theirs = socket.socketpair()
         try:
             with theirs:
                 self._pair.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _PAIR_BYTES)
                 theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PAIR_BYTES)
                 self._process = _spawn(handle, theirs, channel, backlog_records)
-        except BaseException:
-            self._pair.close()
-            handle.close()
-            raise
-        self.capture_pid = self._process.pid
-        try:
+            self.capture_pid = self._process.pid
             self._wait_until_ready()
             super().__init__(channel=channel)
         except BaseException:
@@ -166,7 +155,7 @@ class SocketcanBus(can.BusABC):
         if msg.is_fd:
             raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
         flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
-        frame = _FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
+        frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
         deadline: float | None = None
         while True:
             try:
@@ -276,8 +265,10 @@ class SocketcanBus(can.BusABC):
         self._wait()
         self._socket.close()
 
-    def _wait(self) -> int:
+    def _wait(self) -> int | None:
         """Wait for the end of the capture process; returns its exit code."""
+        if self._process is None:
+            return None
         try:
             return self._process.wait(END_S)
         except subprocess.TimeoutExpired:

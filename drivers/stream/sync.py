@@ -29,6 +29,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import Clock
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
+from drivers.stream.capture import FRAME
 
 SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
@@ -39,7 +40,7 @@ LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
 _TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
 # struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
-_HEAD, _FRAME = struct.Struct("@3I4l2I0q"), struct.Struct("=IB3x8s")
+_HEAD = struct.Struct("@3I4l2I0q")
 SURPLUS = 3.0  #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
 DECAY = 0.99
 """Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
@@ -112,16 +113,10 @@ Pacing = LockstepSync | TimedSync | FollowedSync
 
 
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
-    """Return the kernel's interval for the next window [us].
+    """Return the kernel's interval for the next window of so many periods [us].
 
-    The lateness of the last window is expected again, and the phase is to be corrected within one window.
-
-    Args:
-        period_us: wanted.
-        interval_us: of the kernel now.
-        late_ns: difference of the last window's duration to its periods.
-        phase_ns: lateness of its last SYNC in the whole schedule.
-        periods: in a window.
+    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC in the whole
+    schedule (`phase_ns`) is to be corrected within one window.
     """
     wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
     return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
@@ -130,7 +125,7 @@ def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, pe
 def _setup(flags: int, interval_us: int) -> bytes:
     seconds, rest_us = divmod(interval_us, 1_000_000)
     head = _HEAD.pack(_TX_SETUP, flags, 0, 0, 0, seconds, rest_us, SYNC_COB_ID, 1)
-    return head + _FRAME.pack(SYNC_COB_ID, 0, bytes(8))
+    return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
 
 
 class KernelProducer(AbstractContextManager["KernelProducer"]):
@@ -174,11 +169,7 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase.
-
-        Raises:
-            OSError: the kernel refuses a new interval.
-        """
+        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
         if periods == 0:
             self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
             return
