@@ -19,7 +19,7 @@ from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, 
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
-from drivers.motion.guard import producer_of, read_consumers
+from drivers.motion.guard import Guard, producer_of, read_consumers
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
@@ -186,9 +186,11 @@ class CanopenNetwork:
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
         for axis, entries in zip(self.axes, consumers, strict=True):
-            setup = self._setups.setdefault(axis.node_id, AxisSetup(self.link, axis))
+            if (setup := self._setups.get(axis.node_id)) is None:
+                guard = Guard(self.link.objects(axis.node_id), entries, self.was_ours)
+                setup = self._setups[axis.node_id] = AxisSetup(self.link, axis, guard)
             setup.send_heartbeats(self.heartbeat_ms)
-            setup.watch_recorder(entries, self.was_ours, self.recorder_id, self.guard_ms)
+            setup.guard.arm(self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
         for axis in self.axes:
             setup = self._setups[axis.node_id]
@@ -266,13 +268,13 @@ class CanopenNetwork:
             if node_id not in self.link.silent:
                 # A failure is tried again, and reported, when the network closes.
                 with suppress(DriverError):
-                    setup.stop_watching()
+                    setup.guard.disarm()
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
         """Report the amplifiers of the prepared network that do not stop by themselves when the recorder is killed."""
-        guards = [(axis, setup.guard) for axis in self.axes if (setup := self._setups.get(axis.node_id))]
-        return tuple(f"{axis.name}: {guard.lack}" for axis, guard in guards if guard is not None and guard.lack)
+        setups = [(axis, self._setups[axis.node_id]) for axis in self.axes if axis.node_id in self._setups]
+        return tuple(f"{axis.name}: {setup.guard.lack}" for axis, setup in setups if setup.guard.lack)
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
         """Ask all these axes at once for an answer; those without one are skipped from then on."""

@@ -21,7 +21,7 @@ from drivers.canopen.pdo import (
     write_record,
 )
 from drivers.errors import SetupRefused, StateRefused
-from drivers.motion.guard import Consumers, Guard
+from drivers.motion.guard import Guard
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 from drivers.profiles.scale import ScaleReading
 
@@ -34,8 +34,8 @@ PROFILE_POSITION_MODE = 1
 class AxisSetup:
     """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone."""
 
-    def __init__(self, link: Link, axis: Axis) -> None:
-        self.guard: Guard | None = None  #: How the amplifier watches the recorder; None before `watch_recorder`
+    def __init__(self, link: Link, axis: Axis, guard: Guard) -> None:
+        self.guard = guard  #: How the amplifier watches the recorder
         self._link = link
         self._axis = axis
         self._access = link.objects(axis.node_id)
@@ -49,14 +49,6 @@ class AxisSetup:
         if self._heartbeat_ms is None:
             self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
         self._access.write(HEARTBEAT_TIME, period_ms)
-
-    def watch_recorder(
-        self, consumers: Consumers | None, is_left_over: Callable[[int], bool], recorder_id: int, silence_ms: int
-    ) -> None:
-        """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py)."""
-        if self.guard is None:
-            self.guard = Guard(self._access, consumers, is_left_over)
-        self.guard.arm(recorder_id, silence_ms)
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
@@ -101,18 +93,13 @@ class AxisSetup:
                 raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
             self._link.pass_time()
 
-    def stop_watching(self) -> None:
-        """Restore the objects of the guard."""
-        if self.guard is not None:
-            self.guard.disarm()
-
     def restoring(self) -> Iterator[Callable[[], object]]:
         """Yield the steps that restore all settings; the heartbeat last."""
         for record in self._pdos_before.values():
             yield partial(write_record, self._access, record)
         if self._mode is not None:
             yield partial(self._access.write, MODE_OF_OPERATION, self._mode)
-        yield self.stop_watching
+        yield self.guard.disarm
         if self._heartbeat_ms is not None:
             yield partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
 
@@ -134,7 +121,7 @@ class AxisSetup:
             "rated_current_a": scale.rated_current_a,
             "rated_torque_nm": scale.rated_torque_nm,
             "scale_warnings": list(scale.warnings),
-            "guard": "none" if self.guard is None else self.guard.describe(silence_ms),
+            "guard": self.guard.describe(silence_ms),
             "mode_before": self._mode,
             "mapping": [str(record) for record in self._pdos],
             "mapping_before": [str(record) for record in self._pdos_before.values()],

@@ -80,8 +80,7 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     """Compare the drive's Kt = rated torque / rated current with the cell's, |nameplate gain / N|.
 
     Args:
-        reading: of the drive.
-        amplitude: of its profile.
+        reading, amplitude: of the drive, and of its profile.
         motor_nm_per_a: torque constant of the motor by the cell configuration [Nm/A], sign irrelevant.
 
     Returns:

@@ -16,7 +16,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
 from drivers.stream.answers import Answers, Slot, StreamStatistics
-from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample, ignore_event
+from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
@@ -59,7 +59,7 @@ class SyncStream:
         self,
         network: CanopenNetwork,
         pacing: Pacing,
-        on_event: EventSink = ignore_event,
+        on_event: EventSink = lambda _event: None,
         max_missing_cycles: int = 3,
     ) -> None:
         self.network = network
