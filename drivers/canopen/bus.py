@@ -79,12 +79,16 @@ def bus_errors(address: object) -> Iterator[None]:
         raise BusError(str(address), str(error) or type(error).__name__) from error
 
 
-def open_bus(address: BusAddress) -> can.BusABC:
+def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
     """Open one end of a bus.
 
     A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for ever), so close ends
     that are not read. No end receives its own frames, except the SYNCs on ``socketcan``, which return with their time
     and ``is_rx`` False (drivers/stream/socketcan.py).
+
+    Args:
+        address: of the bus.
+        answering: for a device that answers each frame: on ``socketcan`` without the capture process.
 
     Raises:
         BusError: the interface is unknown, the device is absent, or the hub does not answer.
@@ -93,17 +97,9 @@ def open_bus(address: BusAddress) -> can.BusABC:
         if address.interface == "socketcand":
             # python-can's own client mistakes a closed hub for silence.
             return SocketcandBus(address.channel, address.host, address.port)
-        if address.interface == "socketcan":
+        if address.interface == "socketcan" and not answering:
             # python-can's own loses frames while this interpreter is busy, and cannot count them.
             return open_socketcan(address.channel)
-    return open_answering_bus(address)
-
-
-def open_answering_bus(address: BusAddress) -> can.BusABC:
-    """As `open_bus`, for a device that answers each frame: on ``socketcan`` without the capture process."""
-    if address.interface == "socketcand":
-        return open_bus(address)
-    with bus_errors(address):
         try:
             # A user's python-can configuration file must not change the cell's configuration.
             return can.Bus(

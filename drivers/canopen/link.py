@@ -72,20 +72,7 @@ def command_name(identifier: int) -> str:
 
 
 class Link:
-    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost.
-
-    Attributes:
-        nmt: last NMT state of each node that sent a heartbeat.
-        heard_ns: time of that heartbeat by the clock.
-        answered: nodes that sent any SDO answer.
-        silent: nodes that did not answer their last request, and sent nothing since.
-        heard: node ids of which any frame arrived since the bus was opened.
-        foreign: number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of
-            our axes, our own heartbeat) and that we did not send.
-        own_id: node id of our heartbeat, None before one was chosen.
-        names: names of our axes by node id.
-        sync_producer: device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
-    """
+    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost."""
 
     def __init__(
         self,
@@ -97,14 +84,17 @@ class Link:
         self.address = address
         self.clock = clock
         self.policy = policy
-        self.nmt: dict[int, int] = {}
-        self.heard_ns: dict[int, int] = {}
-        self.answered: set[int] = set()
+        self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
+        self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
+        self.answered: set[int] = set()  #: Nodes that sent any SDO answer
+        self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
+        self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
+        #: Number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of our
+        #: axes, our own heartbeat) and that we did not send.
         self.foreign: dict[int, int] = {}
-        self.silent: set[int] = set()
-        self.heard: set[int] = set()
-        self.own_id: int | None = None
-        self.names: Mapping[int, str] = {}
+        self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
+        self.names: Mapping[int, str] = {}  #: Of our axes by node id
+        #: Device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0

@@ -73,18 +73,12 @@ def slots_of(axes: Sequence[Axis]) -> dict[int, Slot]:
 
 
 class Answers:
-    """Assigns answers to cycles and counts them.
-
-    Attributes:
-        slots: by COB-ID.
-        values: last value of each column.
-        counts: by their names in StreamStatistics.
-    """
+    """Assigns answers to cycles and counts them."""
 
     def __init__(self, axes: Sequence[Axis]) -> None:
-        self.slots = slots_of(axes)
-        self.values = [0] * (3 * len(axes))
-        self.counts: Counter[str] = Counter()
+        self.slots = slots_of(axes)  #: By COB-ID
+        self.values = [0] * (3 * len(axes))  #: Last value of each column
+        self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1
         self._debt = 0  # slots whose answer to an earlier SYNC may still come
         self._open_debt = self._now = 0

@@ -217,9 +217,6 @@ class DriveProducer(AbstractContextManager["DriveProducer"]):
                 raise
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
-    def seen(self, monotonic_ns: int, periods: int) -> None:
-        """A drive keeps its period by itself."""
-
     def start(self) -> None:
         """Let the drive send SYNC."""
         access = self._network.link.objects(self._node_id)
