@@ -93,42 +93,36 @@ def execute(
         yield from walk.enable(permission.granted_by)
         for number, move in enumerate(moves):
             yield from walk.move(number, move)
-        problems = yield from walk.stop()
-        if not problems:  # amplifiers without confirmed standstill go on watching us
+        yield from walk.stop()
+        if not walk.problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
             walk.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
-            problems = _drain(walk.stop())
-            if not problems:
+            try:
+                for _ in walk.stop():
+                    pass
+            except BaseException as cut:
+                cut.add_note(f"{WHILE}stopping: the stop was cut short")
+                raise
+            if not walk.problems:
                 network.unguard()
-        for problem in problems:
+        for problem in walk.problems:
             error.add_note(f"{WHILE}stopping: {problem}")
         raise
-    for problem in problems[1:]:
-        problems[0].add_note(f"{WHILE}stopping: {problem}")
-    if problems:
-        raise problems[0]
+    for problem in walk.problems[1:]:
+        walk.problems[0].add_note(f"{WHILE}stopping: {problem}")
+    if walk.problems:
+        raise walk.problems[0]
     stream.check()  # faults during the stop
-
-
-def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError]:
-    while True:
-        try:
-            next(stop)
-        except StopIteration as end:
-            problems: list[DriverError] = end.value
-            return problems
-        except BaseException as cut:
-            cut.add_note(f"{WHILE}stopping: the stop was cut short")
-            raise
 
 
 class _Walk:
     """One run of ``execute``: the stream, the last sample and the last command of each axis."""
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
+        self.problems: list[DriverError] = []  #: Failures to confirm the last stop
         self._network = network
         self._stream = stream
         self._bounds = bounds
@@ -149,7 +143,7 @@ class _Walk:
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
-            self._stream.outgoing.extend((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
+            self._stream.outgoing.append(_frame(self._nodes[axis].node_id, 0, *command))
 
     def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
@@ -252,11 +246,11 @@ class _Walk:
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
-    def stop(self) -> Generator[Sample, None, list[DriverError]]:
-        """Quick stop all axes, then remove their power; returns the failures to confirm it."""
+    def stop(self) -> Iterator[Sample]:
+        """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
         self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
         self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
-        problems: list[DriverError] = []
+        self.problems = []
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
@@ -265,14 +259,15 @@ class _Walk:
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
             self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
-            problems.append(error)
+            self.problems.append(error)
         try:
             silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
         except DriverError as error:
             self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            return problems or [error]
+            self.problems = self.problems or [error]
+            return
         if silent is not None:
-            problems.append(silent)
+            self.problems.append(silent)
         heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
         if heard:
             self._network.begin_stop([self._nodes[axis] for axis in heard])
@@ -285,8 +280,7 @@ class _Walk:
                 self._network.disable(self._nodes[axis])
             except DriverError as error:
                 self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
-                problems.append(error)
-        return problems
+                self.problems.append(error)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
