@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import can
 
 from drivers.errors import BusError
-from drivers.stream.socketcan import open_socketcan
+from drivers.stream.socketcan import BurstBus, open_socketcan
 
 CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
@@ -123,7 +123,7 @@ def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
             bus.send(message)
 
 
-class SocketcandBus(can.BusABC):
+class SocketcandBus(BurstBus):
     """One end of a bus of a socketcand server.
 
     Raises:
@@ -134,7 +134,7 @@ class SocketcandBus(can.BusABC):
     def __init__(self, channel: str, host: str, port: int) -> None:
         self.channel_info = f"socketcand {channel}@{host}:{port}"
         self._channel = channel
-        self._received: deque[can.Message] = deque()
+        self._received = deque()
         self._buffer = b""
         self._stuck: str | None = None
         self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
@@ -190,25 +190,16 @@ class SocketcandBus(can.BusABC):
             except OSError as error:
                 raise can.CanOperationError(f"{self.channel_info}: {error}") from error
 
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
-        if self._received and self._filters is None:
-            return self._received.popleft()
-        return super().recv(timeout)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if self._received:
-            return self._received.popleft(), False
+    def _fill(self, timeout_s: float | None) -> None:
         try:
-            if not select.select((self._socket,), (), (), timeout)[0]:
-                return None, False
+            if not select.select((self._socket,), (), (), timeout_s)[0]:
+                return
             chunk = self._socket.recv(_RECEIVE_BYTES)
         except (OSError, ValueError) as error:
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
         if not chunk:
             raise can.CanOperationError(f"{self.channel_info}: the server closed the connection")
         self._parse(self._buffer + chunk)
-        return (self._received.popleft() if self._received else None), False
 
     def _parse(self, buffer: bytes) -> None:
         end = 0

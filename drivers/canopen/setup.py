@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 
 from drivers.canopen.link import Link
@@ -108,9 +108,7 @@ class AxisSetup:
         profile = self._axis.profile
         return {
             "node_id": self._axis.node_id,
-            "vendor_id": identity.vendor_id,
-            "product_code": identity.product_code,
-            "serial": identity.serial,
+            **asdict(identity),
             "profile": profile.name,
             # The recorded current: without both, a gain of this log cannot be compared with another's.
             "amplitude": profile.amplitude.value,

@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import time
+from abc import abstractmethod
 from collections import deque
 from functools import partial
 from operator import sub
@@ -96,7 +97,26 @@ def open_socketcan(
     return SocketcanBus(channel, handle, backlog_records, remarks)
 
 
-class SocketcanBus(can.BusABC):
+class BurstBus(can.BusABC):
+    """A bus of which one call reads a burst; its other frames are returned without python-can's clock and logging."""
+
+    _received: deque[can.Message]
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._received:
+            self._fill(timeout)
+        return (self._received.popleft() if self._received else None), False
+
+    @abstractmethod
+    def _fill(self, timeout_s: float | None) -> None: ...
+
+
+class SocketcanBus(BurstBus):
     """A socket of classic CAN frames, and the process that reads it.
 
     Args:
@@ -120,7 +140,7 @@ class SocketcanBus(can.BusABC):
         self.losses = NO_LOSSES  #: Of the frames received so far
         self.remarks = remarks
         self._channel = channel
-        self._received: deque[can.Message] = deque()
+        self._received = deque()
         self._chunks: deque[bytes] = deque()
         self._ready = False
         self._end: str | None = None
@@ -174,17 +194,6 @@ class SocketcanBus(can.BusABC):
                 time.sleep(RETRY_S)
             else:
                 return
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
-        if self._received and self._filters is None:
-            return self._received.popleft()
-        return super().recv(timeout)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if not self._received:
-            self._fill(timeout)
-        return (self._received.popleft() if self._received else None), False
 
     def _fill(self, timeout_s: float | None) -> None:
         """Take records from the capture process, waiting for the first of them."""

@@ -159,9 +159,8 @@ class SyncStream:
         if late and not self._behind:
             self._behind = True
             remedy = "moving axes cannot be watched; reduce the load of this computer"
-            self._watch.faults.append(
-                BusError(str(self._link.address), f"read {behind_ns * 1e-9:.1f} s late: {remedy}")
-            )
+            reason = f"read {behind_ns * 1e-9:.1f} s late: {remedy}"
+            self._watch.faults.append(BusError(str(self._link.address), reason))
         return late
 
     def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
@@ -221,10 +220,7 @@ class SyncStream:
         self.emit(CellEvent(self.time_ns, None, EventKind.SYNC_LOST, self._cycles, reason))
         self._watch.faults.append(BusError(str(self._link.address), reason))
         self.pacing = TimedSync(pacing.period_ns, pacing.start_ns, pacing.clock)
-        now = pacing.clock()
-        if self._cycles == 0:
-            self._first_sync_ns = self._answered_ns = now
-        self._next_sync_ns = now
+        self._next_sync_ns = pacing.clock()
         return self._send_sync()
 
     def _send_sync(self) -> int:
