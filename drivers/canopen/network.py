@@ -17,9 +17,8 @@ from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_
 from drivers.canopen.pdo import CONTROLWORD, STATUSWORD
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
-from drivers.canopen.setup import AxisSetup
+from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
-from drivers.motion.guard import Guard, producer_of, read_consumers
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
@@ -83,7 +82,7 @@ class CanopenNetwork:
         address: of the bus, or of the buses that share the axes.
         axes: the amplifiers, in the order of the samples' columns.
         heartbeat_ms: period of every node's heartbeat, and of ours while axes have power.
-        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/motion/guard.py).
+        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/canopen/setup.py).
         bounds, policy: time limits.
         clock: monotonic time [ns].
         opener: opens the bus of an address, or of several as one.

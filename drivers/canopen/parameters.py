@@ -14,8 +14,8 @@ from enum import Enum
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import PDOS, SETPOINT_PDOS, STATUSWORD, Direction, feedback_entries, pack, read_record, records
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.setup import CONSUMERS
 from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
-from drivers.motion.guard import CONSUMERS
 from drivers.profiles.cia402 import POWERLESS, decode
 from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Parameter
 
