@@ -68,12 +68,9 @@ def read_consumers(access: ObjectAccess) -> Consumers | None:
 
 
 class Guard:
-    """The watch of an amplifier over the recorder, by an entry of 1016h that is free or of a killed recorder.
+    """The watch of an amplifier over the recorder, by an entry of its 1016h (`consumers`).
 
-    Args:
-        access: to the amplifier.
-        consumers: its 1016h.
-        left_over: whether the value of an entry watches a killed recorder.
+    The entry is free, or `left_over` shows that it watches a killed recorder.
     """
 
     def __init__(self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> None:

@@ -32,14 +32,7 @@ _WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
 
 
 class FrozenData:
-    """Finds moving axes whose data do not change; made when the set-points of a move are sent.
-
-    Args:
-        move: in progress.
-        start_counts: positions at its start.
-        axes: indices of the moving axes.
-        period_ns: of the samples.
-    """
+    """Finds moving axes whose data do not change; made when the set-points of a move are sent, from these positions."""
 
     def __init__(self, move: Move, start_counts: Sequence[int], axes: Sequence[int], period_ns: int) -> None:
         self._paths = {axis: move.path(axis, start_counts[axis]) for axis in axes}

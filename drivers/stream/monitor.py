@@ -118,12 +118,7 @@ class _AxisWatch:
 
 
 class CellMonitor:
-    """Reads a bus and, where no other master is on it, reads its axes by SDO.
-
-    Args:
-        link: open; only the monitor may read it meanwhile.
-        axes: of the cell.
-    """
+    """Reads a bus and, where no other master is on it, its axes by SDO; nothing else may read the link meanwhile."""
 
     def __init__(self, link: Link, axes: tuple[Axis, ...]) -> None:
         self._link = link

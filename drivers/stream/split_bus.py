@@ -100,12 +100,9 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
 
 
 class SplitBus(can.BusABC):
-    """Ends of several buses as one; ``channel`` of a received frame names its bus.
+    """Ends of several buses as one, which closes them; ``channel`` of a received frame names its bus.
 
-    Args:
-        address: of the buses.
-        ends: of the buses, in their order; the split bus closes them.
-        clock: monotonic seconds, for time-outs.
+    The ends are in the order of the address; the clock, for time-outs, is monotonic [s].
     """
 
     def __init__(

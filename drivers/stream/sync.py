@@ -133,10 +133,6 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
 
     It ends with the process that started it. Each interval counts from the actual time of the last SYNC, so the period
     is too long by the lateness of the timer: `seen` measures that and shortens the interval.
-
-    Args:
-        network: on SocketCAN.
-        period_us: of SYNC.
     """
 
     name = "the kernel"
@@ -192,13 +188,7 @@ class KernelProducer(AbstractContextManager["KernelProducer"]):
 
 
 class DriveProducer(AbstractContextManager["DriveProducer"]):
-    """SYNC by a drive of the cell, by its objects 1005h (bit 30) and 1006h; both are restored afterwards.
-
-    Args:
-        network: that the drive belongs to.
-        axis: index of the axis.
-        period_us: of SYNC.
-    """
+    """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
 
     def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
         self.name = network.axes[axis].name
@@ -248,9 +238,6 @@ class SyncRate:
     """Detects a second SYNC producer: its SYNCs look like the expected producer's, but then too many arrive.
 
     Jitter cancels out: a late SYNC is followed by an early one.
-
-    Args:
-        period_ns: of the producer [ns].
     """
 
     def __init__(self, period_ns: int) -> None:
