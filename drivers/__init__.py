@@ -26,98 +26,58 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.canopen.bus import BusAddress
-    from drivers.canopen.network import CanopenNetwork, open_cell
-    from drivers.canopen.scan import FoundNode
-    from drivers.canopen.scan import scan_bus as scan
-    from drivers.errors import (
-        BusBusy,
-        BusError,
-        DriveFault,
-        DriverError,
-        MotionRefused,
-        MotionTimeout,
-        NodeError,
-        NodeMisplaced,
-        NodeMissing,
-        ObjectAccessError,
-        ParameterRefused,
-        ParametersMixed,
-        SampleLost,
-        SetupRefused,
-        StateRefused,
-    )
-    from drivers.motion.execute import execute
-    from drivers.motion.move import AxisLimits, MotionPermission, Move, synchronised_move
-    from drivers.profiles.cia402 import State, decode
-    from drivers.profiles.profile import (
-        CIA402,
-        Amplitude,
-        Axis,
-        CurrentScale,
-        DriveProfile,
-        Identity,
-        ObjectEntry,
-        TapPoint,
-    )
-    from drivers.stream.answers import StreamStatistics
-    from drivers.stream.sample import CellEvent, EventKind, Sample
-    from drivers.stream.split_bus import BusPart, SplitAddress
-    from drivers.stream.stream import SyncStream
-    from drivers.stream.sync import FollowedSync, LockstepSync, TimedSync
-
-__all__ = [
-    "CIA402",
-    "Amplitude",
-    "Axis",
-    "AxisLimits",
-    "BusAddress",
-    "BusBusy",
-    "BusError",
-    "BusPart",
-    "CanopenNetwork",
-    "CellEvent",
-    "CurrentScale",
-    "DriveFault",
-    "DriveProfile",
-    "DriverError",
-    "EventKind",
-    "FollowedSync",
-    "FoundNode",
-    "Identity",
-    "LockstepSync",
-    "MotionPermission",
-    "MotionRefused",
-    "MotionTimeout",
-    "Move",
-    "NodeError",
-    "NodeMisplaced",
-    "NodeMissing",
-    "ObjectAccessError",
-    "ObjectEntry",
-    "ParameterRefused",
-    "ParametersMixed",
-    "Sample",
-    "SampleLost",
-    "SetupRefused",
-    "SplitAddress",
-    "State",
-    "StateRefused",
-    "StreamStatistics",
-    "SyncStream",
-    "TapPoint",
-    "TimedSync",
-    "decode",
-    "execute",
-    "open_cell",
-    "scan",
-    "synchronised_move",
-]
+    from drivers.canopen.bus import BusAddress as BusAddress
+    from drivers.canopen.network import CanopenNetwork as CanopenNetwork
+    from drivers.canopen.network import open_cell as open_cell
+    from drivers.canopen.scan import FoundNode as FoundNode
+    from drivers.canopen.scan import scan as scan
+    from drivers.errors import BusBusy as BusBusy
+    from drivers.errors import BusError as BusError
+    from drivers.errors import DriveFault as DriveFault
+    from drivers.errors import DriverError as DriverError
+    from drivers.errors import MotionRefused as MotionRefused
+    from drivers.errors import MotionTimeout as MotionTimeout
+    from drivers.errors import NodeError as NodeError
+    from drivers.errors import NodeMisplaced as NodeMisplaced
+    from drivers.errors import NodeMissing as NodeMissing
+    from drivers.errors import ObjectAccessError as ObjectAccessError
+    from drivers.errors import ParameterRefused as ParameterRefused
+    from drivers.errors import ParametersMixed as ParametersMixed
+    from drivers.errors import SampleLost as SampleLost
+    from drivers.errors import SetupRefused as SetupRefused
+    from drivers.errors import StateRefused as StateRefused
+    from drivers.motion.execute import execute as execute
+    from drivers.motion.move import AxisLimits as AxisLimits
+    from drivers.motion.move import MotionPermission as MotionPermission
+    from drivers.motion.move import Move as Move
+    from drivers.motion.move import synchronised_move as synchronised_move
+    from drivers.profiles.cia402 import State as State
+    from drivers.profiles.cia402 import decode as decode
+    from drivers.profiles.profile import CIA402 as CIA402
+    from drivers.profiles.profile import Amplitude as Amplitude
+    from drivers.profiles.profile import Axis as Axis
+    from drivers.profiles.profile import CurrentScale as CurrentScale
+    from drivers.profiles.profile import DriveProfile as DriveProfile
+    from drivers.profiles.profile import Identity as Identity
+    from drivers.profiles.profile import ObjectEntry as ObjectEntry
+    from drivers.profiles.profile import TapPoint as TapPoint
+    from drivers.stream.answers import StreamStatistics as StreamStatistics
+    from drivers.stream.sample import CellEvent as CellEvent
+    from drivers.stream.sample import EventKind as EventKind
+    from drivers.stream.sample import Sample as Sample
+    from drivers.stream.split_bus import BusPart as BusPart
+    from drivers.stream.split_bus import SplitAddress as SplitAddress
+    from drivers.stream.stream import SyncStream as SyncStream
+    from drivers.stream.sync import FollowedSync as FollowedSync
+    from drivers.stream.sync import LockstepSync as LockstepSync
+    from drivers.stream.sync import TimedSync as TimedSync
 
 _HOMES = {
     "canopen.bus": "BusAddress",
     "canopen.network": "CanopenNetwork open_cell",
-    "canopen.scan": "FoundNode scan_bus",
+    "canopen.scan": "FoundNode scan",
+    "errors": "BusBusy BusError DriveFault DriverError MotionRefused MotionTimeout NodeError NodeMisplaced NodeMissing "
+    "ObjectAccessError ParameterRefused ParametersMixed SampleLost SetupRefused StateRefused",
     "motion.execute": "execute",
     "motion.move": "AxisLimits MotionPermission Move synchronised_move",
     "profiles.cia402": "State decode",
@@ -129,14 +89,13 @@ _HOMES = {
     "stream.sync": "FollowedSync LockstepSync TimedSync",
 }
 _MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
 def __getattr__(name: str) -> object:
-    if name not in __all__:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
-    name_there = "scan_bus" if name == "scan" else name
-    module = import_module(f"{__name__}.{_MODULES.get(name_there, 'errors')}")
-    value = globals()[name] = getattr(module, name_there)
+    value = globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     return value
 
 

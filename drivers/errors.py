@@ -120,12 +120,7 @@ class NodeMisplaced(DriverError):
 
 
 class NodeError(DriverError):
-    """One amplifier is not as expected.
-
-    Args:
-        node: the amplifier; its name, where known, is in the message.
-        reason: what was found, what was expected and what to do.
-    """
+    """One amplifier is not as expected; the reason has what was found, what was expected and what to do."""
 
     def __init__(self, node: Node, reason: str) -> None:
         super().__init__(f"{node_label(node)}: {reason}")
@@ -192,14 +187,7 @@ class DriveFault(NodeError):
 
 
 class SampleLost(DriverError):
-    """A SYNC cycle had no complete answer.
-
-    Args:
-        cycle: number of the cycle.
-        axes: indices of the axes without an answer.
-        names: their names.
-        silent_s: time since any axis answered [s], where none answers any more.
-    """
+    """A SYNC cycle had no complete answer; `silent_s` is the time since any axis answered, where none does any more."""
 
     def __init__(self, cycle: int, axes: tuple[int, ...], names: Sequence[str], silent_s: float | None = None) -> None:
         if silent_s is None:

@@ -53,9 +53,9 @@ def simulate(
 
     from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
-    from drivers.canopen.bus import BusAddress, open_answering_bus
+    from drivers.canopen.bus import BusAddress, open_bus
     from drivers.canopen.hub import Hub
-    from drivers.stream.split_bus import BusPart, SplitAddress, open_split_bus
+    from drivers.stream.split_bus import BusPart, SplitAddress, open_cell_bus
 
     require_simulator()
     from drivers.simulation.cell import SimulatedCell
@@ -84,7 +84,7 @@ def simulate(
             for name, nodes in there.items()
         )
         address = SplitAddress(parts) if bus else parts[0].address
-        end = open_split_bus(address) if isinstance(address, SplitAddress) else open_answering_bus(address)
+        end = open_cell_bus(address) if isinstance(address, SplitAddress) else open_bus(address, answering=True)
         stack.callback(end.shutdown)
         cell = SimulatedCell(spec, end, mounted=mounted)
         what = payload or "none" if payload_from is None else f"as {payload_from} says"

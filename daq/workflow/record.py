@@ -363,9 +363,9 @@ def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | 
     sync = _sync(cell)
     period_ns, clock = sync.period_us * 1000, clocks.monotonic_ns
     if producer is not None:
-        in_kernel = isinstance(producer, KernelProducer)
+        seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
-        return FollowedSync(period_ns, producer.name, in_kernel, silence_s, producer.seen, start_ns, clock)
+        return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, start_ns, clock)
     if sync.pacing is declared.Pacing.LOCKSTEP:
         return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
     return TimedSync(period_ns, start_ns=start_ns, clock=clock)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import can
 
 from drivers.errors import BusError
-from drivers.stream.socketcan import open_socketcan
+from drivers.stream.socketcan import BurstBus, open_socketcan
 
 CONNECT_TIMEOUT_S = 5.0
 SEND_S = 2.0  #: Longest time in which a server may accept nothing; a frame sent in part cannot be recalled
@@ -79,12 +79,16 @@ def bus_errors(address: object) -> Iterator[None]:
         raise BusError(str(address), str(error) or type(error).__name__) from error
 
 
-def open_bus(address: BusAddress) -> can.BusABC:
+def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
     """Open one end of a bus.
 
     A ``virtual`` bus keeps every unread frame without limit (a limit would block the *sender* for ever), so close ends
     that are not read. No end receives its own frames, except the SYNCs on ``socketcan``, which return with their time
     and ``is_rx`` False (drivers/stream/socketcan.py).
+
+    Args:
+        address: of the bus.
+        answering: for a device that answers each frame: on ``socketcan`` without the capture process.
 
     Raises:
         BusError: the interface is unknown, the device is absent, or the hub does not answer.
@@ -93,21 +97,9 @@ def open_bus(address: BusAddress) -> can.BusABC:
         if address.interface == "socketcand":
             # python-can's own client mistakes a closed hub for silence.
             return SocketcandBus(address.channel, address.host, address.port)
-        if address.interface == "socketcan":
+        if address.interface == "socketcan" and not answering:
             # python-can's own loses frames while this interpreter is busy, and cannot count them.
             return open_socketcan(address.channel)
-    return open_answering_bus(address)
-
-
-def open_answering_bus(address: BusAddress) -> can.BusABC:
-    """As `open_bus`, for a device that answers each frame: on ``socketcan`` without the capture process.
-
-    Raises:
-        BusError: as `open_bus`.
-    """
-    if address.interface == "socketcand":
-        return open_bus(address)
-    with bus_errors(address):
         try:
             # A user's python-can configuration file must not change the cell's configuration.
             return can.Bus(
@@ -126,12 +118,12 @@ def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
     burst: Callable[[Sequence[can.Message]], None] | None = getattr(bus, "send_burst", None)
     if burst is not None:
         burst(messages)
-        return
-    for message in messages:
-        bus.send(message)
+    else:
+        for message in messages:
+            bus.send(message)
 
 
-class SocketcandBus(can.BusABC):
+class SocketcandBus(BurstBus):
     """One end of a bus of a socketcand server.
 
     Raises:
@@ -142,7 +134,7 @@ class SocketcandBus(can.BusABC):
     def __init__(self, channel: str, host: str, port: int) -> None:
         self.channel_info = f"socketcand {channel}@{host}:{port}"
         self._channel = channel
-        self._received: deque[can.Message] = deque()
+        self._received = deque()
         self._buffer = b""
         self._stuck: str | None = None
         self._socket = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
@@ -184,12 +176,7 @@ class SocketcandBus(can.BusABC):
         """Send frames, in one system call if the server accepts them."""
         if self._stuck is not None:
             raise can.CanOperationError(self._stuck)
-        try:
-            self._send_all(memoryview(b"".join(map(send_line, messages))))
-        except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
-
-    def _send_all(self, data: memoryview) -> None:
+        data = memoryview(b"".join(map(_command, messages)))
         end_s: float | None = None
         while data:
             try:
@@ -200,26 +187,19 @@ class SocketcandBus(can.BusABC):
                 if left_s <= 0 or not select.select((), (self._socket,), (), left_s)[1]:
                     self._stuck = f"{self.channel_info}: the server accepts nothing for {SEND_S:g} s"
                     raise can.CanOperationError(self._stuck) from None
+            except OSError as error:
+                raise can.CanOperationError(f"{self.channel_info}: {error}") from error
 
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
-        if self._received and self._filters is None:
-            return self._received.popleft()
-        return super().recv(timeout)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if self._received:
-            return self._received.popleft(), False
+    def _fill(self, timeout_s: float | None) -> None:
         try:
-            if not select.select((self._socket,), (), (), timeout)[0]:
-                return None, False
+            if not select.select((self._socket,), (), (), timeout_s)[0]:
+                return
             chunk = self._socket.recv(_RECEIVE_BYTES)
         except (OSError, ValueError) as error:
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
         if not chunk:
             raise can.CanOperationError(f"{self.channel_info}: the server closed the connection")
         self._parse(self._buffer + chunk)
-        return (self._received.popleft() if self._received else None), False
 
     def _parse(self, buffer: bytes) -> None:
         end = 0
@@ -260,7 +240,7 @@ class SocketcandBus(can.BusABC):
         self._socket.close()
 
 
-def send_line(message: can.Message) -> bytes:
+def _command(message: can.Message) -> bytes:
     """Return a frame as the protocol's ``send`` command."""
     if message.is_remote_frame or message.is_fd or message.is_error_frame:
         raise can.CanOperationError(f"the socketcand protocol has no remote, FD or error frames to send: {message}")

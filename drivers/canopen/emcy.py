@@ -1,150 +1,17 @@
 """Error codes of EMCY and 603Fh in words.
 
-Source: CiA 301 (emergency error code classes 00xxh to FFxxh and the communication codes 81xxh and 82xxh) and CiA 402-2
-(IEC 61800-7-201, error codes of power drive systems). Other codes are described by their class: upper byte, then upper
-digit.
+The texts are those of CiA 301 and CiA 402-2 (emcy.txt). Other codes are described by their class: upper byte, then
+upper digit.
 """
 
 from __future__ import annotations
 
-CODES = {
-    0x0000: "no error",
-    0x1000: "generic error",
-    0x2100: "current on the input side",
-    0x2110: "short circuit or earth leakage at the input",
-    0x2120: "earth leakage at the input",
-    0x2130: "short circuit at the input",
-    0x2200: "internal current",
-    0x2211: "internal current, no. 1",
-    0x2212: "internal current, no. 2",
-    0x2213: "over-current in ramp function",
-    0x2214: "over-current in the sequence",
-    0x2220: "continuous over-current inside the drive",
-    0x2230: "short circuit or earth leakage inside the drive",
-    0x2240: "earth leakage inside the drive",
-    0x2250: "short circuit inside the drive",
-    0x2300: "current on the output side",
-    0x2310: "continuous over-current at the output",
-    0x2311: "continuous over-current, no. 1",
-    0x2312: "continuous over-current, no. 2",
-    0x2320: "short circuit or earth leakage at the output",
-    0x2330: "earth leakage at the output",
-    0x2340: "short circuit at the output",
-    0x2350: "load level fault (I2t, thermal state)",
-    0x2351: "load level warning (I2t, thermal state)",
-    0x3100: "mains voltage",
-    0x3110: "mains over-voltage",
-    0x3120: "mains under-voltage",
-    0x3130: "mains phase failure",
-    0x3140: "mains frequency",
-    0x3200: "DC link voltage",
-    0x3210: "DC link over-voltage",
-    0x3220: "DC link under-voltage",
-    0x3230: "load error of the DC link",
-    0x3300: "output voltage",
-    0x3310: "output over-voltage",
-    0x4100: "ambient temperature",
-    0x4110: "ambient temperature too high",
-    0x4120: "ambient temperature too low",
-    0x4200: "device temperature",
-    0x4210: "device temperature too high",
-    0x4220: "device temperature too low",
-    0x4300: "drive temperature",
-    0x4310: "drive temperature too high",
-    0x4320: "drive temperature too low",
-    0x4400: "supply temperature",
-    0x5000: "device hardware",
-    0x5100: "supply of the hardware",
-    0x5110: "low-voltage supply",
-    0x5200: "control hardware",
-    0x5300: "operating unit",
-    0x5400: "power section",
-    0x5410: "output stages",
-    0x5430: "input stages",
-    0x5440: "contactors",
-    0x5450: "fuses",
-    0x5500: "hardware memory",
-    0x5530: "non-volatile memory",
-    0x6000: "device software",
-    0x6100: "internal software",
-    0x6010: "software reset (watchdog)",
-    0x6200: "user software",
-    0x6300: "data record",
-    0x6310: "loss of parameters",
-    0x6320: "parameter error",
-    0x7100: "additional module: power",
-    0x7110: "brake chopper",
-    0x7111: "failure of the brake chopper",
-    0x7112: "over-current of the brake chopper",
-    0x7113: "protective circuit of the brake chopper",
-    0x7120: "motor",
-    0x7121: "motor blocked",
-    0x7122: "motor error or wrong commutation",
-    0x7123: "motor tilted",
-    0x7200: "measurement circuit",
-    0x7300: "sensor",
-    0x7301: "tachometer fault",
-    0x7302: "tachometer wrong polarity",
-    0x7303: "resolver 1 fault",
-    0x7304: "resolver 2 fault",
-    0x7305: "incremental sensor 1 fault",
-    0x7306: "incremental sensor 2 fault",
-    0x7307: "incremental sensor 3 fault",
-    0x7310: "speed",
-    0x7320: "position",
-    0x7400: "computation circuit",
-    0x7500: "communication",
-    0x7510: "serial interface no. 1",
-    0x7520: "serial interface no. 2",
-    0x7600: "data storage",
-    0x8100: "communication",
-    0x8110: "CAN overrun: frames lost",
-    0x8120: "CAN in error passive mode",
-    0x8130: "life guard error or heartbeat error",
-    0x8140: "recovered from bus-off",
-    0x8150: "CAN-ID collision",
-    0x8200: "protocol error",
-    0x8210: "PDO not processed due to length error",
-    0x8220: "PDO length exceeded",
-    0x8240: "unexpected SYNC data length",
-    0x8250: "RPDO time-out",
-    0x8300: "torque control",
-    0x8311: "excess torque",
-    0x8312: "difficult start-up",
-    0x8313: "standstill torque",
-    0x8321: "insufficient torque",
-    0x8331: "torque fault",
-    0x8400: "velocity speed controller",
-    0x8500: "position controller",
-    0x8600: "positioning controller",
-    0x8611: "following error",
-    0x8612: "reference limit",
-    0x8700: "SYNC controller",
-    0x8800: "winding controller",
-    0x8900: "process data monitoring",
-    0x8A00: "control",
-    0x9000: "external error",
-    0xF000: "additional functions",
-    0xF001: "deceleration",
-    0xF002: "sub-synchronous run",
-    0xF003: "stroke operation",
-    0xF004: "control",
-}
-"""Text of each code that the two standards name."""
+from pathlib import Path
 
-_CLASSES = {
-    0x0: "error reset or no error",
-    0x1: "generic error",
-    0x2: "current",
-    0x3: "voltage",
-    0x4: "temperature",
-    0x5: "device hardware",
-    0x6: "device software",
-    0x7: "additional modules",
-    0x8: "monitoring",
-    0x9: "external error",
-    0xF: "additional functions",
-}
+_LINES = Path(__file__).with_name("emcy.txt").read_text(encoding="utf-8").splitlines()
+_TEXTS = {digits: text for digits, _, text in (line.partition(" ") for line in _LINES if not line.startswith("#"))}
+CODES = {int(digits, 16): text for digits, text in _TEXTS.items() if len(digits) == 4}
+"""Text of each code that the two standards name."""
 
 
 def describe(code: int) -> str:
@@ -156,4 +23,4 @@ def describe(code: int) -> str:
     for mask in (0xFFF0, 0xFF00, 0xF000):
         if code & mask in CODES and code & mask:
             return f"{CODES[code & mask]} (this code is the maker's)"
-    return f"{_CLASSES.get(code >> 12, 'reserved')} (this code is the maker's)"
+    return f"{_TEXTS.get(f'{code >> 12:X}', 'reserved')} (this code is the maker's)"

@@ -6,6 +6,7 @@ while it waits. See docs/decisions/0002-stream-owns-the-bus.md.
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
@@ -71,20 +72,7 @@ def command_name(identifier: int) -> str:
 
 
 class Link:
-    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost.
-
-    Attributes:
-        nmt: last NMT state of each node that sent a heartbeat.
-        heard_ns: time of that heartbeat by the clock.
-        answered: nodes that sent any SDO answer.
-        silent: nodes that did not answer their last request, and sent nothing since.
-        heard: node ids of which any frame arrived since the bus was opened.
-        foreign: number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of
-            our axes, our own heartbeat) and that we did not send.
-        own_id: node id of our heartbeat, None before one was chosen.
-        names: names of our axes by node id.
-        sync_producer: device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
-    """
+    """An open bus and the last known state of its nodes. Methods that use the bus raise BusError when it is lost."""
 
     def __init__(
         self,
@@ -96,14 +84,17 @@ class Link:
         self.address = address
         self.clock = clock
         self.policy = policy
-        self.nmt: dict[int, int] = {}
-        self.heard_ns: dict[int, int] = {}
-        self.answered: set[int] = set()
+        self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
+        self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
+        self.answered: set[int] = set()  #: Nodes that sent any SDO answer
+        self.silent: set[int] = set()  #: Nodes that did not answer their last request, and sent nothing since
+        self.heard: set[int] = set()  #: Node ids of which any frame arrived since the bus was opened
+        #: Number of frames by identifier that only we should send (NMT, SYNC, SDO request, set-point of one of our
+        #: axes, our own heartbeat) and that we did not send.
         self.foreign: dict[int, int] = {}
-        self.silent: set[int] = set()
-        self.heard: set[int] = set()
-        self.own_id: int | None = None
-        self.names: Mapping[int, str] = {}
+        self.own_id: int | None = None  #: Node id of our heartbeat, None before one was chosen
+        self.names: Mapping[int, str] = {}  #: Of our axes by node id
+        #: Device that sends SYNC on our behalf (drivers/stream/sync.py); None while only we send it.
         self.sync_producer: str | None = None
         self._beat: can.Message | None = None
         self._beat_period_ns = 0
@@ -151,17 +142,17 @@ class Link:
         self.send((can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False),))
         self.wait(0.001)
 
-    def wait(self, seconds: float) -> None:
-        """Handle frames for a time."""
+    def wait(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Handle frames for a time, or until a condition holds; returns whether it does."""
         deadline = self.clock() + round(seconds * 1e9)
-        while (left_ns := deadline - self.clock()) > 0:
+        while not (done := until()) and (left_ns := deadline - self.clock()) > 0:
             self.pump(left_ns * 1e-9)
+        return done
 
     def start_heartbeat(self, node_id: int, period_ms: int) -> None:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
-        self._beat = can.Message(
-            arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=bytes((NmtState.OPERATIONAL,))
-        )
+        state = bytes((NmtState.OPERATIONAL,))
+        self._beat = can.Message(arbitration_id=HEARTBEAT + node_id, is_extended_id=False, data=state)
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
     def stop_heartbeat(self) -> None:
@@ -196,9 +187,16 @@ class Link:
         self.heard.add(node_id)
         self.silent.discard(node_id)
         if service == HEARTBEAT and message.data:
-            self._note_heartbeat(node_id, message.data[0] & 0x7F)
+            previous, state = self.nmt.get(node_id), message.data[0] & 0x7F
+            self.nmt[node_id], self.heard_ns[node_id] = state, self.clock()
+            if previous != state:
+                self._events.append((node_id, EventKind.NMT, state, f"NMT {nmt_name(previous)} -> {nmt_name(state)}"))
         elif service == _EMCY and len(message.data) == 8:
-            self._note_emcy(node_id, message.data)
+            code, register, data = struct.unpack("<HB5s", message.data)
+            # CiA 301: codes 00xxh report the end of an error.
+            kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
+            text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data.hex()}"
+            self._events.append((node_id, kind, code, text))
         elif service == _SDO_ANSWER:
             self.answered.add(node_id)
             for client in self._clients.get(node_id, ()):
@@ -206,14 +204,6 @@ class Link:
         else:
             return False
         return True
-
-    def _note_heartbeat(self, node_id: int, state: int) -> None:
-        previous = self.nmt.get(node_id)
-        self.nmt[node_id] = state
-        self.heard_ns[node_id] = self.clock()
-        if previous != state:
-            text = f"NMT {nmt_name(previous)} -> {nmt_name(state)}"
-            self._events.append((node_id, EventKind.NMT, state, text))
 
     def _note_error_frame(self, message: can.Message) -> None:
         """Report the state of the CAN controller; the kernel sends each change once."""
@@ -236,43 +226,21 @@ class Link:
         if self.foreign[identifier] == 1:  # once: a master would fill the log
             self._events.append((0, EventKind.BUS_BUSY, identifier, f"{command_name(identifier)} that we did not send"))
 
-    def _note_emcy(self, node_id: int, data: bytearray) -> None:
-        code, register = int.from_bytes(data[:2], "little"), data[2]
-        # CiA 301: codes 00xxh report the end of an error.
-        kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-        text = f"EMCY {code:04X}h {describe(code)}, error register {register:02X}h, data {data[3:].hex()}"
-        self._events.append((node_id, kind, code, text))
-
     def take_events(self, time_ns: int, node_ids: Sequence[int]) -> tuple[CellEvent, ...]:
         """Return the events since the last call in their order; axis is None for nodes that are no axes of ours."""
-        if not self._events:
-            return ()
         taken, self._events = self._events, deque()
-        return tuple(
-            CellEvent(
-                time_ns,
-                node_ids.index(node) if node in node_ids else None,
-                kind,
-                code,
-                f"{self.label(node)}: {text}" if node else text,
-            )
-            for node, kind, code, text in taken
-        )
-
-    @property
-    def has_events(self) -> bool:
-        """Whether take_events would return an event."""
-        return bool(self._events)
-
-    def label(self, node_id: int) -> str:
-        """Name a node in a message, with its axis where it is one of ours."""
-        return node_label(self.objects(node_id))
+        found = []
+        for node, kind, code, text in taken:
+            axis = node_ids.index(node) if node in node_ids else None
+            whole = f"{node_label(self.objects(node))}: {text}" if node else text
+            found.append(CellEvent(time_ns, axis, kind, code, whole))
+        return tuple(found)
 
     def objects(self, node_id: int, policy: SdoPolicy | None = None) -> ObjectAccess:
         """Return access to the object dictionary of a node, with the link's policy or another."""
         policy = policy or self.policy
         if (node_id, policy) not in self._access:
-            client = SynchronousSdoClient(node_id, self.send, self.pump, self.clock, policy)
+            client = SynchronousSdoClient(node_id, self, policy)
             self._clients.setdefault(node_id, []).append(client)
             self._access[node_id, policy] = ObjectAccess(node_id, client, policy, self.names.get(node_id, ""))
         return self._access[node_id, policy]
@@ -289,10 +257,10 @@ class Link:
         Raises:
             StateRefused: none came in time; canopen would have believed the command.
         """
-        deadline = self.clock() + round(within_s * 1e9)
-        while self.heard_ns.get(node_id, since_ns - 1) < since_ns or self.nmt[node_id] != state:
-            left_ns = deadline - self.clock()
-            if left_ns <= 0:
-                found = self.nmt.get(node_id) if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
-                raise StateRefused(self.objects(node_id), f"NMT {state}", f"{nmt_name(found)} after {within_s:.3g} s")
-            self.pump(left_ns * 1e-9)
+
+        def found() -> int | None:
+            return self.nmt[node_id] if self.heard_ns.get(node_id, since_ns - 1) >= since_ns else None
+
+        if not self.wait(within_s, lambda: found() == state):
+            shown = f"{nmt_name(found())} after {within_s:.3g} s"
+            raise StateRefused(self.objects(node_id), f"NMT {state}", shown)

@@ -15,11 +15,10 @@ import can
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
 from drivers.canopen.pdo import CONTROLWORD, STATUSWORD
-from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, require, scan
+from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.sdo import Clock, SdoPolicy
-from drivers.canopen.setup import AxisSetup
+from drivers.canopen.setup import AxisSetup, Guard, producer_of, read_consumers
 from drivers.errors import WHILE, BusBusy, DriverError, NodeMissing, SetupRefused, StateRefused
-from drivers.motion.guard import is_left_over, producer_of, read_consumers
 from drivers.profiles.cia402 import FAULT_RESET_SEQUENCE, POWERLESS, Goal, State, decode, next_command
 from drivers.profiles.profile import Axis, Identity
 from drivers.profiles.scale import ScaleReading, read_scale
@@ -27,6 +26,7 @@ from drivers.stream.sample import Sample
 from drivers.stream.split_bus import CellAddress, open_cell_bus
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
+LOWEST_USUAL_ID = 112  #: The recorder takes the highest free id: this one or a higher one on any usual bus
 HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 
@@ -82,7 +82,7 @@ class CanopenNetwork:
         address: of the bus, or of the buses that share the axes.
         axes: the amplifiers, in the order of the samples' columns.
         heartbeat_ms: period of every node's heartbeat, and of ours while axes have power.
-        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/motion/guard.py).
+        guard_ms: silence of ours after which the amplifiers stop by themselves (drivers/canopen/setup.py).
         bounds, policy: time limits.
         clock: monotonic time [ns].
         opener: opens the bus of an address, or of several as one.
@@ -114,7 +114,7 @@ class CanopenNetwork:
         self.recorder_id = next((n for n in range(127, 0, -1) if n not in self.node_ids), 0)
         self._setups: dict[int, AxisSetup] = {}
         self._readback: dict[str, object] = {}
-        self._scales: dict[str, ScaleReading] = {}
+        self._scales: tuple[ScaleReading, ...] = ()
 
     def __enter__(self) -> Self:
         self.link.open()
@@ -141,7 +141,7 @@ class CanopenNetwork:
 
     def scan(self, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5) -> tuple[FoundNode, ...]:
         """Find the nodes on the bus; changes nothing."""
-        return scan(self.link, node_ids, wait_s)
+        return scan_link(self.link, node_ids, wait_s)
 
     def check_identities(self) -> tuple[Identity, ...]:
         """Compare 1018h of every axis with its configuration.
@@ -151,28 +151,24 @@ class CanopenNetwork:
             SetupRefused: another amplifier than the configured one.
             ObjectAccessError: a node does not report its identity.
         """
-        require(self.link, self.node_ids, self.bounds.answer_s)
-        return tuple(self._check_identity(axis) for axis in self.axes)
-
-    def _check_identity(self, axis: Axis) -> Identity:
-        found = read_identity(self.link.objects(axis.node_id))
-        expected = axis.identity
-        if expected is None:
-            return found
-        pairs = [
-            ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
-            ("product code 1018h:02", expected.product_code, found.product_code),
-        ]
-        if expected.serial is not None:
-            pairs.append(("serial number 1018h:04", expected.serial, found.serial or 0))
-        for name, want, have in pairs:
-            if want != have:
-                raise SetupRefused(
-                    axis,
-                    f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
-                    "correct the configuration only after checking the hardware",
-                )
-        return found
+        answered = answering(self.link, self.node_ids, self.bounds.answer_s)
+        if missing := [axis for axis in self.axes if axis.node_id not in answered]:
+            raise NodeMissing(missing, answered, self.bounds.answer_s)
+        identities = tuple(read_identity(self.link.objects(node_id)) for node_id in self.node_ids)
+        for axis, found in zip(self.axes, identities, strict=True):
+            expected = axis.identity or found
+            for name, want, have in (
+                ("vendor id 1018h:01", expected.vendor_id, found.vendor_id),
+                ("product code 1018h:02", expected.product_code, found.product_code),
+                ("serial number 1018h:04", expected.serial, found.serial or 0),
+            ):
+                if want is not None and want != have:
+                    raise SetupRefused(
+                        axis,
+                        f"{name} is {have:#x}, the cell configuration expects {want:#x}; was an amplifier exchanged? "
+                        "correct the configuration only after checking the hardware",
+                    )
+        return identities
 
     def prepare(self) -> None:
         """Set every node up: identity, heartbeats, PRE-OPERATIONAL, mapping, profile position mode, OPERATIONAL.
@@ -189,27 +185,23 @@ class CanopenNetwork:
         if self.link.own_id is None:
             self._take_recorder_id([value for entries in consumers for _, value in entries or ()])
         for axis, entries in zip(self.axes, consumers, strict=True):
-            setup = self._setups.setdefault(axis.node_id, AxisSetup(self.link, axis))
+            if (setup := self._setups.get(axis.node_id)) is None:
+                guard = Guard(self.link.objects(axis.node_id), entries, self.was_ours)
+                setup = self._setups[axis.node_id] = AxisSetup(self.link, axis, guard)
             setup.send_heartbeats(self.heartbeat_ms)
-            setup.watch_recorder(entries, self.was_ours, self.recorder_id, self.guard_ms)
+            setup.guard.arm(self.recorder_id, self.guard_ms)
         self._command_all(NmtCommand.ENTER_PRE_OPERATIONAL, NmtState.PRE_OPERATIONAL)
-        for axis, identity in zip(self.axes, identities, strict=True):
+        for axis in self.axes:
             setup = self._setups[axis.node_id]
             self.disable(axis)
             setup.map_pdos()
             setup.set_mode(self.bounds.mode_s)
-            self._readback[axis.name] = setup.describe(identity, self._scale(axis), self.guard_ms)
+        for axis, identity, scale in zip(self.axes, identities, self.scales(), strict=True):
+            self._readback[axis.name] = self._setups[axis.node_id].describe(identity, scale, self.guard_ms)
         self._command_all(NmtCommand.START, NmtState.OPERATIONAL)
 
     def _take_recorder_id(self, watched: Sequence[int]) -> None:
-        """Choose the highest node id that no device uses, and that no amplifier waits for.
-
-        Args:
-            watched: entries of 1016h of all amplifiers.
-
-        Raises:
-            BusBusy: there is none.
-        """
+        """Choose the highest node id that no device uses, and that no amplifier waits for by its entries of 1016h."""
         # An amplifier that waits for a device which is off now would take our heartbeat for that device's.
         awaited = {producer_of(value) for value in watched if value & 0xFFFF != self.guard_ms}
         left = [n for n in range(127, 0, -1) if n not in awaited and n not in self.node_ids]
@@ -227,8 +219,14 @@ class CanopenNetwork:
         )
 
     def was_ours(self, value: int) -> bool:
-        """Whether an entry of 1016h still watches a recorder that was killed."""
-        return is_left_over(value, self.recorder_id, self.guard_ms, self.link.heard | self.link.names.keys())
+        """Whether an entry of 1016h still watches a recorder that was killed, and no device that is present.
+
+        That recorder may have used another node id, because of another device.
+        """
+        producer = producer_of(value)
+        usual = producer >= LOWEST_USUAL_ID and value & 0xFFFF == self.guard_ms
+        present = {0, *self.link.heard, *self.node_ids}
+        return producer not in present and (producer == self.recorder_id or usual)
 
     def require_quiet(self) -> None:
         """Listen for a while before the first frame is sent.
@@ -269,13 +267,13 @@ class CanopenNetwork:
             if node_id not in self.link.silent:
                 # A failure is tried again, and reported, when the network closes.
                 with suppress(DriverError):
-                    setup.stop_watching()
+                    setup.guard.disarm()
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
         """Report the amplifiers of the prepared network that do not stop by themselves when the recorder is killed."""
-        guards = [(axis, setup.guard) for axis in self.axes if (setup := self._setups.get(axis.node_id))]
-        return tuple(f"{axis.name}: {guard.lack}" for axis, guard in guards if guard is not None and guard.lack)
+        setups = [(axis, self._setups[axis.node_id]) for axis in self.axes if axis.node_id in self._setups]
+        return tuple(f"{axis.name}: {setup.guard.lack}" for axis, setup in setups if setup.guard.lack)
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
         """Ask all these axes at once for an answer; those without one are skipped from then on."""
@@ -314,8 +312,7 @@ class CanopenNetwork:
         """Return ampere per raw unit of each axis' current object, from the drives' own scale objects.
 
         Raises:
-            ObjectAccessError: a scale object cannot be read.
-            SetupRefused: the scale is implausible.
+            ObjectAccessError, SetupRefused: as `scales`.
         """
         return tuple(reading.ampere_per_unit for reading in self.scales())
 
@@ -325,12 +322,9 @@ class CanopenNetwork:
         Raises:
             ObjectAccessError, SetupRefused: as `drivers.profiles.scale.read_scale`.
         """
-        return tuple(self._scale(axis) for axis in self.axes)
-
-    def _scale(self, axis: Axis) -> ScaleReading:
-        if axis.name not in self._scales:
-            self._scales[axis.name] = read_scale(self.link.objects(axis.node_id), axis.profile)
-        return self._scales[axis.name]
+        if not self._scales:
+            self._scales = tuple(read_scale(self.link.objects(axis.node_id), axis.profile) for axis in self.axes)
+        return self._scales
 
     def readback(self) -> dict[str, object]:
         """Return what the drives reported during `prepare`, by axis name, for the log."""
@@ -390,7 +384,6 @@ class CanopenNetwork:
         """Disable, PRE-OPERATIONAL, restore; every step is tried, whatever failed before. Returns the failures."""
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
-        silent: NodeMissing | None = None
         for attempt in ("first", "last"):
             try:
                 # One time limit for all: asked in turn, six dead nodes would take a minute and more.

@@ -8,14 +8,14 @@ where it would store the PDO mapping, that must not be a mapping which a recordi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import PDOS, SETPOINT_PDOS, STATUSWORD, Direction, feedback_entries, pack, read_record, records
 from drivers.canopen.sdo import SdoPolicy
+from drivers.canopen.setup import CONSUMERS
 from drivers.errors import DriverError, NodeError, ObjectAccessError, ParameterRefused, ParametersMixed
-from drivers.motion.guard import CONSUMERS
 from drivers.profiles.cia402 import POWERLESS, decode
 from drivers.profiles.profile import Axis, Identity, Mapping, ObjectEntry, Parameter
 
@@ -69,14 +69,6 @@ class ParameterChange:
     saved: bool
 
 
-@dataclass
-class _Progress:
-    """Steps of a write that must be undone when it fails."""
-
-    tried: list[ParameterWrite] = field(default_factory=list)
-    saves: list[Axis] = field(default_factory=list)
-
-
 def read_parameters(network: CanopenNetwork, wanted: Sequence[tuple[Axis, Parameter]]) -> tuple[ParameterValue, ...]:
     """Read a parameter of each axis; changes nothing.
 
@@ -90,12 +82,11 @@ def read_parameters(network: CanopenNetwork, wanted: Sequence[tuple[Axis, Parame
     """
     network.require_quiet()
     identities = dict(zip(network.node_ids, network.check_identities(), strict=True))
-    return tuple(
-        ParameterValue(
-            axis, identities[axis.node_id], parameter, network.link.objects(axis.node_id).read(parameter.entry)
-        )
-        for axis, parameter in wanted
-    )
+    found = []
+    for axis, parameter in wanted:
+        word = network.link.objects(axis.node_id).read(parameter.entry)
+        found.append(ParameterValue(axis, identities[axis.node_id], parameter, word))
+    return tuple(found)
 
 
 def write_parameters(
@@ -132,22 +123,33 @@ def write_parameters(
             _require_savable(network, write.axis, saving)
     network.require_alone()
     begin(old)
-    progress = _Progress()
+    tried: list[ParameterValue] = []
+    saved: list[Axis] = []
     try:
         for value, write in zip(old, writes, strict=True):
             if value.word != write.word:
-                progress.tried.append(write)
-                _put(network, write)
+                tried.append(value)
+                _require_powerless(network, write.axis)
+                network.link.objects(write.axis.node_id).write(write.parameter.entry, write.word)
+                _check(network, write)
+                _require_powerless(network, write.axis)
+                network.require_alone()
         if saving is not Saving.RAM:
             for write in writes:
-                _save_noted(network, write.axis, save_timeout_s, progress)
+                saved.append(write.axis)
+                try:
+                    _save(network, write.axis, save_timeout_s)
+                except ObjectAccessError as error:
+                    if error.abort_code is not None:
+                        saved.remove(write.axis)  # an abort confirms that nothing was saved
+                    raise
                 _check(network, write)
         for axis in network.axes:
             _require_powerless(network, axis)
         network.require_alone()
     except BaseException as error:  # an interrupt too: a cell with half of the new gains has no valid set
         with network.block_signals():
-            _undo(network, old, progress, save_timeout_s, error)
+            _undo(network, tried, saved, save_timeout_s, error)
         raise
     return tuple(
         ParameterChange(write.axis.name, write.parameter, value.word, write.word, saving is not Saving.RAM)
@@ -181,15 +183,7 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     return ""
 
 
-def _put(network: CanopenNetwork, write: ParameterWrite) -> None:
-    _require_powerless(network, write.axis)
-    network.link.objects(write.axis.node_id).write(write.parameter.entry, write.word)
-    _check(network, write)
-    _require_powerless(network, write.axis)
-    network.require_alone()
-
-
-def _check(network: CanopenNetwork, write: ParameterWrite) -> None:
+def _check(network: CanopenNetwork, write: ParameterWrite | ParameterValue) -> None:
     found = network.link.objects(write.axis.node_id).read(write.parameter.entry)
     if found != write.word:
         written, read = (f"{write.parameter.value(word):.9g} ({word:#x})" for word in (write.word, found))
@@ -198,16 +192,6 @@ def _check(network: CanopenNetwork, write: ParameterWrite) -> None:
             f"object {write.parameter} reads back as {read}, written was {written}; does the drive limit or round it, "
             "or is it another object?",
         )
-
-
-def _save_noted(network: CanopenNetwork, axis: Axis, timeout_s: float, progress: _Progress) -> None:
-    progress.saves.append(axis)
-    try:
-        _save(network, axis, timeout_s)
-    except ObjectAccessError as error:
-        if error.abort_code is not None:
-            progress.saves.remove(axis)  # an abort confirms that nothing was saved
-        raise
 
 
 def _save(network: CanopenNetwork, axis: Axis, timeout_s: float) -> None:
@@ -247,31 +231,25 @@ def _require_savable(network: CanopenNetwork, axis: Axis, saving: Saving) -> Non
 
 def _undo(
     network: CanopenNetwork,
-    old: tuple[ParameterValue, ...],
-    progress: _Progress,
+    tried: Sequence[ParameterValue],
+    saved: Sequence[Axis],
     timeout_s: float,
     error: BaseException,
 ) -> None:
-    """Restore the old values, and save them where the new ones may have been saved.
-
-    Raises:
-        ParametersMixed: not everywhere; its cause is the error before.
-    """
-    tried = {write.axis.node_id for write in progress.tried}
-    touched = [value for value in old if value.axis.node_id in tried]
+    """Restore the old values, and save them where the new ones may have been saved; ParametersMixed if not all are."""
     restored, problems = [], []
     try:
         # One time limit for all drives that do not answer.
-        network.find_silent([value.axis for value in touched])
+        network.find_silent([value.axis for value in tried])
     except DriverError as problem:
         problems.append(str(problem))
-    for value in touched:
+    for value in tried:
         try:
-            _put_back(network, value, save=value.axis in progress.saves, timeout_s=timeout_s)
+            _put_back(network, value, save=value.axis in saved, timeout_s=timeout_s)
             restored.append(value.axis.name)
         except DriverError as problem:
             problems.append(str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}")
-    if problems and touched:
+    if problems and tried:
         raise ParametersMixed(tuple(restored), tuple(problems)) from error
     if restored:
         error.add_note(f"kept: the old values are restored in {', '.join(restored)}")
@@ -280,12 +258,11 @@ def _undo(
 def _put_back(network: CanopenNetwork, value: ParameterValue, *, save: bool, timeout_s: float) -> None:
     if value.axis.node_id in network.link.silent:
         raise ObjectAccessError(value.axis, str(value.parameter), "the node does not answer any more")
-    write = ParameterWrite(value.axis, value.parameter, value.word)
     access = network.link.objects(value.axis.node_id)
     if access.read(value.parameter.entry) != value.word:
         _require_powerless(network, value.axis)
         access.write(value.parameter.entry, value.word)
-    _check(network, write)
+    _check(network, value)
     if save:
         _save(network, value.axis, timeout_s)
-        _check(network, write)
+        _check(network, value)

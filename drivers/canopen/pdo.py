@@ -119,6 +119,10 @@ def _parameters(direction: Direction, number: int) -> tuple[ObjectEntry, ObjectE
     )
 
 
+def _entry(count: ObjectEntry, subindex: int) -> ObjectEntry:
+    return ObjectEntry(count.index, subindex, 32, signed=False)
+
+
 def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoRecord | None:
     """Read one PDO of a drive; None when the drive has no such PDO."""
     cob_id, transmission, count = _parameters(direction, number)
@@ -126,12 +130,12 @@ def read_record(access: ObjectAccess, direction: Direction, number: int) -> PdoR
     if identifier is None:
         return None
     mapped = access.read(count)
-    entries = tuple(access.read(ObjectEntry(count.index, sub, 32, signed=False)) for sub in range(1, mapped + 1))
+    entries = tuple(access.read(_entry(count, sub)) for sub in range(1, mapped + 1))
     return PdoRecord(direction, number, identifier, access.read(transmission), entries)
 
 
 def write_record(access: ObjectAccess, record: PdoRecord) -> None:
-    """Write one PDO, read it back and compare.
+    """Write what differs of one PDO, read it back and compare.
 
     Drives accept only this order: COB-ID not valid, count 0, entries, transmission type, count, COB-ID valid.
 
@@ -139,58 +143,25 @@ def write_record(access: ObjectAccess, record: PdoRecord) -> None:
         SetupRefused: a step was aborted, or the PDO reads back differently.
     """
     cob_id, transmission, count = _parameters(record.direction, record.number)
-    steps = [(cob_id, access.read(cob_id) | NOT_VALID), (count, 0)]
-    steps += [
-        (ObjectEntry(count.index, sub, 32, signed=False), entry) for sub, entry in enumerate(record.entries, start=1)
-    ]
-    steps += [(transmission, record.transmission), (count, len(record.entries)), (cob_id, record.cob_id)]
+    before = read_record(access, record.direction, record.number)
+    if before == record:
+        return
+    off = (record.cob_id if before is None else before.cob_id) | NOT_VALID
+    steps = [(cob_id, off)]
+    if before is None or (before.entries, before.transmission) != (record.entries, record.transmission):
+        steps += [(count, 0), *((_entry(count, sub), word) for sub, word in enumerate(record.entries, start=1))]
+        steps += [(transmission, record.transmission), (count, len(record.entries))]
+    if record.cob_id != off:
+        steps.append((cob_id, record.cob_id))
     for entry, value in steps:
         try:
             access.write(entry, value)
         except ObjectAccessError as error:
             raise SetupRefused(access, f"{record.name}: writing {value:#x} to {entry}: {error.reason}") from error
     found = read_record(access, record.direction, record.number)
-    if found is None or not _same(found, record):
+    if (
+        found is None
+        or (found.entries, found.transmission) != (record.entries, record.transmission)
+        or (found.cob_id ^ record.cob_id) & _COB_ID_BITS
+    ):
         raise SetupRefused(access, f"{record.name}: reads back as '{found}', written was '{record}'")
-
-
-def switch_off(access: ObjectAccess, record: PdoRecord) -> None:
-    """Mark a PDO as not valid and leave its mapping alone.
-
-    Raises:
-        SetupRefused: the drive refused.
-    """
-    _write_cob_id(access, record, record.cob_id | NOT_VALID)
-
-
-def restore(access: ObjectAccess, record: PdoRecord) -> None:
-    """Restore the original parameters of a PDO with as few writes as possible.
-
-    Raises:
-        SetupRefused: a step was aborted, or the PDO reads back differently.
-    """
-    found = read_record(access, record.direction, record.number)
-    if found == record:
-        return
-    if found is not None and (found.entries, found.transmission) == (record.entries, record.transmission):
-        _write_cob_id(access, record, record.cob_id)
-    else:
-        write_record(access, record)
-
-
-def _write_cob_id(access: ObjectAccess, record: PdoRecord, value: int) -> None:
-    cob_id, _, _ = _parameters(record.direction, record.number)
-    try:
-        if not value & NOT_VALID:
-            access.write(cob_id, access.read(cob_id) | NOT_VALID)  # the rest may change only while it is not valid
-        access.write(cob_id, value)
-        found = access.read(cob_id)
-    except ObjectAccessError as error:
-        raise SetupRefused(access, f"{record.name}: writing {value:#x} to {cob_id}: {error.reason}") from error
-    if (found ^ value) & _COB_ID_BITS:
-        raise SetupRefused(access, f"{record.name}: {cob_id} reads back as {found:#x}, written was {value:#x}")
-
-
-def _same(one: PdoRecord, other: PdoRecord) -> bool:
-    identical = one.entries == other.entries and one.transmission == other.transmission
-    return identical and (one.cob_id ^ other.cob_id) & _COB_ID_BITS == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import can
@@ -12,7 +13,7 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import Link
 from drivers.canopen.pdo import STATUSWORD
 from drivers.canopen.sdo import ObjectAccess, SdoPolicy
-from drivers.errors import NodeMissing, ObjectAccessError
+from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
 from drivers.stream.split_bus import CellAddress
@@ -50,7 +51,7 @@ class FoundNode:
         return None if self.statusword is None else decode(self.statusword)
 
 
-def scan_bus(
+def scan(
     address: CellAddress | str, node_ids: Sequence[int] = range(1, 128), wait_s: float = 0.5
 ) -> tuple[FoundNode, ...]:
     """Open a bus and find its nodes; changes nothing.
@@ -67,33 +68,35 @@ def scan_bus(
     link = Link(place, SdoPolicy(), time.monotonic_ns)
     link.open()
     try:
-        return scan(link, node_ids, wait_s)
+        return scan_link(link, node_ids, wait_s)
     finally:
         link.close()
 
 
-def scan(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
+def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
     answered = answering(link, node_ids, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
-    return tuple(_describe(link, node_id, node_id in answered) for node_id in alive)
-
-
-def require(link: Link, node_ids: Sequence[int], wait_s: float) -> None:
-    """Make sure that all these nodes answer SDO requests.
-
-    Raises:
-        NodeMissing: some do not.
-    """
-    answered = answering(link, node_ids, wait_s)
-    missing = [link.objects(node_id) for node_id in node_ids if node_id not in answered]
-    if missing:
-        raise NodeMissing(missing, answered, wait_s)
+    found = []
+    for node_id in alive:
+        nmt = link.nmt.get(node_id)
+        if node_id not in answered:
+            found.append(FoundNode(node_id, None, None, None, nmt, None))
+            continue
+        access = link.objects(node_id)
+        identity = name = None
+        with suppress(ObjectAccessError):
+            identity = read_identity(access)
+        with suppress(ObjectAccessError):
+            name = access.read_bytes(0x1008, 0).rstrip(b"\0 ").decode("utf-8", "replace")
+        revision, statusword = (access.read_optional(entry, any_abort=True) for entry in (REVISION, STATUSWORD))
+        found.append(FoundNode(node_id, identity, revision, name, nmt, statusword))
+    return tuple(found)
 
 
 def read_identity(access: ObjectAccess) -> Identity:
     """Read object 1018h; the serial is None where a node has none."""
-    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), _optional(access, SERIAL))
+    return Identity(access.read(VENDOR_ID), access.read(PRODUCT_CODE), access.read_optional(SERIAL, any_abort=True))
 
 
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
@@ -101,9 +104,7 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
     asked = set(node_ids)
     link.answered.clear()
     _ask(link, node_ids)
-    deadline = link.clock() + round(wait_s * 1e9)
-    while not asked <= link.answered and (left_ns := deadline - link.clock()) > 0:
-        link.pump(left_ns * 1e-9)
+    link.wait(wait_s, lambda: asked <= link.answered)
     return tuple(sorted(asked & link.answered))
 
 
@@ -116,28 +117,3 @@ def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, .
 
 def _ask(link: Link, node_ids: Sequence[int]) -> None:
     link.send([can.Message(arbitration_id=0x600 + n, is_extended_id=False, data=_READ_DEVICE_TYPE) for n in node_ids])
-
-
-def _describe(link: Link, node_id: int, answers: bool) -> FoundNode:
-    nmt = link.nmt.get(node_id)
-    if not answers:
-        return FoundNode(node_id, None, None, None, nmt, None)
-    access = link.objects(node_id)
-    try:
-        identity = read_identity(access)
-    except ObjectAccessError:
-        identity = None
-    try:
-        name = access.read_text(0x1008)
-    except ObjectAccessError:
-        name = None
-    return FoundNode(node_id, identity, _optional(access, REVISION), name, nmt, _optional(access, STATUSWORD))
-
-
-def _optional(access: ObjectAccess, entry: ObjectEntry) -> int | None:
-    try:
-        return access.read(entry)
-    except ObjectAccessError as error:
-        if error.abort_code is None:
-            raise
-        return None

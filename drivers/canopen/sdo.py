@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from queue import Empty, Queue
-from typing import TypeVar
+from queue import Queue
+from typing import Protocol, TypeVar
 
 import can
 from canopen import ObjectDictionary
@@ -24,9 +24,6 @@ _INITIATE_DOWNLOAD, _INITIATE_UPLOAD = 1, 2
 
 T = TypeVar("T")
 
-Send = Callable[[Sequence[can.Message]], None]  #: Sends frames
-Pump = Callable[[float], None]
-"""Reads the bus for at most the given time [s] and dispatches frames; returns after each frame."""
 Clock = Callable[[], int]  #: Monotonic time [ns]
 
 
@@ -59,12 +56,13 @@ class ObjectAccess:
         # Some drives send four bytes whatever the object's size is.
         return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
 
-    def read_optional(self, entry: ObjectEntry) -> int | None:
-        """Read an integer object that a drive need not have; None where it has none."""
+    def read_optional(self, entry: ObjectEntry, *, any_abort: bool = False) -> int | None:
+        """Read an integer object that a drive need not have; None where it has none, or aborts for any reason."""
         try:
             return self.read(entry)
         except ObjectAccessError as error:
-            if error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX):
+            missing = error.abort_code in (ABORT_DOES_NOT_EXIST, ABORT_NO_SUBINDEX)
+            if missing or (any_abort and error.abort_code is not None):
                 return None
             raise
 
@@ -79,10 +77,6 @@ class ObjectAccess:
         except OverflowError as error:
             raise ObjectAccessError(self, str(entry), f"{value} does not fit {entry.bits} bits") from error
         self._attempt(str(entry), lambda: self._client.download(entry.index, entry.subindex, data))
-
-    def read_text(self, index: int, subindex: int = 0) -> str:
-        """Read a visible string, without its padding."""
-        return self.read_bytes(index, subindex).rstrip(b"\0 ").decode("utf-8", "replace")
 
     def read_bytes(self, index: int, subindex: int) -> bytes:
         """Read the raw bytes of any object."""
@@ -102,6 +96,16 @@ class ObjectAccess:
         raise ObjectAccessError(self, name, f"{reason}, asked {self._policy.attempts} times")
 
 
+class _Bus(Protocol):
+    """The reader of the bus (drivers/canopen/link.py)."""
+
+    clock: Clock
+
+    def send(self, messages: Sequence[can.Message]) -> None: ...
+
+    def pump(self, timeout_s: float) -> None: ...
+
+
 class SynchronousSdoClient(SdoClient):
     """canopen's SDO client without its thread: it reads the bus while it waits.
 
@@ -109,52 +113,38 @@ class SynchronousSdoClient(SdoClient):
     the stream. Here the caller is the only reader.
     """
 
-    def __init__(self, node_id: int, send: Send, pump: Pump, clock: Clock, policy: SdoPolicy) -> None:
+    def __init__(self, node_id: int, bus: _Bus, policy: SdoPolicy) -> None:
         SdoClient.__init__(self, 0x600 + node_id, 0x580 + node_id, ObjectDictionary())
-        self._send = send
-        self._pump = pump
-        self._clock = clock
+        self._bus = bus
         self._policy = policy
 
     def receive(self, data: bytearray) -> None:
-        """Accept an answer that was read from the bus."""
-        self.responses.put(bytes(data))
+        """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
+        if len(data) == 8:
+            self.responses.put(bytes(data))
 
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
-        self._send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
+        self._bus.send((can.Message(arbitration_id=self.rx_cobid, is_extended_id=False, data=request),))
 
     def abort(self, abort_code: int = _ABORT_TIMED_OUT) -> None:
         """Abort the transfer on the node's side."""
         self.send_request(struct.pack("<B3xL", _ABORT, abort_code))
 
     def read_response(self) -> bytes:
-        """Wait for the next answer of the node.
-
-        Raises:
-            SdoCommunicationError: none within the policy's time.
-        """
-        deadline = self._clock() + round(self._policy.timeout_s * 1e9)
-        while True:
-            try:
-                response: bytes = self.responses.get_nowait()
-            except Empty:
-                left_s = (deadline - self._clock()) * 1e-9
-                if left_s <= 0:
-                    raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s") from None
-                self._pump(left_s)
-            else:
-                if len(response) == 8:  # CiA 301: an SDO always has eight bytes
-                    return response
+        """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
+        deadline = self._bus.clock() + round(self._policy.timeout_s * 1e9)
+        while self.responses.empty():
+            left_s = (deadline - self._bus.clock()) * 1e-9
+            if left_s <= 0:
+                raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
+            self._bus.pump(left_s)
+        response: bytes = self.responses.get_nowait()
+        return response
 
     def request_response(self, sdo_request: bytes) -> bytes:
-        """Send a request and return the answer that belongs to it.
-
-        Raises:
-            SdoAbortedError: the node aborted the transfer.
-            SdoCommunicationError: no answer in time.
-        """
-        self._pump(0.0)
+        """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
+        self._bus.pump(0.0)
         self.responses = Queue()
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])

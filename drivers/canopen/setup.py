@@ -1,8 +1,19 @@
-"""Set one amplifier up for a recording, and restore afterwards the settings that it had before."""
+"""Set one amplifier up for a recording, and restore afterwards the settings that it had before.
+
+The amplifier also watches the recorder, so that it stops by itself when the recorder is killed, hangs or is cut off.
+The recorder sends a heartbeat while axes have power; the amplifier watches it (CiA 301, consumer heartbeat time 1016h,
+which begins with the first heartbeat). When none comes, it acts by its abort connection option code (CiA 402-2, 6007h):
+quick stop.
+
+A heartbeat does not identify its sender. Another device with the recorder's node id would keep the axes running after
+the recorder was killed. The recorder therefore takes an id that no device uses, and a foreign heartbeat with it is a
+fault. The watch raises ObjectAccessError only when the amplifier does not answer; a refusal is no reason not to record.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from functools import partial
 
 from drivers.canopen.link import Link
@@ -17,12 +28,10 @@ from drivers.canopen.pdo import (
     pack,
     read_record,
     records,
-    restore,
-    switch_off,
     write_record,
 )
-from drivers.errors import SetupRefused, StateRefused
-from drivers.motion.guard import Consumers, Guard, arm, disarm, find_guard
+from drivers.canopen.sdo import ObjectAccess
+from drivers.errors import ObjectAccessError, SetupRefused, StateRefused
 from drivers.profiles.profile import Axis, Identity, ObjectEntry
 from drivers.profiles.scale import ScaleReading
 
@@ -30,17 +39,102 @@ HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16, signed=False)
 MODE_OF_OPERATION = ObjectEntry(0x6060, 0, 8, signed=True)
 MODE_DISPLAY = ObjectEntry(0x6061, 0, 8, signed=True)
 PROFILE_POSITION_MODE = 1
+CONSUMERS = ObjectEntry(0x1016, 0, 8, signed=False)
+ABORT_CONNECTION = ObjectEntry(0x6007, 0, 16, signed=True)
+QUICK_STOP_ON_LOSS = 3
+MOST_CONSUMERS = 127  #: Entries that 1016h can have (CiA 301)
+
+Consumers = tuple[tuple[ObjectEntry, int], ...]
+"""Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
+
+
+def producer_of(value: int) -> int:
+    """Return the node id that an entry of 1016h watches, 0 where it watches none."""
+    return value >> 16 & 0x7F if value & 0xFFFF else 0
+
+
+def read_consumers(access: ObjectAccess) -> Consumers | None:
+    """Read 1016h up to the first entry that cannot be read; None where the amplifier has no such object."""
+    found: list[tuple[ObjectEntry, int]] = []
+    try:
+        for sub in range(1, min(access.read(CONSUMERS), MOST_CONSUMERS) + 1):
+            entry = ObjectEntry(CONSUMERS.index, sub, 32, signed=False)
+            found.append((entry, access.read(entry)))
+    except ObjectAccessError as error:
+        if error.abort_code is None:
+            raise
+        return tuple(found) or None
+    return tuple(found)
+
+
+class Guard:
+    """The watch of an amplifier over the recorder, by an entry of its 1016h (`consumers`).
+
+    The entry is free, or `left_over` shows that it watches a killed recorder.
+    """
+
+    def __init__(self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]) -> None:
+        self.lack = ""  #: Missing capability, in words; empty when nothing is missing
+        self._access = access
+        self._consumer: ObjectEntry | None = None
+        self._consumer_before = 0
+        self._option_before: int | None = None
+        for entry, value in consumers or ():
+            if (ours := left_over(value)) or not value & 0xFFFF:
+                self._consumer, self._consumer_before = entry, 0 if ours else value
+                break
+        else:
+            free = "" if consumers is None else "free "
+            self.lack = f"no {free}1016h: it does NOT stop by itself when the recorder is killed"
+            return
+        self._option_before = access.read_optional(ABORT_CONNECTION, any_abort=True)
+        if self._option_before is None:
+            self.lack = "no 6007h: when the recorder is killed it stops in the way that its maker decided"
+
+    def describe(self, silence_ms: int) -> str:
+        """Describe the guard in words, for the log."""
+        if self._consumer is None:
+            return self.lack
+        return f"watches the recorder by {self._consumer}, {silence_ms} ms" + (f"; {self.lack}" if self.lack else "")
+
+    def arm(self, recorder_id: int, silence_ms: int) -> None:
+        """Let the amplifier quick stop after this silence of the recorder, counted from its first heartbeat.
+
+        A refused write is reported in `lack`; the recording goes on.
+        """
+        if self._consumer is None:
+            return
+        if self._option_before is not None and (refused := self._refused(ABORT_CONNECTION, QUICK_STOP_ON_LOSS)):
+            before, self._option_before = self._option_before, None
+            self.lack = f"6007h = {before} rules how it stops when the recorder is killed: 3 is {refused}"
+        if refused := self._refused(self._consumer, recorder_id << 16 | silence_ms):
+            if self._option_before is not None:
+                self._access.write(ABORT_CONNECTION, self._option_before)
+            self.lack = f"it does NOT stop by itself when the recorder is killed: 1016h is {refused}"
+            self._consumer = None
+
+    def _refused(self, entry: ObjectEntry, value: int) -> str:
+        try:
+            self._access.write(entry, value)
+        except ObjectAccessError as error:
+            if error.abort_code is None:
+                raise
+            return error.reason
+        return ""
+
+    def disarm(self) -> None:
+        """Restore the original values."""
+        if self._consumer is not None:
+            self._access.write(self._consumer, self._consumer_before)
+            if self._option_before is not None:
+                self._access.write(ABORT_CONNECTION, self._option_before)
 
 
 class AxisSetup:
-    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone.
+    """The settings of one amplifier; each step keeps the original value first, so a half-done setup can be undone."""
 
-    Attributes:
-        guard: how the amplifier watches the recorder; None before `watch_recorder`.
-    """
-
-    def __init__(self, link: Link, axis: Axis) -> None:
-        self.guard: Guard | None = None
+    def __init__(self, link: Link, axis: Axis, guard: Guard) -> None:
+        self.guard = guard  #: How the amplifier watches the recorder
         self._link = link
         self._axis = axis
         self._access = link.objects(axis.node_id)
@@ -54,14 +148,6 @@ class AxisSetup:
         if self._heartbeat_ms is None:
             self._heartbeat_ms = self._access.read(HEARTBEAT_TIME)
         self._access.write(HEARTBEAT_TIME, period_ms)
-
-    def watch_recorder(
-        self, consumers: Consumers | None, is_left_over: Callable[[int], bool], recorder_id: int, silence_ms: int
-    ) -> None:
-        """Let the amplifier quick stop when the recorder falls silent (drivers/motion/guard.py)."""
-        if self.guard is None:
-            self.guard = find_guard(self._access, consumers, is_left_over)
-        self.guard = arm(self._access, self.guard, recorder_id, silence_ms)
 
     def map_pdos(self) -> None:
         """Map position, current and statusword into TPDOs and the set-points into RPDOs; all other PDOs go off.
@@ -81,25 +167,20 @@ class AxisSetup:
         for direction, pdos in wanted.items():
             for number in range(PDOS):
                 found = read_record(self._access, direction, number)
-                if number < len(pdos) and found is None:
-                    raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
                 if found is None:
-                    continue
-                if number < len(pdos):
+                    if number < len(pdos):
+                        raise SetupRefused(axis, f"{pdos[number].name}: the drive has no such PDO")
+                elif number < len(pdos):
                     self._pdos_before.setdefault(found.name, found)
                     write_record(self._access, pdos[number])
                 elif not found.cob_id & NOT_VALID:
                     self._pdos_before.setdefault(found.name, found)
-                    switch_off(self._access, found)  # a drive's default PDOs would come between ours
+                    # A drive's default PDOs would come between ours.
+                    write_record(self._access, replace(found, cob_id=found.cob_id | NOT_VALID))
         self._pdos = wanted[Direction.TPDO] + wanted[Direction.RPDO]
 
     def set_mode(self, within_s: float) -> None:
-        """Select profile position mode, and wait until 6061h shows it.
-
-        Raises:
-            StateRefused: it does not show it in time.
-            ObjectAccessError: refused or not answered.
-        """
+        """Select profile position mode, and wait until 6061h shows it; StateRefused where it does not in time."""
         access = self._access
         if self._mode is None:
             self._mode = access.read(MODE_OF_OPERATION)
@@ -111,18 +192,13 @@ class AxisSetup:
                 raise StateRefused(self._axis, "profile position mode (1)", found, access.read(STATUSWORD))
             self._link.pass_time()
 
-    def stop_watching(self) -> None:
-        """Restore the objects of the guard."""
-        if self.guard is not None:
-            disarm(self._access, self.guard)
-
     def restoring(self) -> Iterator[Callable[[], object]]:
         """Yield the steps that restore all settings; the heartbeat last."""
         for record in self._pdos_before.values():
-            yield partial(restore, self._access, record)
+            yield partial(write_record, self._access, record)
         if self._mode is not None:
             yield partial(self._access.write, MODE_OF_OPERATION, self._mode)
-        yield self.stop_watching
+        yield self.guard.disarm
         if self._heartbeat_ms is not None:
             yield partial(self._access.write, HEARTBEAT_TIME, self._heartbeat_ms)
 
@@ -131,9 +207,7 @@ class AxisSetup:
         profile = self._axis.profile
         return {
             "node_id": self._axis.node_id,
-            "vendor_id": identity.vendor_id,
-            "product_code": identity.product_code,
-            "serial": identity.serial,
+            **asdict(identity),
             "profile": profile.name,
             # The recorded current: without both, a gain of this log cannot be compared with another's.
             "amplitude": profile.amplitude.value,
@@ -144,7 +218,7 @@ class AxisSetup:
             "rated_current_a": scale.rated_current_a,
             "rated_torque_nm": scale.rated_torque_nm,
             "scale_warnings": list(scale.warnings),
-            "guard": "none" if self.guard is None else self.guard.describe(silence_ms),
+            "guard": self.guard.describe(silence_ms),
             "mode_before": self._mode,
             "mapping": [str(record) for record in self._pdos],
             "mapping_before": [str(record) for record in self._pdos_before.values()],

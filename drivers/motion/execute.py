@@ -33,7 +33,7 @@ from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync
 
 _LAYOUTS = tuple(map(layout, SETPOINT_PDOS))
-_ENABLED = Command.ENABLE_OPERATION
+_NEW_SETPOINT = Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,42 +93,36 @@ def execute(
         yield from walk.enable(permission.granted_by)
         for number, move in enumerate(moves):
             yield from walk.move(number, move)
-        problems = yield from walk.stop()
-        if not problems:  # amplifiers without confirmed standstill go on watching us
+        yield from walk.stop()
+        if not walk.problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
-            walk.ended_by(error)
-            problems = _drain(walk.stop())
-            if not problems:
+            walk.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
+            try:
+                for _ in walk.stop():
+                    pass
+            except BaseException as cut:
+                cut.add_note(f"{WHILE}stopping: the stop was cut short")
+                raise
+            if not walk.problems:
                 network.unguard()
-        for problem in problems:
+        for problem in walk.problems:
             error.add_note(f"{WHILE}stopping: {problem}")
         raise
-    if problems:
-        for problem in problems[1:]:
-            problems[0].add_note(f"{WHILE}stopping: {problem}")
-        raise problems[0]
+    for problem in walk.problems[1:]:
+        walk.problems[0].add_note(f"{WHILE}stopping: {problem}")
+    if walk.problems:
+        raise walk.problems[0]
     stream.check()  # faults during the stop
-
-
-def _drain(stop: Generator[Sample, None, list[DriverError]]) -> list[DriverError]:
-    while True:
-        try:
-            next(stop)
-        except StopIteration as end:
-            problems: list[DriverError] = end.value
-            return problems
-        except BaseException as cut:
-            cut.add_note(f"{WHILE}stopping: the stop was cut short")
-            raise
 
 
 class _Walk:
     """One run of ``execute``: the stream, the last sample and the last command of each axis."""
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
+        self.problems: list[DriverError] = []  #: Failures to confirm the last stop
         self._network = network
         self._stream = stream
         self._bounds = bounds
@@ -141,10 +135,6 @@ class _Walk:
     def _cycles(self, seconds: float) -> int:
         return max(1, round(seconds * 1e9 / self._stream.pacing.period_ns))
 
-    def _next(self) -> Sample:
-        self._sample = next(self._stream)
-        return self._sample
-
     def _state(self, axis: int) -> State:
         return decode(self._sample.statusword[axis])
 
@@ -153,17 +143,17 @@ class _Walk:
         command = (controlword, self._targets[axis])
         if repeat or self._sent[axis] != command:
             self._sent[axis] = command
-            self._stream.send((_frame(self._nodes[axis].node_id, 0, controlword, self._targets[axis]),))
+            self._stream.outgoing.append(_frame(self._nodes[axis].node_id, 0, *command))
 
-    def _emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
+    def emit(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         self._stream.emit(CellEvent(self._stream.time_ns, axis, kind, code, text))
 
     def enable(self, granted_by: str) -> Iterator[Sample]:
         """Bring all axes to OPERATION ENABLED, each holding where it is."""
-        self._emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
+        self.emit(None, EventKind.STATE, 0, f"enabling all axes, permission by {granted_by}")
         for axis in self._axes:
             if self._state(axis) in (State.FAULT, State.FAULT_REACTION_ACTIVE):
-                self._refuse(axis)
+                raise self._refusal(axis)
         for cycle in range(self._cycles(self._bounds.enable_s)):
             waiting = [axis for axis in self._axes if self._state(axis) is not State.OPERATION_ENABLED]
             if not waiting:
@@ -171,17 +161,17 @@ class _Walk:
             for axis in waiting:
                 # A target that is not the position would be a jump on enabling.
                 self._targets[axis] = self._sample.position_counts[axis]
-                self._send_command(
-                    axis, next_command(self._state(axis), Goal.OPERATION_ENABLED), repeat=cycle % 10 == 0
-                )
-            yield self._next()
+                command = next_command(self._state(axis), Goal.OPERATION_ENABLED)
+                self._send_command(axis, command, repeat=cycle % 10 == 0)
+            self._sample = next(self._stream)
+            yield self._sample
         for axis in self._axes:
             if self._state(axis) is not State.OPERATION_ENABLED:
-                self._refuse(axis)
+                raise self._refusal(axis)
 
-    def _refuse(self, axis: int) -> None:
+    def _refusal(self, axis: int) -> StateRefused:
         word = self._sample.statusword[axis]
-        raise StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
+        return StateRefused(self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word)
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:
         """Make one move of all axes with a distance to go, and the dwell after it."""
@@ -191,22 +181,26 @@ class _Walk:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
             velocity, acceleration = move.velocity_counts_s[axis], move.acceleration_counts_s2[axis]
             node_id = self._nodes[axis].node_id
-            self._stream.send((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
+            self._stream.outgoing.extend((_frame(node_id, 1, velocity, acceleration), _frame(node_id, 2, acceleration)))
             yield self._checked()
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
-            self._send_command(axis, Command.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY)
+            self._send_command(axis, _NEW_SETPOINT)
         sample = self._checked()
-        self._emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
+        self.emit(None, EventKind.MOVE_START, number, f"move {number} to {move.target_counts}")
         yield sample
         yield from self._handshake(number, moving)
-        durations = move.duration_s(start)
-        allowed = 2 * max(durations) + self._bounds.settle_s
+        allowed = 2 * max(move.duration_s(start)) + self._bounds.settle_s
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed)):
             for axis in data.frozen(self._sample):
                 if not self._arrived(axis, start[axis]):  # a stiff axis may be there before its profile ends
-                    self._freeze(number, axis)
+                    position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
+                    reason = f"move {number}: position {position} and current {current} do not change during the move"
+                    remedy = "is its data frozen, its encoder or its motor cable off?"
+                    error = DriveFault(self._nodes[axis], reason, remedy=remedy)
+                    self.emit(axis, EventKind.FROZEN, number, str(error))
+                    raise error
             if all(self._arrived(axis, start[axis]) for axis in moving):
                 break
             yield self._checked()
@@ -214,36 +208,23 @@ class _Walk:
             late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
             if late:
                 raise self._timeout(number, late, allowed)
-        self._emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
+        self.emit(None, EventKind.MOVE_END, number, f"move {number} ended at {self._sample.position_counts}")
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
-    def _freeze(self, number: int, axis: int) -> None:
-        position, current = self._sample.position_counts[axis], self._sample.current_raw[axis]
-        error = DriveFault(
-            self._nodes[axis],
-            f"move {number}: position {position} and current {current} do not change during the move",
-            remedy="is its data frozen, its encoder or its motor cable off?",
-        )
-        self._emit(axis, EventKind.FROZEN, number, str(error))
-        raise error
-
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
         """Set and clear the new set-point of all axes, each with the same SYNC, and wait for the acknowledgements."""
-        rising = _ENABLED | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
-        bound = self._cycles(self._bounds.acknowledge_s)
-        for wanted, controlword in ((STATUS_SETPOINT_ACKNOWLEDGE, rising), (0, int(_ENABLED))):
+        bit = STATUS_SETPOINT_ACKNOWLEDGE
+        for wanted, controlword in ((bit, _NEW_SETPOINT), (0, int(Command.ENABLE_OPERATION))):
             waiting = list(moving)
-            for _ in range(bound):
+            for _ in range(self._cycles(self._bounds.acknowledge_s)):
                 for axis in waiting:
                     # Repeated every cycle until acknowledged: some drives act on the second controlword only.
                     self._send_command(axis, controlword, repeat=True)
                 if not waiting:
                     break
                 yield self._checked()
-                waiting = [
-                    axis for axis in moving if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE != wanted
-                ]
+                waiting = [axis for axis in moving if self._sample.statusword[axis] & bit != wanted]
             if waiting:
                 raise self._timeout(number, tuple(waiting), self._bounds.acknowledge_s)
 
@@ -257,7 +238,7 @@ class _Walk:
 
     def _checked(self) -> Sample:
         """Return the next sample, in which all axes are still enabled."""
-        sample = self._next()
+        sample = self._sample = next(self._stream)
         for axis in self._axes:
             if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
                 word = sample.statusword[axis]
@@ -265,15 +246,11 @@ class _Walk:
                 raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word)
         return sample
 
-    def ended_by(self, error: BaseException) -> None:
-        """Log why the moves ended early."""
-        self._emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
-
-    def stop(self) -> Generator[Sample, None, list[DriverError]]:
-        """Quick stop all axes, then remove their power; returns the failures to confirm it."""
-        self._stream.drop_outgoing()  # a set-point that was not sent yet must not start a move now
-        self._emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
-        problems: list[DriverError] = []
+    def stop(self) -> Iterator[Sample]:
+        """Quick stop all axes, then remove their power; failures to confirm it are in `problems`."""
+        self._stream.outgoing.clear()  # a set-point that was not sent yet must not start a move now
+        self.emit(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        self.problems = []
         unconfirmed = tuple(self._axes)
         try:
             unconfirmed = yield from self._stop_by_pdo()
@@ -281,35 +258,34 @@ class _Walk:
             self._stream.read_on(self._stream.pacing.period_ns * 1e-9)
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped by SDO.
-            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
-            problems.append(error)
+            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}")
+            self.problems.append(error)
         try:
-            silent = self._network.find_silent([self._network.axes[axis] for axis in unconfirmed])
+            silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
         except DriverError as error:
-            self._emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            return problems or [error]
+            self.emit(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            self.problems = self.problems or [error]
+            return
         if silent is not None:
-            problems.append(silent)
+            self.problems.append(silent)
         heard = [axis for axis in unconfirmed if silent is None or self._nodes[axis].node_id not in silent.node_ids]
         if heard:
-            self._network.begin_stop([self._network.axes[axis] for axis in heard])
+            self._network.begin_stop([self._nodes[axis] for axis in heard])
         for axis in unconfirmed:
             if axis not in heard:
                 text = f"{node_label(self._nodes[axis])} does not answer: its standstill is not confirmed"
-                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
                 continue
             try:
-                self._network.disable(self._network.axes[axis])
+                self._network.disable(self._nodes[axis])
             except DriverError as error:
-                self._emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
-                problems.append(error)
-        return problems
+                self.emit(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], str(error))
+                self.problems.append(error)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the stop."""
         still, rest = [0] * len(self._sent), list(self._sample.position_counts)
-        silent = 0
-        powered = list(self._axes)
+        silent, powered = 0, list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
             for axis in powered:
                 state = self._state(axis)
@@ -325,9 +301,8 @@ class _Walk:
                 still[axis] = still[axis] + 1 if near and known else 0
                 rest[axis] = rest[axis] if near else position
             silent = silent + 1 if self._sample.missing else 0
-            powered = [
-                axis for axis in self._axes if self._sample.missing >> axis & 1 or self._state(axis) not in POWERLESS
-            ]
+            missing = self._sample.missing
+            powered = [axis for axis in self._axes if missing >> axis & 1 or self._state(axis) not in POWERLESS]
             lockstep_silent = self._stream.silent and isinstance(self._stream.pacing, LockstepSync)
             if not powered or silent > (0 if lockstep_silent else self._stream.max_missing_cycles):
                 break

@@ -41,13 +41,24 @@ class Move:
     dwell_cycles: int = 0
 
     def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
-        """Return the time that each axis needs from these positions, with the profile's whole numbers."""
+        """Return the time that each axis needs from these positions."""
         return tuple(
-            trapezoid_duration_s(abs(target - start), velocity, acceleration) if target != start else 0.0
-            for start, target, velocity, acceleration in zip(
-                start_counts, self.target_counts, self.velocity_counts_s, self.acceleration_counts_s2, strict=True
+            self.path(axis, start).duration_s if self.target_counts[axis] != start else 0.0
+            for axis, start in enumerate(start_counts)
+        )
+
+    def path(self, axis: int, start_counts: int) -> Trapezoid:
+        """Return the way of one axis from a position, with the profile's whole numbers [counts]."""
+        start, end, velocity, acceleration = (
+            np.array([float(number)])
+            for number in (
+                start_counts,
+                self.target_counts[axis],
+                self.velocity_counts_s[axis],
+                self.acceleration_counts_s2[axis],
             )
         )
+        return synchronised(start, end, velocity, acceleration)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +72,6 @@ class MotionPermission:
 
     granted_by: str
     limits: tuple[AxisLimits, ...]
-
-
-def trapezoid_duration_s(distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float) -> float:
-    """Return the duration of a trapezoid, or of a triangle when the velocity is not reached [s]."""
-    if distance_counts * acceleration_counts_s2 < velocity_counts_s**2:
-        return 2.0 * math.sqrt(distance_counts / acceleration_counts_s2)
-    return distance_counts / velocity_counts_s + velocity_counts_s / acceleration_counts_s2
 
 
 def synchronised_move(
@@ -110,7 +114,14 @@ def check_moves(
         raise MotionRefused("the permission names no operator: set granted_by")
     if len(permission.limits) != len(names):
         raise MotionRefused(f"the permission has limits for {len(permission.limits)} axes, the cell has {len(names)}")
-    _check_positions("starts at", start_counts, permission, names)
+
+    def check_positions(event: str, positions: Sequence[int]) -> None:
+        for name, position, limit in zip(names, positions, permission.limits, strict=True):
+            if not limit.position_min_counts <= position <= limit.position_max_counts:
+                allowed = f"{limit.position_min_counts} to {limit.position_max_counts} counts"
+                raise MotionRefused(f"{name}: {event} {position} counts, allowed is {allowed}")
+
+    check_positions("starts at", start_counts)
     here = tuple(start_counts)
     for number, move in enumerate(moves):
         where = f"move {number}"
@@ -119,7 +130,7 @@ def check_moves(
             raise MotionRefused(f"{where}: has {tuple(map(len, profiles))} values, the cell has {len(names)} axes")
         if move.dwell_cycles < 0:
             raise MotionRefused(f"{where}: dwells for {move.dwell_cycles} cycles")
-        _check_positions(f"{where} goes to", move.target_counts, permission, names)
+        check_positions(f"{where} goes to", move.target_counts)
         for axis, limit in enumerate(permission.limits):
             if move.target_counts[axis] == here[axis]:
                 continue
@@ -132,13 +143,6 @@ def check_moves(
                         f"{where}: {names[axis]}: {quantity} {value}, allowed is above 0 up to {allowed:g}"
                     )
         here = move.target_counts
-
-
-def _check_positions(event: str, positions: Sequence[int], permission: MotionPermission, names: Sequence[str]) -> None:
-    for name, position, limit in zip(names, positions, permission.limits, strict=True):
-        if not limit.position_min_counts <= position <= limit.position_max_counts:
-            allowed = f"{limit.position_min_counts} to {limit.position_max_counts} counts"
-            raise MotionRefused(f"{name}: {event} {position} counts, allowed is {allowed}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +183,7 @@ class Trapezoid:
 
 
 def synchronised(
-    start: FloatArray,
-    end: FloatArray,
-    velocity_limit: FloatArray,
-    acceleration_limit: FloatArray,
+    start: FloatArray, end: FloatArray, velocity_limit: FloatArray, acceleration_limit: FloatArray
 ) -> Trapezoid:
     """Return the fastest trapezoid within the limits of every axis in which all axes end together.
 

@@ -6,9 +6,10 @@ ways: neither position nor current of a moving axis changes by one count, or an 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+
+import numpy as np
 
 from drivers.canopen.link import HEARTBEAT, SDO_REQUEST, NmtState, command_name, nmt_name
 from drivers.canopen.network import CanopenNetwork
@@ -30,61 +31,30 @@ LIMIT_S = 0.5
 _WATCHED_BITS = STATE_BITS | STATUS_FOLLOWING_ERROR
 
 
-def travel_counts(
-    distance_counts: float, velocity_counts_s: float, acceleration_counts_s2: float, time_s: float
-) -> float:
-    """Return the distance of a symmetric trapezoid (or triangle) from rest after a time [counts]."""
-    velocity = min(velocity_counts_s, math.sqrt(distance_counts * acceleration_counts_s2))
-    ramp_s = velocity / acceleration_counts_s2
-    duration_s = distance_counts / velocity + ramp_s
-    time_s = min(max(time_s, 0.0), duration_s)
-    rising, falling = min(time_s, ramp_s), max(time_s - (duration_s - ramp_s), 0.0)
-    return (
-        velocity * time_s
-        - 0.5 * velocity * ramp_s
-        + 0.5 * acceleration_counts_s2 * ((ramp_s - rising) ** 2 - falling**2)
-    )
-
-
 class FrozenData:
-    """Finds moving axes whose data do not change; made when the set-points of a move are sent.
-
-    Args:
-        move: in progress.
-        start_counts: positions at its start.
-        axes: indices of the moving axes.
-        period_ns: of the samples.
-    """
+    """Finds moving axes whose data do not change; made when the set-points of a move are sent, from these positions."""
 
     def __init__(self, move: Move, start_counts: Sequence[int], axes: Sequence[int], period_ns: int) -> None:
-        self._profiles = {
-            axis: (
-                float(abs(move.target_counts[axis] - start_counts[axis])),
-                float(move.velocity_counts_s[axis]),
-                float(move.acceleration_counts_s2[axis]),
-            )
-            for axis in axes
-        }
+        self._paths = {axis: move.path(axis, start_counts[axis]) for axis in axes}
         self._period_s = period_ns * 1e-9
         self._begin: int | None = None
         self._last: dict[int, tuple[int, int, int]] = {}
 
     def frozen(self, sample: Sample) -> tuple[int, ...]:
         """Return the axes whose values have not changed for too long; takes every sample once."""
-        if self._begin is None:
-            self._begin = sample.cycle
+        self._begin = sample.cycle if self._begin is None else self._begin
         found = []
-        for axis, profile in self._profiles.items():
+        for axis, path in self._paths.items():
             values = (sample.position_counts[axis], sample.current_raw[axis])
             last = self._last.get(axis)
             if last is None or last[:2] != values or sample.missing >> axis & 1:
                 self._last[axis] = (*values, sample.cycle)
                 continue
             since_s, now_s = ((cycle - self._begin) * self._period_s for cycle in (last[2], sample.cycle))
-            if now_s - since_s >= FROZEN_S and travel_counts(*profile, now_s) - travel_counts(*profile, since_s) >= (
-                FROZEN_COUNTS
-            ):
-                found.append(axis)
+            if now_s - since_s >= FROZEN_S:
+                positions, _, _ = path.at(np.array([since_s, now_s]))
+                if abs(positions[1, 0] - positions[0, 0]) >= FROZEN_COUNTS:
+                    found.append(axis)
         return tuple(found)
 
 
@@ -100,16 +70,10 @@ class ToggleBits:
         # For each axis: the bit, the time of its last change, cycles since, whether that was reported.
         self._last: dict[int, tuple[int, int, int, bool]] = {}
 
-    def __bool__(self) -> bool:
-        return bool(self._bits)
-
     def stale(self, time_ns: int, statuswords: Sequence[int], missing: int) -> Iterator[tuple[int, int, DriveFault]]:
         """Yield (index, bit, fault) of each axis whose bit has not toggled for too long; call in every cycle.
 
-        Args:
-            time_ns: of the samples.
-            statuswords: of all axes.
-            missing: bit i is set when axis i did not answer; its interval then starts anew.
+        The interval of a missing axis (bit i for axis i) starts anew.
         """
         for axis, node, bit, allowed_ns in self._bits:
             if missing >> axis & 1:
@@ -123,23 +87,17 @@ class ToggleBits:
             stale = cycles + 1 >= STALE_PERIODS and time_ns - since_ns >= allowed_ns
             self._last[axis] = (value, since_ns, cycles + 1, reported or stale)
             if stale and not reported:
-                still_ms = (time_ns - since_ns) * 1e-6
-                reason = (
-                    f"statusword bit {bit} has not toggled for {cycles + 1} cycles, {still_ms:g} ms; its data are old"
-                )
+                still = f"{cycles + 1} cycles, {(time_ns - since_ns) * 1e-6:g} ms"
+                reason = f"statusword bit {bit} has not toggled for {still}; its data are old"
                 remedy = "restart the drive, and check toggle_bit and update_period_us of its profile"
                 yield axis, bit, DriveFault(node, reason, remedy=remedy)
 
 
 class Watch:
-    """Last reports of a network's drives.
-
-    Attributes:
-        faults: not raised yet, in the order in which they were seen.
-    """
+    """Last reports of a network's drives."""
 
     def __init__(self, network: CanopenNetwork, on_event: EventSink) -> None:
-        self.faults: deque[DriverError] = deque()
+        self.faults: deque[DriverError] = deque()  #: Not raised yet, in the order in which they were seen
         self._network = network
         self._link = network.link
         self._on_event = on_event
@@ -153,24 +111,25 @@ class Watch:
         self._toggle_bits = ToggleBits(network.axes)
 
     def cycle(self, time_ns: int, clock_ns: int, statuswords: tuple[int, ...], missing: int) -> None:
-        """Process one cycle.
-
-        Args:
-            time_ns: of the samples.
-            clock_ns: by the clock.
-            statuswords: of all axes.
-            missing: bit i is set when axis i did not answer this cycle.
-        """
-        if self._link.has_events:
-            self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
+        """Process one cycle: its time in the samples and by the clock, statuswords, and bit i for a missing axis i."""
+        self.note_events(time_ns)  # first: an EMCY has the cause, the statusword only the state
         if self._unheard or statuswords != self._statuswords:
             self._note_statuswords(time_ns, statuswords, missing)
-        if self._limited_since_ns:
-            self._check_limits(time_ns)
-        if self._toggle_bits:
-            for axis, bit, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
-                self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, bit, str(stale)))
-                self.faults.append(stale)
+        for axis, since_ns in tuple(self._limited_since_ns.items()):
+            word = self._statuswords[axis]
+            if decode(word) is not State.OPERATION_ENABLED:
+                self._limited_since_ns[axis] = time_ns  # a limit without motion is no reason to stop
+            elif (active_ns := time_ns - since_ns) > LIMIT_S * 1e9:
+                del self._limited_since_ns[axis]
+                node = self._network.axes[axis]
+                text = f"{node.name}: a limit has been active for {active_ns * 1e-9:.3f} s"
+                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
+                reason = f"a limit has been active for {LIMIT_S:g} s, statusword {word:#06x}"
+                remedy = "check limit switches, position, speed and current limits, or use slower moves"
+                self.faults.append(DriveFault(node, reason, word, remedy=remedy))
+        for axis, bit, stale in self._toggle_bits.stale(time_ns, statuswords, missing):
+            self._on_event(CellEvent(time_ns, axis, EventKind.FROZEN, bit, str(stale)))
+            self.faults.append(stale)
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
             self._check_heartbeats(time_ns, clock_ns)
@@ -203,20 +162,6 @@ class Watch:
                     self._limited_since_ns[axis] = time_ns
                 else:
                     self._limited_since_ns.pop(axis, None)
-
-    def _check_limits(self, time_ns: int) -> None:
-        for axis, since_ns in tuple(self._limited_since_ns.items()):
-            word = self._statuswords[axis]
-            if decode(word) is not State.OPERATION_ENABLED:
-                self._limited_since_ns[axis] = time_ns  # a limit without motion is no reason to stop
-            elif (active_ns := time_ns - since_ns) > LIMIT_S * 1e9:
-                del self._limited_since_ns[axis]
-                node = self._network.axes[axis]
-                text = f"{node.name}: a limit has been active for {active_ns * 1e-9:.3f} s"
-                self._on_event(CellEvent(time_ns, axis, EventKind.LIMIT, word, text))
-                reason = f"a limit has been active for {LIMIT_S:g} s, statusword {word:#06x}"
-                remedy = "check limit switches, position, speed and current limits, or use slower moves"
-                self.faults.append(DriveFault(node, reason, word, remedy=remedy))
 
     def note_events(self, time_ns: int) -> None:
         """Report the events of the nodes since the last cycle, at a time of the samples."""

@@ -39,15 +39,10 @@ POWERLESS = (State.SWITCH_ON_DISABLED, State.NOT_READY_TO_SWITCH_ON, State.FAULT
 STATE_BITS = 0x6F  #: Bits of the statusword that encode the state
 
 
-def _match(statusword: int) -> State:
-    for state in State:
-        mask, pattern = state.value
-        if statusword & mask == pattern:
-            return state
-    return State.UNKNOWN
-
-
-_STATES = tuple(_match(bits) for bits in range(STATE_BITS + 1))  # six decodes a SYNC: a table, not a search
+_STATES = tuple(  # six decodes a SYNC: a table, not a search
+    next((state for state in State if bits & state.value[0] == state.value[1]), State.UNKNOWN)
+    for bits in range(STATE_BITS + 1)
+)
 
 
 def decode(statusword: int) -> State:
@@ -75,22 +70,23 @@ class Goal(Enum):
     QUICK_STOP = "quick stop"
 
 
-_ENABLING = {
-    State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
-    State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
-    State.SWITCHED_ON: Command.ENABLE_OPERATION,
-    State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
-}
-_DISABLING = {
+_PATHS = {
+    Goal.OPERATION_ENABLED: {
+        State.SWITCH_ON_DISABLED: Command.SHUTDOWN,
+        State.READY_TO_SWITCH_ON: Command.SWITCH_ON,
+        State.SWITCHED_ON: Command.ENABLE_OPERATION,
+        State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
+    },
     # One step at a time: voltage is removed only after the drive has stopped and its brake could close.
-    State.OPERATION_ENABLED: Command.DISABLE_OPERATION,
-    State.SWITCHED_ON: Command.SHUTDOWN,
+    Goal.SWITCH_ON_DISABLED: {
+        State.OPERATION_ENABLED: Command.DISABLE_OPERATION,
+        State.SWITCHED_ON: Command.SHUTDOWN,
+    },
+    Goal.QUICK_STOP: {
+        State.OPERATION_ENABLED: Command.QUICK_STOP,
+        State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
+    },
 }
-_STOPPING = {
-    State.OPERATION_ENABLED: Command.QUICK_STOP,
-    State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
-}
-_PATHS = {Goal.OPERATION_ENABLED: _ENABLING, Goal.SWITCH_ON_DISABLED: _DISABLING, Goal.QUICK_STOP: _STOPPING}
 
 
 def next_command(state: State, goal: Goal) -> Command:

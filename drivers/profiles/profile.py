@@ -45,11 +45,6 @@ class Basis(Enum):
     NOTES = "notes"
     ASSUMED = "assumed"
 
-    @property
-    def verified(self) -> bool:
-        """Whether it was read in a text of the manufacturer."""
-        return self in (Basis.EDS, Basis.MANUAL)
-
 
 class Mapping(Enum):
     """Effect of a drive's save on PDO mappings."""
@@ -108,11 +103,7 @@ class CurrentScale:
     weights: tuple[float, ...] = (1.0,)
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
-        """Return the scale for the values of the objects and of the switch.
-
-        Raises:
-            IndexError: the switch has no such value.
-        """
+        """Return the scale for the values of the objects and of the switch; IndexError for an unknown one."""
         if not 0 <= choice < len(self.weights):
             raise IndexError(choice)
         return self.factor * math.prod(values) * self.weights[choice]
@@ -122,18 +113,18 @@ class CurrentScale:
 class RatedMotor:
     """Objects of the motor's name plate in a drive, against which ampere values are checked."""
 
-    current: ObjectEntry  #: rated current and its unit (6075h: 1e-3)
-    ampere_per_unit: float = 1e-3  #: rated current and its unit (6075h: 1e-3)
-    torque: ObjectEntry | None = None  #: rated torque and its unit (6076h: 1e-3); None where the drive has none
-    newton_metre_per_unit: float = 1e-3  #: rated torque and its unit (6076h: 1e-3); None where the drive has none
+    current: ObjectEntry  #: rated current
+    ampere_per_unit: float = 1e-3  #: its unit (6075h: 1e-3)
+    torque: ObjectEntry | None = None  #: rated torque; None where the drive has none
+    newton_metre_per_unit: float = 1e-3  #: its unit (6076h: 1e-3)
 
 
 @dataclass(frozen=True, slots=True)
 class Save:
     """Command that saves a drive's parameters."""
 
-    command: ObjectEntry  #: object, and the value to write to it ("save" of CiA 301)
-    signature: int  #: object, and the value to write to it ("save" of CiA 301)
+    command: ObjectEntry  #: object to write
+    signature: int  #: its value ("save" of CiA 301)
     mapping: Mapping  #: whether it saves PDO mappings too; those of a recording must then be restored before
 
 
@@ -189,11 +180,6 @@ class DriveProfile:
             TapPoint.ACTUAL: "ACTUAL current",
         }
         return f"{words[self.tap]} {self.current}"
-
-    @property
-    def unverified(self) -> tuple[Fact, ...]:
-        """Facts that were not read in a text of the manufacturer."""
-        return tuple(fact for fact in self.facts if not fact.basis.verified)
 
 
 CIA402 = DriveProfile(
@@ -278,11 +264,6 @@ class Parameter:
         """The object as it goes over the bus: its bits as an unsigned word."""
         return ObjectEntry(self.index, self.subindex, self.kind.bits, signed=False)
 
-    @property
-    def whole(self) -> bool:
-        """Whether it holds integers only."""
-        return self.kind is not ParameterKind.F32
-
     def word(self, value: float) -> int:
         """Return the bits of the nearest number that it can hold.
 
@@ -292,7 +273,7 @@ class Parameter:
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for {self}")
         try:
-            data = struct.pack(_CODES[self.kind], round(value) if self.whole else value)
+            data = struct.pack(_CODES[self.kind], value if self.kind is ParameterKind.F32 else round(value))
         except (struct.error, OverflowError) as error:
             raise ValueError(f"{value:g} does not fit {self.kind.value} {self}") from error
         return int.from_bytes(data, "little")

@@ -42,33 +42,37 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
             range or the resolution of the current object.
         ObjectAccessError: a scale object cannot be read.
     """
-    scale = profile.current_scale
+
+    def implausible(found: str, expected: str, remedy: str) -> SetupRefused:
+        return _implausible(access, profile.name, found, expected, remedy)
+
+    scale, entry = profile.current_scale, profile.current
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
-            raise _implausible(
-                access,
-                profile.name,
-                f"{name} = {value}",
-                "the motor's rated value",
-                "the drive was not set up for its motor, and its current has no scale: enter the motor's name plate",
-            )
+            remedy = "the drive was not set up for its motor; its current has no scale: enter the motor's name plate"
+            raise implausible(f"{name} = {value}", "the motor's rated value", remedy)
     choice = 0 if scale.switch is None else access.read(scale.switch)
     try:
         ampere = scale.ampere_per_unit(tuple(values.values()), choice)
     except IndexError as error:
-        raise _implausible(
-            access,
-            profile.name,
-            f"{scale.switch} = {choice}",
-            f"0 to {len(scale.weights) - 1}",
-            "this firmware scales its current in a way that is not in the profile; complete the profile",
-        ) from error
+        remedy = "this firmware scales its current in a way that is not in the profile; complete the profile"
+        raise implausible(f"{scale.switch} = {choice}", f"0 to {len(scale.weights) - 1}", remedy) from error
     if scale.switch is not None:
         values[str(scale.switch)] = choice
     rated_a, rated_nm, warnings = _name_plate(access, profile)
     if rated_a is not None:
-        _check_rated(access, profile, ampere, rated_a)
+        if not SMALLEST_RATED_A <= rated_a <= LARGEST_RATED_A:
+            expected = f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A"
+            remedy = "was it entered in another unit than the drive's manual says?"
+            raise implausible(f"a rated current of {rated_a:g} A", expected, remedy)
+        steps, most = rated_a / ampere, 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
+        if not MIN_STEPS <= steps <= most:
+            raise implausible(
+                f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
+                f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
+                "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
+            )
     return ScaleReading(access.node_id, access.name, profile.name, ampere, values, rated_a, rated_nm, warnings)
 
 
@@ -76,8 +80,7 @@ def check_name_plate(reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a
     """Compare the drive's Kt = rated torque / rated current with the cell's, |nameplate gain / N|.
 
     Args:
-        reading: of the drive.
-        amplitude: of its profile.
+        reading, amplitude: of the drive, and of its profile.
         motor_nm_per_a: torque constant of the motor by the cell configuration [Nm/A], sign irrelevant.
 
     Returns:
@@ -128,24 +131,3 @@ def _name_plate(access: ObjectAccess, profile: DriveProfile) -> tuple[float | No
 
 def _implausible(node: Node, profile: str, found: str, expected: str, remedy: str) -> SetupRefused:
     return SetupRefused(node, f"profile {profile}: found {found}; expected {expected}; {remedy}")
-
-
-def _check_rated(node: Node, profile: DriveProfile, ampere: float, rated_a: float) -> None:
-    if not SMALLEST_RATED_A <= rated_a <= LARGEST_RATED_A:
-        raise _implausible(
-            node,
-            profile.name,
-            f"a rated current of {rated_a:g} A",
-            f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A",
-            "was it entered in another unit than the drive's manual says?",
-        )
-    steps, entry = rated_a / ampere, profile.current
-    most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
-    if not MIN_STEPS <= steps <= most:
-        raise _implausible(
-            node,
-            profile.name,
-            f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
-            f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
-            "the scale is not this drive's, or the rated current is not its motor's: check profile and set-up",
-        )

@@ -6,6 +6,7 @@ answer only by waiting for both. After a missing frame this is done for one cycl
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from struct import Struct
@@ -72,20 +73,12 @@ def slots_of(axes: Sequence[Axis]) -> dict[int, Slot]:
 
 
 class Answers:
-    """Assigns answers to cycles and counts them.
-
-    Attributes:
-        slots: by COB-ID.
-        values: last value of each column.
-        seen: bits of the slots that answered the last cycle.
-        frames, missing, late, duplicate: as StreamStatistics.
-    """
+    """Assigns answers to cycles and counts them."""
 
     def __init__(self, axes: Sequence[Axis]) -> None:
-        self.slots = slots_of(axes)
-        self.values = [0] * (3 * len(axes))
-        self.seen = 0
-        self.frames = self.missing = self.late = self.duplicate = 0
+        self.slots = slots_of(axes)  #: By COB-ID
+        self.values = [0] * (3 * len(axes))  #: Last value of each column
+        self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1
         self._debt = 0  # slots whose answer to an earlier SYNC may still come
         self._open_debt = self._now = 0
@@ -111,9 +104,9 @@ class Answers:
             if self._open_debt & slot.bit:
                 # The first one was the late answer to an earlier SYNC, this one belongs to the current SYNC.
                 self._open_debt &= ~slot.bit
-                self.late += 1
+                self.counts["late"] += 1
             else:
-                self.duplicate += 1
+                self.counts["duplicate"] += 1
                 if self._last_data.get(identifier) == data:
                     return
                 # The second answer differs: the first may have been a repetition of the cycle before.
@@ -126,20 +119,19 @@ class Answers:
         """Count an answer that is read before the next SYNC, and so belongs to none that is open."""
         if self._debt & slot.bit:
             self._debt &= ~slot.bit
-            self.late += 1
+            self.counts["late"] += 1
         else:
-            self.duplicate += 1
+            self.counts["duplicate"] += 1
 
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
-        self.seen = self._now
         # With one answer and a debt at the end, the owed frame was lost for good, and the answer is this cycle's.
         self._debt = self._all & ~self._now
-        self.frames += self._now.bit_count()
+        self.counts["frames"] += self._now.bit_count()
         absent = 0
         if self._debt:
             for slot in self.slots.values():
                 if self._debt & slot.bit:
                     absent |= 1 << slot.axis
-                    self.missing += 1
+                    self.counts["missing"] += 1
         return absent

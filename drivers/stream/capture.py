@@ -19,7 +19,6 @@ import sys
 import time
 from contextlib import suppress
 from enum import IntEnum
-from typing import NamedTuple
 
 SO_RXQ_OVFL, SCM_TIMESTAMPNS, SO_MEMINFO = 40, 35, 55  # asm-generic/socket.h
 MSG_OWN, MSG_LOCAL = 0x800, 0x4
@@ -30,7 +29,7 @@ IDLE_MS = 20  #: Silence after which losses are reported without a following fra
 LOOK_NS = 200_000_000  #: Time between two checks of the interface's own counters, and of the parent's process id
 INTERFACE_COUNTERS = ("rx_dropped", "rx_over_errors", "rx_missed_errors")
 """Frames that were lost before any socket: in the kernel's queue behind the driver, and in the controller."""
-_FRAME = struct.Struct("=IB3x8s")  # struct can_frame
+FRAME = struct.Struct("=IB3x8s")  #: struct can_frame
 _TIMESPEC, _U32, _MEMINFO = struct.Struct("@ll"), struct.Struct("=I"), struct.Struct("=9I")
 _DROPS = 8  # SK_MEMINFO_DROPS
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_U32.size)
@@ -45,37 +44,23 @@ class Kind(IntEnum):
     READY = 0
     FRAME = 1
     LOSSES = 2  #: Only the counts, where no frame followed that could carry them
-    END = 3  #: The last record; `can_id` is the error number
-
-
-class Record(NamedTuple):
-    """One frame, or a note of the capture process."""
-
-    kernel_ns: int  #: wall time at which the kernel received the frame [ns since 1970]
-    monotonic_ns: int  #: the same time by the monotonic clock [ns]
-    kernel_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
-    interface_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
-    backlog_dropped: int  #: frames lost so far: in the socket's buffer, before it, and in the backlog
-    can_id: int  #: identifier and flags of struct can_frame
-    kind: int  #: a Kind
-    length: int  #: of the data [bytes]
-    own: bool  #: sent by this very socket, by any program of this machine
-    local: bool  #: sent by this very socket, by any program of this machine
-    data: bytes  #: eight bytes
+    END = 3  #: The last record; its identifier is the error number
 
 
 RECORD = struct.Struct("=qqQQQIBB??8s")
+"""One frame, or a note of the capture process.
+
+Time at which the kernel received the frame, by the wall clock [ns since 1970] and by the monotonic clock [ns]; frames
+lost so far in the socket's buffer, before it, and in the backlog; identifier and flags of struct can_frame; `Kind`;
+bytes of data; whether it was sent by this very socket, and by any program of this machine; eight bytes.
+"""
 
 
 class DropCounter:
-    """The kernel's drop counter of 32 bits, continued beyond them.
-
-    Attributes:
-        total: frames dropped since the first.
-    """
+    """The kernel's drop counter of 32 bits, continued beyond them."""
 
     def __init__(self) -> None:
-        self.total = 0
+        self.total = 0  #: Frames dropped since the first
 
     def see(self, raw: int) -> int:
         """Process a reading; returns the total.
@@ -96,21 +81,16 @@ class MonotonicTime:
 
     Args:
         wall_ns, monotonic_ns: both clocks, read together; no stamp becomes older than that.
-
-    Attributes:
-        offset_ns: last known difference, wall minus monotonic time [ns].
     """
 
     def __init__(self, wall_ns: int, monotonic_ns: int) -> None:
-        self.offset_ns = wall_ns - monotonic_ns
+        self.offset_ns = wall_ns - monotonic_ns  #: Last known difference of the clocks
         self._last_ns = monotonic_ns
 
     def of(self, stamp_ns: int, wall_ns: int, monotonic_ns: int) -> int:
-        """Return the monotonic time of a stamp [ns]; never before the previous one, never after `monotonic_ns`.
+        """Return the monotonic time of a kernel's stamp [ns], from both clocks read together after the frame.
 
-        Args:
-            stamp_ns: of the kernel.
-            wall_ns, monotonic_ns: both clocks, read together after the frame.
+        It is never before the previous one, and never after `monotonic_ns`.
         """
         offset_ns = wall_ns - monotonic_ns
         found_ns = stamp_ns - offset_ns
@@ -147,14 +127,10 @@ class Capture:
         self._counters = tuple(f"/sys/class/net/{interface}/statistics/{name}" for name in INTERFACE_COUNTERS)
         self._interface_before = self._read_interface()
         self._reported_drops = (0, 0, 0)
-        self._frame = bytearray(_FRAME.size)
+        self._frame = bytearray(FRAME.size)
 
     def run(self, parent: int) -> None:
-        """Capture until the parent or the bus is gone.
-
-        Args:
-            parent: its process id.
-        """
+        """Capture until the parent, given by its process id, or the bus is gone."""
         poller = select.poll()
         poller.register(self._bus, select.POLLIN)
         poller.register(self._out, 0)
@@ -174,7 +150,11 @@ class Capture:
                     ended = True
             elif not ready:
                 self._now_ns = time.monotonic_ns()
-                self._read_drops()
+                # A frame reports the drops before it, and there may be none: ask the socket itself.
+                with suppress(OSError):  # before Linux 4.12 the next frame reports it
+                    counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
+                    if len(counters) == _MEMINFO.size:
+                        self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
             if not self.forward():
                 return
             if self._now_ns >= look_ns:
@@ -209,7 +189,7 @@ class Capture:
                     stamp_ns = seconds * 1_000_000_000 + rest_ns
                 elif level == socket.SOL_SOCKET and kind == SO_RXQ_OVFL:
                     self._drops.see(_U32.unpack(data)[0])
-            can_id, length, payload = _FRAME.unpack(self._frame)
+            can_id, length, payload = FRAME.unpack(self._frame)
             burst.append((can_id, length, payload, stamp_ns, flags))
         before_ns, wall_ns, self._now_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         now_ns = (before_ns + self._now_ns) // 2
@@ -217,29 +197,14 @@ class Capture:
             wall_ns = now_ns + self._time.offset_ns  # preempted between the readings: they do not belong together
         for can_id, length, payload, stamp_ns, flags in burst:
             monotonic_ns = self._time.of(stamp_ns or wall_ns, wall_ns, now_ns)
-            self._keep(
-                Record(
-                    stamp_ns or wall_ns,
-                    monotonic_ns,
-                    self._drops.total,
-                    self._interface_dropped,
-                    self._backlog_dropped,
-                    can_id,
-                    Kind.FRAME,
-                    length,
-                    bool(flags & MSG_OWN),
-                    bool(flags & MSG_LOCAL),
-                    payload,
-                )
-            )
+            if len(self._backlog) >= self._most_bytes:
+                self._backlog_dropped += 1
+                continue
+            self._reported_drops = self._counts
+            own, local = bool(flags & MSG_OWN), bool(flags & MSG_LOCAL)
+            head = (stamp_ns or wall_ns, monotonic_ns, *self._reported_drops)
+            self._backlog += RECORD.pack(*head, can_id, Kind.FRAME, length, own, local, payload)
         return number
-
-    def _keep(self, record: Record) -> None:
-        if len(self._backlog) >= self._most_bytes:
-            self._backlog_dropped += 1
-            return
-        self._backlog += RECORD.pack(*record)
-        self._reported_drops = (record.kernel_dropped, record.interface_dropped, record.backlog_dropped)
 
     def _note(self, kind: Kind, number: int = 0) -> None:
         """Append a note to the backlog, even when that is full: notes are few."""
@@ -259,15 +224,6 @@ class Capture:
             except (OSError, ValueError):
                 continue  # it is gone, or does not count this
         return total
-
-    def _read_drops(self) -> None:
-        """Read the socket's own drop count: a frame reports drops before it, and there may be none."""
-        try:
-            counters = self._bus.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, _MEMINFO.size)
-        except OSError:
-            return  # before Linux 4.12: then the next frame reports it
-        if len(counters) == _MEMINFO.size:
-            self._drops.see(_MEMINFO.unpack(counters)[_DROPS])
 
     def forward(self) -> bool:
         """Forward what the parent accepts without waiting; returns False when the parent is gone."""

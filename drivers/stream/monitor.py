@@ -40,9 +40,9 @@ class Source(Enum):
 class AxisReading:
     """Reading of one axis."""
 
-    position_counts: int | None  #: last values, None before the first
-    current_raw: int | None  #: last values, None before the first
-    statusword: int | None  #: last values, None before the first
+    position_counts: int | None  #: last value, None before the first
+    current_raw: int | None  #: last value, None before the first
+    statusword: int | None  #: last value, None before the first
     nmt: int | None  #: state in its last heartbeat, None before the first
     rate_hz: float  #: of complete readings since the last reading
     lost: int  #: SYNCs or requests without an answer since the monitor began
@@ -118,12 +118,7 @@ class _AxisWatch:
 
 
 class CellMonitor:
-    """Reads a bus and, where no other master is on it, reads its axes by SDO.
-
-    Args:
-        link: open; only the monitor may read it meanwhile.
-        axes: of the cell.
-    """
+    """Reads a bus and, where no other master is on it, its axes by SDO; nothing else may read the link meanwhile."""
 
     def __init__(self, link: Link, axes: tuple[Axis, ...]) -> None:
         self._link = link
@@ -154,7 +149,20 @@ class CellMonitor:
                 message = self._link.bus.recv(min(left_ns * 1e-9, READING_S / 10))
                 if message is not None:
                     self._hear(message)
-        return self._reading()
+        now_ns = clock()
+        lasted_s = max((now_ns - self._since_ns) * 1e-9, 1e-9)
+        self._since_ns = now_ns
+        axes = []
+        for axis in self._axes:
+            position, current, statusword = axis.values
+            nmt = self._link.nmt.get(axis.node_id)
+            axes.append(AxisReading(position, current, statusword, nmt, axis.readings / lasted_s, axis.lost))
+            axis.readings = 0
+        frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
+        sync_hz, self._syncs = self._syncs / lasted_s, 0
+        self._frames.clear()
+        events = self._link.take_events(now_ns, tuple(self._by_node))
+        return CellReading(self.source, lasted_s, tuple(axes), sync_hz, frames, events)
 
     def pause(self) -> None:
         """Drop open requests: other code reads the bus for a moment."""
@@ -202,20 +210,3 @@ class CellMonitor:
                 axis.followed = False
                 axis.seen.clear()
         self._master_ns = self._link.clock()
-
-    def _reading(self) -> CellReading:
-        now_ns = self._link.clock()
-        seconds = max((now_ns - self._since_ns) * 1e-9, 1e-9)
-        self._since_ns = now_ns
-        axes = []
-        for axis in self._axes:
-            position, current, statusword = axis.values
-            nmt = self._link.nmt.get(axis.node_id)
-            axes.append(AxisReading(position, current, statusword, nmt, axis.readings / seconds, axis.lost))
-            axis.readings = 0
-        frames = tuple(tuple(self._frames[bus, length] for length in range(9)) for bus in range(len(self._buses)))
-        sync_hz = self._syncs / seconds
-        self._frames.clear()
-        self._syncs = 0
-        events = self._link.take_events(now_ns, tuple(self._by_node))
-        return CellReading(self.source, seconds, tuple(axes), sync_hz, frames, events)

@@ -80,7 +80,3 @@ class CellEvent:
 
 EventSink = Callable[[CellEvent], None]
 """Receives events in the order in which they happen, before the sample of their cycle is returned."""
-
-
-def ignore_event(event: CellEvent) -> None:
-    """Discard an event: an EventSink for samples alone."""

@@ -9,19 +9,20 @@ import errno
 import os
 import select
 import socket
-import struct
 import subprocess
 import sys
 import time
+from abc import abstractmethod
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
+from operator import sub
 from pathlib import Path
+from typing import NamedTuple
 
 import can
 
 from drivers.stream import capture
-from drivers.stream.capture import RECORD, Kind
+from drivers.stream.capture import FRAME, RECORD, Kind
 
 RECEIVE_BUFFER_BYTES = 4 << 20  #: The kernel's default of 208 KiB holds 43 ms of a full bus; a busy machine needs more
 START_S = 20.0  #: Time for the capture process to start; a loaded machine is slow to start an interpreter
@@ -34,32 +35,21 @@ ERROR_CLASSES = 0x4 | 0x40 | 0x100
 """Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h. Single bus errors are not
 requested: a bus without a second node sends thousands a second."""
 _EXTENDED, _REMOTE, _ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
-_FRAME = struct.Struct("=IB3x8s")
 _PAIR_BYTES = 1 << 18
 
 
-@dataclass(frozen=True, slots=True)
-class Losses:
+class Losses(NamedTuple):
     """Frames that came over the wire and were lost in this machine."""
 
     kernel: int = 0  #: in the socket's receive buffer (SO_RXQ_OVFL)
-    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
     #: Before any socket, in the controller or in the kernel's queue behind its driver (the interface's counters, which
     #: are read five times a second).
     interface: int = 0
-
-    @property
-    def total(self) -> int:
-        """Sum of all losses."""
-        return self.kernel + self.interface + self.backlog
+    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
 
     def since(self, earlier: Losses) -> Losses:
         """Return the losses since an earlier reading."""
-        return Losses(
-            kernel=self.kernel - earlier.kernel,
-            backlog=self.backlog - earlier.backlog,
-            interface=self.interface - earlier.interface,
-        )
+        return Losses(*map(sub, self, earlier))
 
 
 NO_LOSSES = Losses()
@@ -90,16 +80,9 @@ def remarks_of(bus: can.BusABC) -> tuple[str, ...]:
 
 
 def open_socketcan(
-    channel: str,
-    receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES,
-    backlog_records: int = capture.BACKLOG_RECORDS,
+    channel: str, receive_buffer_bytes: int = RECEIVE_BUFFER_BYTES, backlog_records: int = capture.BACKLOG_RECORDS
 ) -> SocketcanBus:
     """Open one end of an interface of the kernel.
-
-    Args:
-        channel: name of the interface.
-        receive_buffer_bytes: requested of the kernel.
-        backlog_records: frames that may wait in the capture process.
 
     Raises:
         OSError: there is no such interface, or no permission to use it.
@@ -107,16 +90,33 @@ def open_socketcan(
     """
     handle = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
-        remarks = _configure(handle, receive_buffer_bytes)
-        handle.bind((channel,))
-        _require_up(handle)
+        remarks = _configure(handle, channel, receive_buffer_bytes)
     except BaseException:
         handle.close()
         raise
     return SocketcanBus(channel, handle, backlog_records, remarks)
 
 
-class SocketcanBus(can.BusABC):
+class BurstBus(can.BusABC):
+    """A bus of which one call reads a burst; its other frames are returned without python-can's clock and logging."""
+
+    _received: deque[can.Message]
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        if self._received and self._filters is None:
+            return self._received.popleft()
+        return super().recv(timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._received:
+            self._fill(timeout)
+        return (self._received.popleft() if self._received else None), False
+
+    @abstractmethod
+    def _fill(self, timeout_s: float | None) -> None: ...
+
+
+class SocketcanBus(BurstBus):
     """A socket of classic CAN frames, and the process that reads it.
 
     Args:
@@ -127,11 +127,6 @@ class SocketcanBus(can.BusABC):
 
     Raises:
         can.CanError: the capture process did not start; the socket is closed.
-
-    Attributes:
-        losses: as of the frames received so far.
-        remarks: as given.
-        capture_pid: process id of the capture process.
     """
 
     def __init__(
@@ -142,26 +137,22 @@ class SocketcanBus(can.BusABC):
         remarks: tuple[str, ...] = (),
     ) -> None:
         self.channel_info = f"socketcan {channel}"
-        self.losses = NO_LOSSES
+        self.losses = NO_LOSSES  #: Of the frames received so far
         self.remarks = remarks
         self._channel = channel
-        self._received: deque[can.Message] = deque()
+        self._received = deque()
         self._chunks: deque[bytes] = deque()
         self._ready = False
         self._end: str | None = None
         self._socket = handle
+        self._process: subprocess.Popen[bytes] | None = None
         self._pair, theirs = socket.socketpair()
         try:
             with theirs:
                 self._pair.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _PAIR_BYTES)
                 theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PAIR_BYTES)
                 self._process = _spawn(handle, theirs, channel, backlog_records)
-        except BaseException:
-            self._pair.close()
-            handle.close()
-            raise
-        self.capture_pid = self._process.pid
-        try:
+            self.capture_pid = self._process.pid
             self._wait_until_ready()
             super().__init__(channel=channel)
         except BaseException:
@@ -181,7 +172,10 @@ class SocketcanBus(can.BusABC):
         return self._pair.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        frame = _packed(msg)
+        if msg.is_fd:
+            raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
+        flags = _EXTENDED * msg.is_extended_id | _REMOTE * msg.is_remote_frame | _ERROR * msg.is_error_frame
+        frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
         deadline: float | None = None
         while True:
             try:
@@ -200,17 +194,6 @@ class SocketcanBus(can.BusABC):
                 time.sleep(RETRY_S)
             else:
                 return
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        # One call reads a whole burst; its other frames are returned without python-can's clock and logging.
-        if self._received and self._filters is None:
-            return self._received.popleft()
-        return super().recv(timeout)
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if not self._received:
-            self._fill(timeout)
-        return (self._received.popleft() if self._received else None), False
 
     def _fill(self, timeout_s: float | None) -> None:
         """Take records from the capture process, waiting for the first of them."""
@@ -247,7 +230,7 @@ class SocketcanBus(can.BusABC):
         chunk = b"".join(self._chunks)
         whole = len(chunk) - len(chunk) % RECORD.size
         rest, received, ready, end = deque((chunk[whole:],)), self._received.copy(), self._ready, self._end
-        lost = [self.losses.kernel, self.losses.interface, self.losses.backlog]
+        lost: list[int] = list(self.losses)
         for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == Kind.FRAME:
@@ -258,7 +241,7 @@ class SocketcanBus(can.BusABC):
                 ready = True
             elif kind == Kind.END:
                 end = _reason(can_id)
-        losses = Losses(kernel=lost[0], interface=lost[1], backlog=lost[2])
+        losses = Losses(*lost)
         # No call from here on: the state changes whole, or not at all.
         self._chunks, self._received, self._ready, self._end, self.losses = rest, received, ready, end, losses
 
@@ -291,8 +274,10 @@ class SocketcanBus(can.BusABC):
         self._wait()
         self._socket.close()
 
-    def _wait(self) -> int:
+    def _wait(self) -> int | None:
         """Wait for the end of the capture process; returns its exit code."""
+        if self._process is None:
+            return None
         try:
             return self._process.wait(END_S)
         except subprocess.TimeoutExpired:
@@ -314,8 +299,8 @@ def _spawn(bus: socket.socket, out: socket.socket, channel: str, backlog_records
     )
 
 
-def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, ...]:
-    """Set the options of a CAN_RAW socket; returns remarks for the operator."""
+def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -> tuple[str, ...]:
+    """Set the options of a CAN_RAW socket and bind it; returns remarks for the operator."""
     for level, option, value in (
         (socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
         (socket.SOL_SOCKET, capture.SO_RXQ_OVFL, 1),
@@ -327,6 +312,9 @@ def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, .
         handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
     except PermissionError:
         handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    handle.bind((channel,))
+    if number := handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+        raise can.CanInitializationError(_reason(number))
     # The kernel doubles the requested size for its own book-keeping, and reports the double.
     given = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
     if given >= receive_buffer_bytes:
@@ -335,24 +323,6 @@ def _configure(handle: socket.socket, receive_buffer_bytes: int) -> tuple[str, .
         f"the kernel gave {given >> 10} KiB of receive buffer instead of {receive_buffer_bytes >> 10} KiB: "
         "raise net.core.rmem_max, or let the recorder have CAP_NET_ADMIN",
     )
-
-
-def _require_up(handle: socket.socket) -> None:
-    number = handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    if number:
-        raise can.CanInitializationError(_reason(number))
-
-
-def _packed(message: can.Message) -> bytes:
-    """Return a frame as struct can_frame."""
-    if message.is_fd:
-        raise can.CanOperationError(f"no CAN FD frames on this bus: {message}")
-    flags = (
-        (_EXTENDED if message.is_extended_id else 0)
-        | (_REMOTE if message.is_remote_frame else 0)
-        | (_ERROR if message.is_error_frame else 0)
-    )
-    return _FRAME.pack(message.arbitration_id | flags, message.dlc, bytes(message.data))
 
 
 def _reason(number: int) -> str:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import select
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import groupby
 
 import can
@@ -75,22 +75,13 @@ CellAddress = BusAddress | SplitAddress  #: Address of one bus, or of several
 
 
 def open_cell_bus(address: CellAddress) -> can.BusABC:
-    """Open one end of the bus, or of all buses, of a cell.
+    """Open one end of the bus of a cell, or of every bus as one.
 
     Raises:
         BusError: one cannot be opened (those before it are closed again), or two have a node id in common.
     """
     if isinstance(address, BusAddress):
         return open_bus(address)
-    return open_split_bus(address)
-
-
-def open_split_bus(address: SplitAddress, clock: Callable[[], float] = time.monotonic) -> SplitBus:
-    """Open an end of every bus of a cell, as one bus.
-
-    Raises:
-        BusError: as `open_cell_bus`.
-    """
     homes: dict[int, BusPart] = {}
     for part in address.parts:
         for node_id in part.node_ids:
@@ -98,26 +89,20 @@ def open_split_bus(address: SplitAddress, clock: Callable[[], float] = time.mono
                 reason = f"node {node_id} is on {other.name} and on {part.name}; give one of the two another node id"
                 raise BusError(str(address), reason)
     ends: list[can.BusABC] = []
-    try:
-        for part in address.parts:
-            try:
-                ends.append(open_bus(part.address))
-            except BusError as error:
-                raise BusError(str(part), error.reason) from error
-    except BusError:
-        for end in ends:
-            end.shutdown()
-        raise
-    return SplitBus(address, ends, clock)
+    for part in address.parts:
+        try:
+            ends.append(open_bus(part.address))
+        except BusError as error:
+            for end in ends:
+                end.shutdown()
+            raise BusError(str(part), error.reason) from error
+    return SplitBus(address, ends)
 
 
 class SplitBus(can.BusABC):
-    """Ends of several buses as one; ``channel`` of a received frame names its bus.
+    """Ends of several buses as one, which closes them; ``channel`` of a received frame names its bus.
 
-    Args:
-        address: of the buses.
-        ends: of the buses, in their order; the split bus closes them.
-        clock: monotonic seconds, for time-outs.
+    The ends are in the order of the address; the clock, for time-outs, is monotonic [s].
     """
 
     def __init__(
@@ -144,8 +129,7 @@ class SplitBus(can.BusABC):
     @property
     def losses(self) -> Losses:
         """Losses of all buses together."""
-        each = [losses_of(end) for end in self._ends]
-        return Losses(**{place.name: sum(getattr(lost, place.name) for lost in each) for place in fields(Losses)})
+        return Losses(*map(sum, zip(*map(losses_of, self._ends), strict=True)))
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -168,18 +152,15 @@ class SplitBus(can.BusABC):
             together = tuple(run)
             for burst in (together,) if len(route) == 1 else ((message,) for message in together):
                 for index in route:
-                    self._send_to(index, burst, failures)
+                    if index in self._failed:
+                        continue
+                    try:
+                        send_burst(self._ends[index], burst)
+                    except (can.CanError, OSError, BusError) as error:
+                        failures.append(self._failure(index, error))
         if failures:
             raise failures[0]
         self._require_one()
-
-    def _send_to(self, index: int, messages: Sequence[can.Message], failures: list[BusError]) -> None:
-        if index in self._failed:
-            return
-        try:
-            send_burst(self._ends[index], messages)
-        except (can.CanError, OSError, BusError) as error:
-            failures.append(self._failure(index, error))
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """Return the oldest frame that waits on any of the buses.
@@ -196,7 +177,7 @@ class SplitBus(can.BusABC):
             oldest = self._oldest()
             if oldest is not None:
                 message, self._waiting[oldest] = self._waiting[oldest], None
-                if message is not None and not self._is_echo(message, oldest) and self._at_home(message, oldest):
+                if message is not None and self._belongs(message, oldest):
                     return message
                 continue  # an end may hold more frames without a ready file descriptor
             left_s = None if end_s is None else end_s - self._clock()
@@ -235,22 +216,18 @@ class SplitBus(can.BusABC):
         self._last = index
         return index
 
-    def _is_echo(self, message: can.Message, index: int) -> bool:
-        """Whether a frame is our own SYNC, received for its time, on another bus than the first."""
-        return not message.is_rx and index != min(set(range(len(self._ends))) - self._failed, default=index)
-
-    def _at_home(self, message: can.Message, index: int) -> bool:
-        """Whether a frame comes from the bus of its node."""
+    def _belongs(self, message: can.Message, index: int) -> bool:
+        """Whether a frame comes from the bus of its node; our own SYNC, received for its time, from the first bus."""
+        if not message.is_rx:
+            return index == min(set(range(len(self._ends))) - self._failed, default=index)
         if message.is_extended_id or message.is_error_frame or message.arbitration_id & 0x780 not in _FROM_NODES:
             return True
         node_id = message.arbitration_id & 0x7F
         home = self._homes.get(node_id, index)
-        if home == index:
-            return True
-        if (node_id, index) not in self._misplaced:
+        if home != index and (node_id, index) not in self._misplaced:
             self._misplaced.add((node_id, index))
             raise NodeMisplaced(node_id, self._names[home], self._names[index])
-        return False
+        return home == index
 
     def _wait(self, left_s: float | None) -> None:
         """Wait until a frame comes on one of the buses, or the time is over."""
@@ -267,7 +244,8 @@ class SplitBus(can.BusABC):
     def _failure(self, index: int, error: Exception) -> BusError:
         """Leave this bus out from now on."""
         self._failed.add(index)
-        failure = BusError(self._names[index], error.reason if isinstance(error, BusError) else _text(error))
+        reason = error.reason if isinstance(error, BusError) else str(error) or type(error).__name__
+        failure = BusError(self._names[index], reason)
         failure.__cause__ = error
         return failure
 
@@ -288,10 +266,6 @@ class SplitBus(can.BusABC):
                 failures.append(self._failure(index, error))
         if failures:
             raise failures[0]
-
-
-def _text(error: Exception) -> str:
-    return str(error) or type(error).__name__
 
 
 def _fileno(end: can.BusABC) -> int | None:

@@ -6,7 +6,7 @@ pacing is described in sync.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import can
 
@@ -16,7 +16,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.errors import BusError, DriveFault, NodeMisplaced, SampleLost, node_label
 from drivers.motion.watch import Watch
 from drivers.stream.answers import Answers, Slot, StreamStatistics
-from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample, ignore_event
+from drivers.stream.sample import CellEvent, EventKind, EventSink, Sample
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
@@ -28,9 +28,12 @@ FRAMES_PER_S = 50_000
 """More than two buses of 1 Mbit/s carry: among so many frames a SYNC producer that is alive has been heard."""
 
 
+def _is_plain(message: can.Message) -> bool:
+    return not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
+
+
 def _is_sync(message: can.Message) -> bool:
-    plain = not (message.is_error_frame or message.is_extended_id or message.is_remote_frame)
-    return plain and message.arbitration_id == SYNC_COB_ID
+    return message.arbitration_id == SYNC_COB_ID and _is_plain(message)
 
 
 class SyncStream:
@@ -56,76 +59,46 @@ class SyncStream:
         self,
         network: CanopenNetwork,
         pacing: Pacing,
-        on_event: EventSink = ignore_event,
+        on_event: EventSink = lambda _event: None,
         max_missing_cycles: int = 3,
     ) -> None:
         self.network = network
         self.pacing: Pacing = pacing
         self.max_missing_cycles = max_missing_cycles
+        #: Takes the events; a caller inserts its own here.
+        self.emit = on_event
+        self.silent = False  #: Whether no axis answered the last SYNC
+        #: Time of the last SYNC [ns since 1970]; the pacing's start before the first one.
+        self.time_ns = pacing.start_ns
+        #: Frames to send right before the next SYNC, which triggers synchronous RPDOs.
+        self.outgoing: list[can.Message] = []
         self._link = network.link
-        self._on_event = on_event
         self._answers = Answers(network.axes)
-        self._slots = self._answers.slots
-        self._axes = len(network.axes)
-        self._nodes = frozenset(network.node_ids)
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
-        self._outgoing: list[can.Message] = []
         self._incomplete_cycles = 0
         self._short: dict[int, int] = {}
-        self._silent = False
-        self._answered_ns = 0
-        self._next_sync_ns = 0
-        self._first_sync_ns = 0
-        self._last_sync_ns = 0
+        self._answered_ns = self._next_sync_ns = self._first_sync_ns = self._last_sync_ns = 0
         self._opened: can.Message | None = None
         self._rate = SyncRate(pacing.period_ns)
         self._behind = False
         self._overdue = 0
         self._waited = self._over = False
         self._base = self._losses = Losses()
-        self._time_ns = pacing.start_ns
         self._watch = Watch(network, on_event)
-        self._cycles = self._surplus = self._wrong_length = self._skipped = self._foreign = 0
+        self._cycles = self._skipped = 0
+        self._counts = self._answers.counts
 
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
         return StreamStatistics(
             cycles=self._cycles,
-            frames=self._answers.frames,
-            missing=self._answers.missing,
-            late=self._answers.late,
-            duplicate=self._answers.duplicate,
-            surplus=self._surplus,
-            wrong_length=self._wrong_length,
             skipped_periods=self._skipped,
             kernel_dropped=self._losses.kernel,
             interface_dropped=self._losses.interface,
             backlog_dropped=self._losses.backlog,
-            foreign=self._foreign,
+            **self._counts,
         )
-
-    @property
-    def silent(self) -> bool:
-        """Whether no axis answered the last SYNC."""
-        return self._silent
-
-    @property
-    def time_ns(self) -> int:
-        """Time of the last SYNC [ns since 1970]; the pacing's start before the first one."""
-        return self._time_ns
-
-    def emit(self, event: CellEvent) -> None:
-        """Insert an event of the caller into the stream's events."""
-        self._on_event(event)
-
-    def send(self, messages: Sequence[can.Message]) -> None:
-        """Send frames right before the next SYNC, which triggers synchronous RPDOs."""
-        self._outgoing.extend(messages)
-
-    def drop_outgoing(self) -> None:
-        """Discard the frames that wait for the next SYNC."""
-        self._outgoing.clear()
 
     def __iter__(self) -> Iterator[Sample]:
         return self
@@ -154,7 +127,7 @@ class SyncStream:
                 pacing = self.pacing
                 self._collect(self._follow_sync(pacing) if isinstance(pacing, FollowedSync) else self._send_sync())
         except (BusError, NodeMisplaced) as error:
-            self._on_event(CellEvent(self._time_ns, None, EventKind.BUS_LOST, 0, str(error)))
+            self.emit(CellEvent(self.time_ns, None, EventKind.BUS_LOST, 0, str(error)))
             raise
         return self._finish_cycle()
 
@@ -169,7 +142,7 @@ class SyncStream:
             self._between_cycles(message)
         self._base = losses_of(bus)
         for remark in remarks_of(bus):
-            self._on_event(CellEvent(self._time_ns, None, EventKind.CAPTURE, 0, remark))
+            self.emit(CellEvent(self.time_ns, None, EventKind.CAPTURE, 0, remark))
 
     def _waiting(self) -> Iterator[can.Message]:
         """Yield the frames that have arrived already; a reader that needs too long is a fault."""
@@ -177,18 +150,18 @@ class SyncStream:
         begun_ns = clock()
         while (message := recv(0.0)) is not None:
             yield message
-            if (behind_ns := clock() - begun_ns) > LARGEST_LAG_NS:
-                self._fall_behind(behind_ns)
+            if self._too_late(clock() - begun_ns):
                 return
 
-    def _fall_behind(self, behind_ns: int) -> None:
-        """Report a late reader once; the counters show whether frames were lost."""
-        if not self._behind:
+    def _too_late(self, behind_ns: int) -> bool:
+        """Whether the reader is too late; reported once, because the counters show whether frames were lost."""
+        late = behind_ns > LARGEST_LAG_NS
+        if late and not self._behind:
             self._behind = True
-            reason = (
-                f"read {behind_ns * 1e-9:.1f} s late: moving axes cannot be watched; reduce the load of this computer"
-            )
+            remedy = "moving axes cannot be watched; reduce the load of this computer"
+            reason = f"read {behind_ns * 1e-9:.1f} s late: {remedy}"
             self._watch.faults.append(BusError(str(self._link.address), reason))
+        return late
 
     def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
         """Return the next frame that arrived before a time by the clock: a late reader is no dead producer."""
@@ -203,9 +176,9 @@ class SyncStream:
     def _follow_sync(self, pacing: FollowedSync) -> int:
         """Send waiting frames, and read until the next SYNC; returns the latest time of the one after it."""
         self._link.beat()
-        if self._outgoing:
+        if self.outgoing:
             # As early in the period as possible: all of it should arrive before the next SYNC.
-            outgoing, self._outgoing = self._outgoing, []
+            outgoing, self.outgoing = self.outgoing, []
             self._link.send(outgoing)
         sync, self._opened = self._opened, None
         # Where answers of the last cycle were missing, the wait for them was a wait for this SYNC already.
@@ -232,11 +205,11 @@ class SyncStream:
         if pacing.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
             self._link.note_foreign(SYNC_COB_ID)
         now_ns = pacing.clock()
-        if now_ns - at_ns > LARGEST_LAG_NS:
-            self._fall_behind(now_ns - at_ns)
-        pacing.seen(at_ns, periods)
+        self._too_late(now_ns - at_ns)
+        if pacing.seen is not None:
+            pacing.seen(at_ns, periods)
         self._last_sync_ns = at_ns
-        self._time_ns = pacing.start_ns + at_ns - self._first_sync_ns
+        self.time_ns = pacing.start_ns + at_ns - self._first_sync_ns
         self._cycles += 1
         self._overdue, self._waited = 0, False
         return now_ns + round(pacing.timeout_s * 1e9)
@@ -244,13 +217,10 @@ class SyncStream:
     def _lose_sync(self, pacing: FollowedSync) -> int:
         """Report the dead producer once, and send SYNC from now on, because the axes must be stopped."""
         reason = f"no SYNC from {pacing.producer} for {pacing.timeout_s:g} s"
-        self._on_event(CellEvent(self._time_ns, None, EventKind.SYNC_LOST, self._cycles, reason))
+        self.emit(CellEvent(self.time_ns, None, EventKind.SYNC_LOST, self._cycles, reason))
         self._watch.faults.append(BusError(str(self._link.address), reason))
         self.pacing = TimedSync(pacing.period_ns, pacing.start_ns, pacing.clock)
-        now = pacing.clock()
-        if self._cycles == 0:
-            self._first_sync_ns = self._answered_ns = now
-        self._next_sync_ns = now
+        self._next_sync_ns = pacing.clock()
         return self._send_sync()
 
     def _send_sync(self) -> int:
@@ -263,9 +233,9 @@ class SyncStream:
         if self._cycles == 0:
             self._first_sync_ns = self._next_sync_ns = self._answered_ns = now
         if isinstance(pacing, LockstepSync):
-            self._time_ns = pacing.start_ns + self._cycles * pacing.period_ns
+            self.time_ns = pacing.start_ns + self._cycles * pacing.period_ns
             # A cell that was silent for the whole time gets less the next time: the stop must not take minutes.
-            bound_s = pacing.timeout_s / SHORTENED if self._silent else pacing.timeout_s
+            bound_s = pacing.timeout_s / SHORTENED if self.silent else pacing.timeout_s
             deadline_ns = now + round(bound_s * 1e9)
         else:
             while (left_ns := self._next_sync_ns - now) > 0:
@@ -275,11 +245,10 @@ class SyncStream:
                 now = pacing.clock()
             slipped = (now - self._next_sync_ns) // pacing.period_ns
             self._skipped += slipped
-            if slipped * pacing.period_ns > LARGEST_LAG_NS:
-                self._fall_behind(slipped * pacing.period_ns)
-            self._time_ns = pacing.start_ns + now - self._first_sync_ns
+            self._too_late(slipped * pacing.period_ns)
+            self.time_ns = pacing.start_ns + now - self._first_sync_ns
             deadline_ns = self._next_sync_ns = self._next_sync_ns + (slipped + 1) * pacing.period_ns
-        outgoing, self._outgoing = self._outgoing, []
+        outgoing, self.outgoing = self.outgoing, []
         self._link.send((*outgoing, self._sync))
         self._cycles += 1
         return deadline_ns
@@ -301,55 +270,42 @@ class SyncStream:
                 continue
             if message.is_rx or not isinstance(message, CapturedMessage):
                 return message
-            self._note_own_sync(message)
+            if isinstance(self.pacing, TimedSync):  # the kernel's time of our SYNC; a made-up time stays as it is
+                self._too_late(clock() - message.monotonic_ns)
+                if self._cycles == 1:
+                    self._first_sync_ns = message.monotonic_ns
+                self.time_ns = self.pacing.start_ns + message.monotonic_ns - self._first_sync_ns
         return None
-
-    def _note_own_sync(self, message: CapturedMessage) -> None:
-        """Adopt the kernel's time of our SYNC; made-up time stays as it is."""
-        if isinstance(self.pacing, TimedSync):
-            if (behind_ns := self.pacing.clock() - message.monotonic_ns) > LARGEST_LAG_NS:
-                self._fall_behind(behind_ns)
-            if self._cycles == 1:
-                self._first_sync_ns = message.monotonic_ns
-            self._time_ns = self.pacing.start_ns + message.monotonic_ns - self._first_sync_ns
 
     def _collect(self, deadline_ns: int) -> None:
         """Receive until all answers are there, or the cycle is over."""
-        answers, slots = self._answers, self._slots
+        answers, pacing = self._answers, self.pacing
         answers.begin()
         while not answers.complete:
             message = self._next_frame(deadline_ns)
             if message is None:
                 break
-            identifier = message.arbitration_id
-            slot = slots.get(identifier)
-            if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+            slot = self._slot_of(message)
+            if slot is None:
                 self._other(message)
-                continue
-            data = message.data
-            if len(data) != slot.length:
-                self._note_length(slot, identifier, len(data))
-                continue
-            deadline_ns = deadline_ns if answers.any else self._stragglers_until(deadline_ns)
-            answers.take(identifier, slot, data)
-        self._silent = not answers.any
-        if not self._silent:
-            self._answered_ns = self.pacing.clock()
-
-    def _stragglers_until(self, deadline_ns: int) -> int:
-        """Shorten the deadline in lockstep once one axis has answered: such cells answer all at once."""
-        if not isinstance(self.pacing, LockstepSync):
-            return deadline_ns
-        return min(deadline_ns, self.pacing.clock() + round(self.pacing.timeout_s * 1e9) // STRAGGLING)
+            elif len(message.data) != slot.length:
+                self._note_length(slot, message.arbitration_id, len(message.data))
+            else:
+                if isinstance(pacing, LockstepSync) and not answers.any:  # such a cell answers all at once
+                    deadline_ns = min(deadline_ns, pacing.clock() + round(pacing.timeout_s * 1e9) // STRAGGLING)
+                answers.take(message.arbitration_id, slot, message.data)
+        self.silent = not answers.any
+        if not self.silent:
+            self._answered_ns = pacing.clock()
 
     def _note_length(self, slot: Slot, identifier: int, found: int) -> None:
         """Report a PDO of wrong length: the first may have been corrupted, one with the next SYNC too is a fault."""
-        self._wrong_length += 1
+        self._counts["wrong_length"] += 1
         axis = self.network.axes[slot.axis]
         reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
         if identifier not in self._short or self._short[identifier] < self._cycles - 1:
             text = f"{node_label(axis)}: {reason}"
-            self._on_event(CellEvent(self._time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
+            self.emit(CellEvent(self.time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
         elif self._short[identifier] == self._cycles - 1:
             remedy = "did another program change the mapping, or does another device use this COB-ID?"
             self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
@@ -373,44 +329,49 @@ class SyncStream:
                 if (late := self._link.bus.recv(left_ns * 1e-9)) is None:
                     continue
                 over = over or (followed and _is_sync(late))
-                if not (over and late.arbitration_id in self._slots):
+                if not (over and late.arbitration_id in self._answers.slots):
                     self._between_cycles(late)
         self._over = True
         self._note_losses()
-        self._watch.note_events(self._time_ns)
+        self._watch.note_events(self.time_ns)
 
     def _between_cycles(self, message: can.Message) -> None:
         """Process a frame that is read before the next SYNC, and so answers none that is open."""
-        slot = self._slots.get(message.arbitration_id)
-        if slot is None or message.is_error_frame or message.is_extended_id or message.is_remote_frame:
+        slot = self._slot_of(message)
+        if slot is None:
             self._other(message)
         elif self._cycles == 0:
-            self._foreign += 1
+            self._counts["foreign"] += 1
         else:
             self._answers.take_between(slot)
+
+    def _slot_of(self, message: can.Message) -> Slot | None:
+        return self._answers.slots.get(message.arbitration_id) if _is_plain(message) else None
 
     def _other(self, message: can.Message) -> None:
         if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
             return
-        ours = not message.is_extended_id and message.arbitration_id & 0x7F in self._nodes
-        if ours and self._cycles:
-            self._surplus += 1
-        else:
-            self._foreign += 1
+        ours = not message.is_extended_id and message.arbitration_id & 0x7F in self.network.node_ids
+        self._counts["surplus" if ours and self._cycles else "foreign"] += 1
 
     def _finish_cycle(self) -> Sample:
-        axes, values = self._axes, self._answers.values
+        names, values = [axis.name for axis in self.network.axes], self._answers.values
+        axes = len(names)
         # A skipped period has a number too, so that a gap is visible in the samples.
         cycle = self._cycles - 1 + self._skipped
         missing = self._answers.end()
-        if missing:
-            self._note_missing(cycle, missing)
-        else:
-            self._incomplete_cycles = 0
+        self._incomplete_cycles = self._incomplete_cycles + 1 if missing else 0
+        silent = tuple(axis for axis in range(axes) if missing >> axis & 1)
+        for axis in silent:
+            text = f"no complete answer from {names[axis]} to cycle {cycle}"
+            self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
+        if self._incomplete_cycles > self.max_missing_cycles:
+            silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == axes else None
+            self._watch.faults.append(SampleLost(cycle, silent, [names[axis] for axis in silent], silent_s))
         self._note_losses()
         statuswords = tuple(values[2 * axes :])
-        self._watch.cycle(self._time_ns, self.pacing.clock(), statuswords, missing)
-        return Sample(cycle, self._time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
+        self._watch.cycle(self.time_ns, self.pacing.clock(), statuswords, missing)
+        return Sample(cycle, self.time_ns, tuple(values[:axes]), tuple(values[axes : 2 * axes]), statuswords, missing)
 
     def _note_losses(self) -> None:
         """Report frames that this machine lost; their content is unknown."""
@@ -425,16 +386,4 @@ class SyncStream:
         ):
             if count:
                 text = f"{count} frames dropped {where}"
-                self._on_event(CellEvent(self._time_ns, None, EventKind.FRAMES_DROPPED, count, text))
-
-    def _note_missing(self, cycle: int, missing: int) -> None:
-        silent = tuple(axis for axis in range(self._axes) if missing >> axis & 1)
-        self._incomplete_cycles += 1
-        for axis in silent:
-            text = f"no complete answer from {self.network.axes[axis].name} to cycle {cycle}"
-            self._on_event(CellEvent(self._time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
-        if self._incomplete_cycles <= self.max_missing_cycles:
-            return
-        silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == self._axes else None
-        names = [self.network.axes[axis].name for axis in silent]
-        self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))
+                self.emit(CellEvent(self.time_ns, None, EventKind.FRAMES_DROPPED, count, text))

@@ -19,9 +19,9 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Self
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import SYNC_COB_ID
@@ -29,6 +29,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.sdo import Clock
 from drivers.errors import WHILE, BusError, DriverError
 from drivers.profiles.profile import ObjectEntry
+from drivers.stream.capture import FRAME
 
 SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32, signed=False)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32, signed=False)
@@ -39,7 +40,7 @@ LARGEST_CORRECTION = 0.2
 """Fraction of the period; a kernel that is later than that produces time stamps which are refused."""
 _TX_SETUP, _SET_TIMER, _SET_AND_START_TIMER = 1, 0x1, 0x3  # linux/can/bcm.h
 # struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames; then can_frame.
-_HEAD, _FRAME = struct.Struct("@3I4l2I0q"), struct.Struct("=IB3x8s")
+_HEAD = struct.Struct("@3I4l2I0q")
 SURPLUS = 3.0  #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
 DECAY = 0.99
 """Decay of the lead per SYNC: the permanent difference of two clocks, some tens of ppm, then adds up to nothing."""
@@ -81,10 +82,6 @@ class TimedSync:
     clock: Clock = time.monotonic_ns
 
 
-def ignore(monotonic_ns: int, periods: int) -> None:
-    """Do nothing: for a producer that keeps its period by itself."""
-
-
 @dataclass(frozen=True, slots=True)
 class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
@@ -97,7 +94,8 @@ class FollowedSync:
         in_kernel: the producer is this machine's kernel; a SYNC from the wire is then another device's.
         timeout_s: time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself,
             because the axes are stopped by frames that act on SYNC.
-        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before.
+        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where
+            the producer must be steered.
         start_ns: wall time of the first SYNC [ns since 1970].
         clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
@@ -106,7 +104,7 @@ class FollowedSync:
     producer: str
     in_kernel: bool = False
     timeout_s: float = 0.1
-    seen: Callable[[int, int], None] = ignore
+    seen: Callable[[int, int], None] | None = None
     start_ns: int = 0
     clock: Clock = time.monotonic_ns
 
@@ -115,16 +113,10 @@ Pacing = LockstepSync | TimedSync | FollowedSync
 
 
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
-    """Return the kernel's interval for the next window [us].
+    """Return the kernel's interval for the next window of so many periods [us].
 
-    The lateness of the last window is expected again, and the phase is to be corrected within one window.
-
-    Args:
-        period_us: wanted.
-        interval_us: of the kernel now.
-        late_ns: difference of the last window's duration to its periods.
-        phase_ns: lateness of its last SYNC in the whole schedule.
-        periods: in a window.
+    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC in the whole
+    schedule (`phase_ns`) is to be corrected within one window.
     """
     wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
     return round(min(max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us), (1.0 + LARGEST_CORRECTION) * period_us))
@@ -133,18 +125,14 @@ def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, pe
 def _setup(flags: int, interval_us: int) -> bytes:
     seconds, rest_us = divmod(interval_us, 1_000_000)
     head = _HEAD.pack(_TX_SETUP, flags, 0, 0, 0, seconds, rest_us, SYNC_COB_ID, 1)
-    return head + _FRAME.pack(SYNC_COB_ID, 0, bytes(8))
+    return head + FRAME.pack(SYNC_COB_ID, 0, bytes(8))
 
 
-class KernelProducer:
+class KernelProducer(AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
     It ends with the process that started it. Each interval counts from the actual time of the last SYNC, so the period
     is too long by the lateness of the timer: `seen` measures that and shortens the interval.
-
-    Args:
-        network: on SocketCAN.
-        period_us: of SYNC.
     """
 
     name = "the kernel"
@@ -157,12 +145,7 @@ class KernelProducer:
         self._window = max(8, round(STEERING_S * 1e6 / period_us))
         self._begun_ns = self._phase_ns = self._periods = 0
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self) -> None:
@@ -182,15 +165,7 @@ class KernelProducer:
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC, to keep the average period and the phase of the first one.
-
-        Args:
-            monotonic_ns: its time [ns].
-            periods: since the one before; 0 for the first, where the schedule begins.
-
-        Raises:
-            OSError: the kernel refuses a new interval.
-        """
+        """Process a SYNC and its periods since the one before, 0 for the first; keeps average period and phase."""
         if periods == 0:
             self._begun_ns, self._phase_ns, self._periods = monotonic_ns, 0, 0
             return
@@ -212,14 +187,8 @@ class KernelProducer:
         self._socket, self._link.sync_producer = None, None
 
 
-class DriveProducer:
-    """SYNC by a drive of the cell, by its objects 1005h (bit 30) and 1006h; both are restored afterwards.
-
-    Args:
-        network: that the drive belongs to.
-        axis: index of the axis.
-        period_us: of SYNC.
-    """
+class DriveProducer(AbstractContextManager["DriveProducer"]):
+    """SYNC by a drive of the cell, `axis` by its index: objects 1005h (bit 30) and 1006h, which are restored."""
 
     def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
         self.name = network.axes[axis].name
@@ -227,9 +196,6 @@ class DriveProducer:
         self._node_id = network.node_ids[axis]
         self._period_us = period_us
         self._before: tuple[int, int] | None = None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -240,9 +206,6 @@ class DriveProducer:
             if error is None:
                 raise
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
-
-    def seen(self, monotonic_ns: int, periods: int) -> None:
-        """A drive keeps its period by itself."""
 
     def start(self) -> None:
         """Let the drive send SYNC."""
@@ -275,9 +238,6 @@ class SyncRate:
     """Detects a second SYNC producer: its SYNCs look like the expected producer's, but then too many arrive.
 
     Jitter cancels out: a late SYNC is followed by an early one.
-
-    Args:
-        period_ns: of the producer [ns].
     """
 
     def __init__(self, period_ns: int) -> None:

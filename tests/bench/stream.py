@@ -120,7 +120,7 @@ def one_run(period_us: int, cycles: int, beside: Beside) -> dict[str, Any]:
         int(sent_text),
         reported.cycles + reported.frames + reported.late + reported.duplicate + reported.foreign,
     )
-    lost = losses.total
+    lost = sum(losses)
     steps_us = np.diff(stamps[: max(count - 1, 0)]) * 1e-3
     asked_hz = 1e6 / period_us if period_us else None
     sent_hz = cycles / float(sending_s)

@@ -10,7 +10,7 @@ compares it with a recording over the bus, count by count.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -161,7 +161,7 @@ class DirectStream:
         # Its nodes answer on a bus without readers.
         self._cell = SimulatedCell(spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None)))
         self._cell.plant.time_s = began_s
-        self._outgoing: list[can.Message] = []
+        self.outgoing: list[can.Message] = []
         axes = drive_axes(cell)
         # No bus between this recorder and its amplifiers can fail: they need not be guarded.
         self.network = cast(
@@ -189,16 +189,8 @@ class DirectStream:
     def check(self) -> None:
         """No fault waits: a drive that leaves OPERATION ENABLED is seen in its statusword."""
 
-    def send(self, messages: Sequence[can.Message]) -> None:
-        """Frames for the next SYNC."""
-        self._outgoing.extend(messages)
-
     def read_on(self, seconds: float) -> None:
         """Nothing comes behind the last cycle."""
-
-    def drop_outgoing(self) -> None:
-        """Forget the frames that wait for the next SYNC."""
-        self._outgoing.clear()
 
     def emit(self, event: CellEvent) -> None:
         """Keep an event of the walk's."""
@@ -206,7 +198,7 @@ class DirectStream:
 
     def advance(self) -> Sample:
         """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
-        outgoing, self._outgoing = self._outgoing, []
+        outgoing, self.outgoing = self.outgoing, []
         nodes = self._cell.nodes
         for message in outgoing:
             for node in nodes:

@@ -116,16 +116,16 @@ def test_what_a_full_buffer_drops_is_counted_to_the_frame(wire: socket.socket) -
             wire.send(FRAME.pack(0x181, 0, bytes(8)))
         os.kill(bus.capture_pid, signal.SIGCONT)
         got = 0
-        while got + bus.losses.total < 2000:  # no frame comes after them: the socket itself is asked
+        while got + sum(bus.losses) < 2000:  # no frame comes after them: the socket itself is asked
             message = bus.recv(WAIT_S)
             got += message is not None
-            assert message is not None or bus.losses.total
+            assert message is not None or sum(bus.losses) > 0
         assert 0 < bus.losses.kernel < 2000
         assert (got + bus.losses.kernel, bus.losses.backlog, bus.losses.interface) == (2000, 0, 0)
         wire.send(FRAME.pack(0x182, 0, bytes(8)))
         while received(bus).arbitration_id != 0x182:
             pytest.fail("more frames than were sent")
-        assert got + bus.losses.total == 2000
+        assert got + sum(bus.losses) == 2000
     finally:
         os.kill(bus.capture_pid, signal.SIGCONT)
         bus.shutdown()

@@ -29,12 +29,12 @@ from daq.simulation.simulation_file import load_simulation
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import record
 from drivers.canopen.bus import open_bus
-from drivers.profiles.data_sheet import data_sheet, disagreements
 from drivers.profiles.profile import Basis, DriveProfile, ObjectEntry, ScaleForm, TapPoint
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import Dialect
 from ident.data.run import Run
+from tests.daq.config.data_sheet import data_sheet, disagreements
 
 FOLDER = shipped_configurations() / "drives"
 NAMES = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))

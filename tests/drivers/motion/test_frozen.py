@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.motion.move import Move, synchronised, trapezoid_duration_s
-from drivers.motion.watch import FROZEN_S, FrozenData, travel_counts
+from drivers.motion.move import Move
+from drivers.motion.watch import FROZEN_S, FrozenData
 from drivers.stream.sample import Sample
 
 PERIOD_NS = 1_000_000
 MOVE = Move((50_000, 0), (100_000, 1), (1_000_000, 1))
-
-distances = st.floats(1.0, 1e7)
-speeds = st.floats(10.0, 1e6)
-ramps = st.floats(100.0, 1e7)
-
-
-@settings(deadline=None)
-@given(distances, speeds, ramps, st.floats(-0.1, 1.2))
-def test_the_way_is_that_of_the_trapezoid(distance: float, speed: float, ramp: float, part: float) -> None:
-    time_s = part * trapezoid_duration_s(distance, speed, ramp)
-    path = synchronised(np.zeros(1), np.array([distance]), np.array([speed]), np.array([ramp]))
-    expected = float(path.at(np.array([max(time_s, 0.0)]))[0][0, 0])
-    assert travel_counts(distance, speed, ramp, time_s) == pytest.approx(expected, rel=1e-6, abs=1e-6 * distance)
 
 
 def alarms(positions: list[int], currents: list[int], missing: list[int] | None = None) -> list[int]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
-from drivers.profiles.profile import Amplitude, Basis, CurrentScale, Fact, ObjectEntry, RatedMotor, ScaleForm, TapPoint
+from drivers.profiles.profile import Amplitude, CurrentScale, ObjectEntry, RatedMotor, ScaleForm, TapPoint
 from drivers.profiles.scale import FINE, GROSS, ScaleReading, check_name_plate, read_scale
 from tests.drivers.scripted import PROFILE, ScriptedNode, cell
 
@@ -165,12 +165,3 @@ def test_an_actual_current_is_shouted() -> None:
     assert PROFILE.signal == "current reference 6074h:00"
     assert replace(PROFILE, tap=TapPoint.LIMITED_REFERENCE).signal == "limited current reference 6074h:00"
     assert replace(PROFILE, tap=TapPoint.ACTUAL).signal == "ACTUAL current 6074h:00"
-
-
-def test_only_a_text_of_the_manufacturer_verifies_a_fact() -> None:
-    facts = tuple(Fact("current", basis, "somewhere") for basis in Basis)
-    assert {fact.basis for fact in replace(PROFILE, facts=facts).unverified} == {
-        Basis.STANDARD,
-        Basis.NOTES,
-        Basis.ASSUMED,
-    }

@@ -20,7 +20,7 @@ from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import SYNC_COB_ID, Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError
-from drivers.stream.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime, Record
+from drivers.stream.capture import RECORD, Capture, DropCounter, Kind, MonotonicTime
 from drivers.stream.sample import EventKind
 from drivers.stream.socketcan import CapturedMessage, Losses, SocketcanBus, losses_of, open_socketcan, remarks_of
 from tests.drivers.scripted import FakeClock
@@ -33,8 +33,7 @@ Pair = tuple[SocketcanBus, socket.socket]
 
 u64 = st.integers(0, 2**64 - 1)
 times = st.integers(-(2**63), 2**63 - 1)
-records = st.builds(
-    Record,
+records = st.tuples(
     times,
     times,
     u64,
@@ -66,8 +65,8 @@ def received(bus: SocketcanBus) -> CapturedMessage:
 
 
 @given(records)
-def test_a_record_comes_out_as_it_went_in(record: Record) -> None:
-    assert Record(*RECORD.unpack(RECORD.pack(*record))) == record
+def test_a_record_comes_out_as_it_went_in(record: tuple[object, ...]) -> None:
+    assert RECORD.unpack(RECORD.pack(*record)) == record
 
 
 @given(st.lists(st.integers(0, 2**31 - 1), max_size=20))
@@ -165,11 +164,11 @@ def test_a_full_backlog_is_counted_to_the_frame() -> None:
                 chunks += parent.recv(1 << 20)
             except BlockingIOError:
                 break
-        reported = [Record(*fields) for fields in RECORD.iter_unpack(chunks)]
-        got = sum(record.kind == Kind.FRAME for record in reported)
+        reported = list(RECORD.iter_unpack(chunks))
+        got = sum(kind == Kind.FRAME for *_, kind, _length, _own, _local, _data in reported)
         assert got < sent
-        assert got + reported[-1].backlog_dropped == sent
-        lost = [record.backlog_dropped for record in reported]
+        lost = [backlog_dropped for _, _, _, _, backlog_dropped, *_ in reported]
+        assert got + lost[-1] == sent
         assert lost == sorted(lost)
 
 

@@ -17,7 +17,7 @@ from drivers.canopen.link import Link, NmtCommand
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError, NodeMisplaced
 from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks_of
-from drivers.stream.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_split_bus
+from drivers.stream.split_bus import BUS_OFF, LARGEST_RUN, BusPart, SplitAddress, SplitBus, open_cell_bus
 from tests.drivers.bus_contract import WAIT_S, BusContract, Ends
 from tests.drivers.scripted import FakeClock
 
@@ -193,7 +193,7 @@ def test_waiting_at_one_bus_never_lasts_while_the_other_may_have_frames(pair: Pa
 def test_buses_with_file_descriptors_are_waited_for_together(name: str) -> None:
     with Hub(NAMES) as hub:
         parts = tuple(BusPart(part, hub.address(part), nodes) for part, nodes in zip(NAMES, (LEFT, RIGHT), strict=True))
-        bus, far = open_split_bus(SplitAddress(parts)), open_bus(hub.address(name))
+        bus, far = open_cell_bus(SplitAddress(parts)), open_bus(hub.address(name))
         try:
             assert bus.recv(0.0) is None
             far.send(frame(0x201))
@@ -296,7 +296,7 @@ def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -
 def test_one_node_id_on_two_buses_is_refused_before_anything_is_opened() -> None:
     parts = tuple(BusPart(name, BusAddress("carrier-pigeon", name), frozenset((3, 4))) for name in NAMES)
     with pytest.raises(BusError, match="node 3 is on left and on right; give one of the two another"):
-        open_split_bus(SplitAddress(parts))
+        open_cell_bus(SplitAddress(parts))
 
 
 def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -312,7 +312,7 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(monkeypa
         BusPart("right", BusAddress("carrier-pigeon", "can1"), RIGHT),
     )
     with pytest.raises(BusError, match=r"right \(carrier-pigeon:can1\)"):
-        open_split_bus(SplitAddress(parts))
+        open_cell_bus(SplitAddress(parts))
     with pytest.raises(can.CanOperationError):
         opened[0].send(frame(0x080))
 

@@ -1,6 +1,6 @@
 """Compare a drive profile with the maker's electronic data sheet (EDS or DCF, CiA 306).
 
-No verb needs data sheets. They serve the author of a profile, and the tests of the shipped profiles.
+No verb needs data sheets. They serve the author of a profile, through the tests of the shipped profiles.
 """
 
 from __future__ import annotations
