@@ -16,9 +16,9 @@ from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_join
 from daq.config.clearance import clearance_faults
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
+from daq.config.signers import signer_faults
 from daq.config.yaml_file import Document, Fault, Location, describe
 from daq.errors import ConfigurationInconsistent
-from daq.writeback.signature import public_keys
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, robot_from_urdf
@@ -47,7 +47,7 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
         *_producer_faults(model),
         *_axis_faults(model, joints, urdf),
         *_list_faults(model),
-        *_signer_faults(model.policy.apply.signers),
+        *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, names),
         *max_change_faults(model.policy.apply, names),
     ]
@@ -110,18 +110,6 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 "each mounting a name of its own: it denotes one body in one place",
             )
         yield from _inertia_faults(payload, index)
-
-
-def _signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
-    """Find malformed public keys now, and not at the first signature, long after the recording."""
-    good: dict[str, str] = {}
-    for name, line in signers.items():
-        try:
-            public_keys({**good, name: line})
-        except ConfigurationInconsistent as error:
-            yield Fault(("policy", "apply", "signers", name), error.found, error.expected)
-        else:
-            good[name] = line
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
