@@ -12,12 +12,13 @@ from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from daq.errors import OutputFailed, UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from drivers.canopen.network import SignalBlocker
 
 _HEAD_BYTES = 4096
@@ -119,6 +120,8 @@ class Stepper:
     """Progress bars on stderr for steps that follow each other; a context manager."""
 
     def __init__(self) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
         columns = (
             TextColumn("{task.description}"),
             BarColumn(bar_width=20),

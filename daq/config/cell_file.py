@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +84,7 @@ def cell_from_bundle(
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
-        recording_digest=_recording_digest({name: files[name] for name in used}),
+        recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
         motion=model.policy.motion,
         apply=model.policy.apply,
         history=None if file is None else model.history.place(file),
@@ -106,18 +105,12 @@ _AFTERWARDS = ("policy", "history", "recalibration")
 """Keys for the use of a calibration; no recording and no fit depends on them."""
 
 
-def _recording_digest(files: Mapping[str, bytes]) -> str:
-    """Return the `digest` of the content: comments, line breaks and the order of keys do not count."""
-    return digest({name: _canonical(name, content) for name, content in files.items()})
-
-
-@lru_cache(maxsize=16)
-def _canonical(name: str, content: bytes) -> bytes:
-    """Content without its layout; the logs of a fit carry the same files, which are parsed once."""
-    if name == URDF:
+def _canonical(member: str, content: bytes, name: str) -> bytes:
+    """Content without its layout: comments, line breaks and the order of keys do not count."""
+    if member == URDF:
         return content
     tree = parse_yaml(content, name).tree
-    if name == CELL:
+    if member == CELL:
         tree = {key: value for key, value in tree.items() if key not in _AFTERWARDS}
     return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
 

@@ -15,6 +15,7 @@ import os
 import re
 import stat
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
@@ -38,9 +39,12 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class StrictModel(BaseModel):
-    """Schema of a whole file, and of its sections: no unknown keys, no conversions, no NaN."""
+    """Schema of a whole file, and of its sections: no unknown keys, no conversions, no NaN.
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+    A schema is built when its first document is read: most programs read few of the kinds.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 Model = TypeVar("Model", bound=StrictModel)
@@ -125,8 +129,9 @@ for _tag, _pattern, _first in _CORE_SCALARS:
 _TAGS = {f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")}
 
 
+@lru_cache(maxsize=16)
 def parse_yaml(text: bytes, name: str) -> Document:
-    """Parse one YAML document.
+    """Parse one YAML document. A cell reads its files for their names, their content and their digest: once is enough.
 
     Args:
         text: content of the file.
