@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from ident.model.bodies import LINK_PARAMETERS, Payload
 
@@ -213,14 +214,17 @@ def _number(value: object) -> float:
         return math.nan
 
 
+_Quantum = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
 @dataclass(frozen=True, slots=True)
 class AxisReadback:
     """Answers of the amplifier of one axis."""
 
     name: str  #: name of the axis
-    current_per_unit: float  #: unit of the reference (A) per raw unit, from the profile's formula and objects
+    current_per_unit: _Quantum  #: unit of the reference (A) per raw unit, from the profile's formula and objects
     #: Motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
-    position_rad_per_count: float | None = None
+    position_rad_per_count: _Quantum | None = None
     #: Identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
     drive: dict[str, Any] = field(default_factory=dict)
 
@@ -229,7 +233,7 @@ class AxisReadback:
 class Readback:
     """Answers of all amplifiers when a recording started. Without them raw numbers have no unit."""
 
-    axes: tuple[AxisReadback, ...]
+    axes: Annotated[tuple[AxisReadback, ...], Field(min_length=1)]
 
 
 def readback_of_drives(names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]) -> Readback:
@@ -260,29 +264,8 @@ def readback_from_bytes(data: bytes) -> Readback:
         ValueError: it is not a readback.
     """
     try:
-        tree = json.loads(data)
-    except RecursionError as error:
-        raise ValueError("nested too deep") from error
-    axes = tree.get("axes") if isinstance(tree, dict) else None
-    if not isinstance(axes, list) or not axes:
-        raise ValueError("no list of axes")
-    return Readback(tuple(_axis(axis) for axis in axes))
-
-
-def _axis(tree: Any) -> AxisReadback:
-    tree = tree if isinstance(tree, dict) else {}
-    name, drive, angle = tree.get("name"), tree.get("drive", {}), tree.get("position_rad_per_count")
-    if not (isinstance(name, str) and isinstance(drive, dict)):
-        raise ValueError(f"axis {name!r}: name or drive")  # noqa: TRY004 - one kind of error for a foreign attachment
-    return AxisReadback(
-        name=name,
-        current_per_unit=_quantum(name, "current_per_unit", tree.get("current_per_unit")),
-        position_rad_per_count=None if angle is None else _quantum(name, "position_rad_per_count", angle),
-        drive=drive,
-    )
-
-
-def _quantum(name: str, key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= sys.float_info.max:
-        raise ValueError(f"axis {name!r}: {key} is {value!r:.40}, expected a positive number")
-    return float(value)
+        return TypeAdapter(Readback).validate_json(data, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place, expected = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
+        raise ValueError(f"{place or 'the whole'} is {first['input']!r:.40}, expected {expected}") from error
