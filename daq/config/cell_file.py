@@ -61,7 +61,7 @@ def cell_from_bundle(
     """
     names = names or {}
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
-    model = read_model(document, CellModel)
+    model = read_model(document, CellModel, None if file is None else file.parent)
     urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
     profiles = {
         drive: drive_from_text(_member(files, member, names), names.get(member, member))

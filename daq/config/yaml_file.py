@@ -17,10 +17,10 @@ import stat
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
 
@@ -36,6 +36,17 @@ _NOT_IN_FILE = "\0"
 Name = Annotated[str, Field(min_length=1, max_length=80, pattern=r"^[\w][\w .()/+-]*$")]
 FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]+$")]
 Positive = Annotated[float, Field(gt=0)]
+
+
+def _beside(name: str, info: ValidationInfo) -> Path:
+    return Path(name) if info.context is None else (info.context / name).resolve()
+
+
+if TYPE_CHECKING:
+    FilePath = Path
+else:
+    FilePath = Annotated[FileName, AfterValidator(_beside)]
+    """A path relative to the file that names it; absolute where `read_model` knows the folder of that file."""
 
 
 class StrictModel(BaseModel):
@@ -207,15 +218,20 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
-def read_model(document: Document, model: type[Model]) -> Model:
+def read_model(document: Document, model: type[Model], folder: Path | None = None) -> Model:
     """Check a document against its schema.
+
+    Args:
+        document: a parsed file.
+        model: its schema.
+        folder: folder of the file, which makes each `FilePath` in it absolute.
 
     Raises:
         SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest known key.
     """
     try:
         # Through JSON, where a list may become a tuple and a word an enum although everything else is strict.
-        return model.model_validate_json(json.dumps(document.tree))
+        return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
