@@ -80,7 +80,7 @@ def cell_from_bundle(
         axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
         payloads=tuple(_payload(payload) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
-        controller=None if model.controller is None else model.controller.controller,
+        controller=model.controller,
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
