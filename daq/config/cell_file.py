@@ -121,15 +121,10 @@ def _sources(path: Path) -> dict[str, Path]:
     sources = {CELL: path, URDF: path.parent / model.robot.urdf}
     for drive in model.drives:
         profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
-        sources |= {f"{DRIVES}{drive}.eds": profile.parent / eds for eds in _eds_of(profile)}
+        tree = parse_yaml(read_bytes(profile), str(profile)).tree
+        if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
+            sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
-
-
-def _eds_of(profile: Path) -> tuple[str, ...]:
-    """Return the electronic data sheet named in a profile, if any; the schema is checked elsewhere."""
-    tree = parse_yaml(read_bytes(profile), str(profile)).tree
-    named = tree.get("eds") if isinstance(tree, dict) else None
-    return (named,) if isinstance(named, str) and named else ()
 
 
 def _drive_path(folder: Path, drive: str) -> Path:

@@ -290,7 +290,14 @@ def _bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Itera
     if len(model.buses) > 1 and model.sync.producer != RECORDER:
         expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
         yield Fault(("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected)
-    yield from _refresh_faults(model, model.sync.period_us, profiles)
+    for drive in model.drives:
+        refresh_us = profiles[drive].update_period_us
+        if refresh_us > model.sync.period_us:
+            yield Fault(
+                ("sync", "period_us"),
+                f"{model.sync.period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
+                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
+            )
     for index, bus in enumerate(model.buses):
         if model.sync.pacing is Pacing.TIMED:
             yield from _load_faults(model, model.sync.period_us, bus, profiles)
@@ -336,17 +343,6 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
             several = ", on all buses together: a frame is known by its node id alone" if len(names) > 1 else ""
             found = f"{axis.node_id}, used {used[axis.node_id]} times"
             yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
-
-
-def _refresh_faults(model: CellModel, period_us: int, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    for drive in model.drives:
-        refresh_us = profiles[drive].update_period_us
-        if refresh_us > period_us:
-            yield Fault(
-                ("sync", "period_us"),
-                f"{period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
-                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
-            )
 
 
 def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:

@@ -235,17 +235,13 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
-        raise _mismatch(document, faults, len(items) - len(faults)) from error
-
-
-def _mismatch(document: Document, faults: list[Fault], others: int) -> SchemaMismatch:
-    # A list counts as empty when its items are wrong; the faults inside say enough.
-    outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
-    inner = [fault for fault in faults if fault.path not in outer]
-    remedy = "correct the file; `drivegain init` shows every key"
-    if others:
-        remedy += f" ({others} more faults are not listed)"
-    return SchemaMismatch(**describe(document, inner), remedy=remedy)
+        # A list counts as empty when its items are wrong; the faults inside say enough.
+        outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
+        remedy = "correct the file; `drivegain init` shows every key"
+        if len(items) > len(faults):
+            remedy += f" ({len(items) - len(faults)} more faults are not listed)"
+        inner = [fault for fault in faults if fault.path not in outer]
+        raise SchemaMismatch(**describe(document, inner), remedy=remedy) from error
 
 
 def describe(document: Document, faults: list[Fault]) -> dict[str, str]:

@@ -101,8 +101,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     except OSError as error:
         raise OutputFailed.of(out, error) from error
     said = reader.statistics
-    partial = said.partial or log.name.endswith(".part")
-    return Exported(names, rows, partial, said.valid, said.reason)
+    return Exported(names, rows, reader.partial, said.valid, said.reason)
 
 
 def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iterator[Columns]:

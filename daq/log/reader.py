@@ -161,7 +161,11 @@ class LogReader:
             if isinstance(record, Attachment):
                 self._attachments[record.name] = record.data
             elif isinstance(record, Metadata):
-                self._metadata[record.name] = self._entries(offset, record)
+                try:
+                    self._metadata[record.name] = unsealed(record.metadata)
+                except ValueError as error:
+                    found = f"metadata {record.name!r} with {error}"
+                    raise self._file.corrupt(offset, found, "those that were sealed") from error
             elif isinstance(record, Header) and record.profile != "ros2":
                 raise self._file.foreign(f"profile {record.profile!r}", "ros2")
             elif isinstance(record, Chunk):
@@ -199,14 +203,6 @@ class LogReader:
             return statistics_from_record(self._metadata[STATISTICS])
         except (KeyError, ValueError, RecursionError) as error:
             raise self._incomplete(error, f"metadata {STATISTICS!r}") from error
-
-    def _entries(self, offset: int, record: Metadata) -> dict[str, str]:
-        try:
-            return unsealed(record.metadata)
-        except ValueError as error:
-            raise self._file.corrupt(
-                offset, f"metadata {record.name!r} with {error}", "those that were sealed"
-            ) from error
 
     @property
     def partial(self) -> bool:
@@ -269,14 +265,10 @@ def read_log(path: Path) -> Log:
             expected=f"{statistics.samples}, as its recorder counted",
             remedy="another tool may have cut the log; take the original",
         )
-    return Log(path, reader.digest, head, _joined(blocks), tuple(reader.events), statistics)
-
-
-def _joined(blocks: list[SampleBlock]) -> SampleBlock:
-    """Join all samples; the blocks are freed, so that a long log is not in memory twice."""
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
-    blocks.clear()
-    return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+    blocks.clear()  # so that a long log is not in memory twice
+    samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics)
 
 
 MASKED = (
