@@ -64,6 +64,7 @@ class Log:
         samples: all samples.
         events: in the order of the log.
         statistics: the recorder's summary at the end.
+        partial: the end of the recording is unknown: it was salvaged, or never got its final name.
     """
 
     path: Path
@@ -72,15 +73,7 @@ class Log:
     samples: SampleBlock
     events: tuple[CellEvent, ...]
     statistics: RunStatistics
-
-    @property
-    def partial(self) -> bool:
-        """Whether the end of the recording is unknown: it was salvaged, or never got its final name."""
-        return _partial(self.path, self.statistics)
-
-
-def _partial(path: Path, statistics: RunStatistics) -> bool:
-    return statistics.partial or path.name.endswith(UNFINISHED)
+    partial: bool
 
 
 class LogReader:
@@ -207,7 +200,7 @@ class LogReader:
     @property
     def partial(self) -> bool:
         """See `Log.partial`; after the iteration."""
-        return _partial(self.path, self.statistics)
+        return self.statistics.partial or self.path.name.endswith(UNFINISHED)
 
     def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
@@ -268,7 +261,7 @@ def read_log(path: Path) -> Log:
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
     blocks.clear()  # so that a long log is not in memory twice
     samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
-    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics)
+    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics, reader.partial)
 
 
 MASKED = (
