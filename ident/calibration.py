@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 from ident.data.run import Recording
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError
-from ident.estimators.identify import Identification
+
+if TYPE_CHECKING:  # reading a calibration needs no estimator
+    from ident.estimators.identify import Identification
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -82,6 +83,10 @@ def build_app() -> typer.Typer:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line, by default that of this process, and return its exit code."""
+    if arguments is None:
+        # A process of one command: almost all that it makes at its start stays, and searching it for garbage again and
+        # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
+        gc.set_threshold(20_000, 50, 100)
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.

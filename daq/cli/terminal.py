@@ -12,12 +12,13 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from daq.errors import OutputFailed, UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from drivers.canopen.network import SignalBlocker
 
 ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
@@ -121,6 +122,8 @@ class Stepper:
 @contextmanager
 def show_steps() -> Iterator[Stepper]:
     """Show progress bars on stderr; the last one is ended unless an error is raised."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
     remark = TextColumn("{task.fields[remark]}", style="dim")
     columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
     with Progress(*columns, console=Console(stderr=True), refresh_per_second=5) as bars:

@@ -5,14 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
+from typing import TYPE_CHECKING
 
+import drivers
 from daq.config.cell import Bus, Cell, Pacing
 from daq.errors import ConfigurationInconsistent
-from drivers.canopen.bus import BusAddress
-from drivers.canopen.network import HEARTBEAT_MS
-from drivers.canopen.pdo import SETPOINT_PDOS, STATUSWORD, pack
+from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
-from drivers.stream.split_bus import BusPart, CellAddress, SplitAddress
+
+if TYPE_CHECKING:
+    from drivers.stream.split_bus import CellAddress
+
+# Addresses are made through the lazy front door: reading a cell file checks the load of its buses, and that needs no
+# CAN library.
 
 LARGEST_MEAN = 0.80
 """Largest mean load, as a share of the bus. The rest is for repeated frames, SDO, EMCY and other nodes; above it frames
@@ -134,10 +139,10 @@ def cell_address(cell: Cell) -> CellAddress:
         ConfigurationInconsistent: the cell only imports recordings.
     """
     parts = bus_parts(cell)
-    return parts[0].address if len(parts) == 1 else SplitAddress(parts)
+    return parts[0].address if len(parts) == 1 else drivers.SplitAddress(parts)
 
 
-def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
+def bus_parts(cell: Cell) -> tuple[drivers.BusPart, ...]:
     """Return each bus of a cell with the nodes that should be on it.
 
     Raises:
@@ -146,7 +151,7 @@ def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
     if not cell.buses:
         raise _no_bus(cell, "no bus")
     return tuple(
-        BusPart(bus.name, _address(bus), frozenset(axis.node_id for axis in axes if axis.node_id is not None))
+        drivers.BusPart(bus.name, _address(bus), frozenset(axis.node_id for axis in axes if axis.node_id is not None))
         for bus, axes in cell.wiring
     )
 
@@ -174,7 +179,7 @@ def load_warnings(cell: Cell) -> tuple[str, ...]:
     )
 
 
-def bus_address(cell: Cell) -> BusAddress:
+def bus_address(cell: Cell) -> drivers.BusAddress:
     """Return the address of the only bus of a cell.
 
     Raises:
@@ -206,8 +211,8 @@ def drive_axes(cell: Cell) -> tuple[Axis, ...]:
     return tuple(axes)
 
 
-def _address(bus: Bus) -> BusAddress:
-    return BusAddress(bus.interface, bus.channel, bus.bitrate_bit_s, bus.host, bus.port)
+def _address(bus: Bus) -> drivers.BusAddress:
+    return drivers.BusAddress(bus.interface, bus.channel, bus.bitrate_bit_s, bus.host, bus.port)
 
 
 def _no_bus(cell: Cell, found: str) -> ConfigurationInconsistent:

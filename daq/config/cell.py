@@ -99,31 +99,19 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One motor with its amplifier, and the joint of the same number.
-
-    Attributes:
-        name: name of the axis.
-        node_id, drive, profile, identity: of the amplifier; None in a cell that only imports recordings.
-        bus: name of the amplifier's bus; None in such a cell.
-        counts_per_revolution: encoder counts of a motor revolution; None where the import defines its own count.
-        unit: unit of the joint's positions for people: degrees, or mm for a prismatic joint.
-        zero_offset_rad: joint position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint].
-        nameplate_gain: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed.
-        gain_unit: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference.
-        limits: limits of the joint.
-    """
+    """One motor with its amplifier, and the joint of the same number."""
 
     name: str
-    node_id: int | None
+    node_id: int | None  #: of the amplifier, as the next four; None in a cell that only imports recordings
     drive: str | None
     profile: DriveProfile | None
     identity: Identity | None
     bus: str | None
-    counts_per_revolution: int | None
-    unit: JointUnit
-    zero_offset_rad: float
-    nameplate_gain: float
-    gain_unit: str
+    counts_per_revolution: int | None  #: encoder counts of a motor revolution; None where the import defines its own
+    unit: JointUnit  #: unit of the joint's positions for people
+    zero_offset_rad: float  #: position in the URDF's frame when R⁻¹ q_motor is zero [rad; m of a prismatic joint]
+    nameplate_gain: float  #: a priori joint drive gain g = N·Gt·Kt [gain_unit], signed
+    gain_unit: str  #: Nm (N of a prismatic joint) at the joint per unit of the current-loop reference
     limits: Limits
 
 

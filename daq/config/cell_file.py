@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +61,7 @@ def cell_from_bundle(
     """
     names = names or {}
     document = parse_yaml(_member(files, CELL, names), names.get(CELL, CELL))
-    model = read_model(document, CellModel)
+    model = read_model(document, CellModel, None if file is None else file.parent)
     urdf = _member(files, URDF, names).decode("utf-8", errors="replace")
     profiles = {
         drive: drive_from_text(_member(files, member, names), names.get(member, member))
@@ -81,11 +80,11 @@ def cell_from_bundle(
         axes=tuple(_axis(axis, model.bus_of(axis), profiles) for axis in model.axes),
         payloads=tuple(_payload(payload) for payload in model.payloads),
         conditioning=_conditioning(model.conditioning),
-        controller=None if model.controller is None else model.controller.controller,
+        controller=model.controller,
         clearance=clearance_of(model.workspace, model.clearance, [axis.name for axis in model.axes]),
         folder=None if file is None else file.parent,
         digest=digest({name: files[name] for name in used}),
-        recording_digest=_recording_digest({name: files[name] for name in used}),
+        recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
         motion=model.policy.motion,
         apply=model.policy.apply,
         history=None if file is None else model.history.place(file),
@@ -106,18 +105,12 @@ _AFTERWARDS = ("policy", "history", "recalibration")
 """Keys for the use of a calibration; no recording and no fit depends on them."""
 
 
-def _recording_digest(files: Mapping[str, bytes]) -> str:
-    """Return the `digest` of the content: comments, line breaks and the order of keys do not count."""
-    return digest({name: _canonical(name, content) for name, content in files.items()})
-
-
-@lru_cache(maxsize=16)
-def _canonical(name: str, content: bytes) -> bytes:
-    """Content without its layout; the logs of a fit carry the same files, which are parsed once."""
-    if name == URDF:
+def _canonical(member: str, content: bytes, name: str) -> bytes:
+    """Content without its layout: comments, line breaks and the order of keys do not count."""
+    if member == URDF:
         return content
     tree = parse_yaml(content, name).tree
-    if name == CELL:
+    if member == CELL:
         tree = {key: value for key, value in tree.items() if key not in _AFTERWARDS}
     return json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
 
@@ -128,15 +121,10 @@ def _sources(path: Path) -> dict[str, Path]:
     sources = {CELL: path, URDF: path.parent / model.robot.urdf}
     for drive in model.drives:
         profile = sources[f"{DRIVES}{drive}.yaml"] = _drive_path(path.parent, drive)
-        sources |= {f"{DRIVES}{drive}.eds": profile.parent / eds for eds in _eds_of(profile)}
+        tree = parse_yaml(read_bytes(profile), str(profile)).tree
+        if isinstance(tree, dict) and isinstance(eds := tree.get("eds"), str) and eds:  # the schema is checked later
+            sources[f"{DRIVES}{drive}.eds"] = profile.parent / eds
     return sources
-
-
-def _eds_of(profile: Path) -> tuple[str, ...]:
-    """Return the electronic data sheet named in a profile, if any; the schema is checked elsewhere."""
-    tree = parse_yaml(read_bytes(profile), str(profile)).tree
-    named = tree.get("eds") if isinstance(tree, dict) else None
-    return (named,) if isinstance(named, str) and named else ()
 
 
 def _drive_path(folder: Path, drive: str) -> Path:

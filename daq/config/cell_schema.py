@@ -16,7 +16,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
 from daq.config.clearance import ClearanceSection, WorkspaceSection
-from daq.config.controller import ControllerSection
+from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection
 from daq.config.recalibration import RecalibrationSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
@@ -203,7 +203,7 @@ class CellModel(StrictModel):
     axes: Annotated[tuple[AxisModel, ...], Field(min_length=1, max_length=32)]
     payloads: tuple[PayloadModel, ...] = ()
     conditioning: ConditioningModel
-    controller: ControllerSection | None = None
+    controller: Controller | None = None
     workspace: WorkspaceSection | None = None
     clearance: ClearanceSection | None = None
     policy: PolicyModel = PolicyModel()

@@ -16,9 +16,9 @@ from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_join
 from daq.config.clearance import clearance_faults
 from daq.config.controller import controller_faults
 from daq.config.policy import max_change_faults
+from daq.config.signers import signer_faults
 from daq.config.yaml_file import Document, Fault, Location, describe
 from daq.errors import ConfigurationInconsistent
-from daq.writeback.signature import public_keys
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, robot_from_urdf
@@ -47,7 +47,7 @@ def check(document: Document, model: CellModel, urdf: str, profiles: Mapping[str
         *_producer_faults(model),
         *_axis_faults(model, joints, urdf),
         *_list_faults(model),
-        *_signer_faults(model.policy.apply.signers),
+        *signer_faults(model.policy.apply.signers),
         *clearance_faults(model.workspace, model.clearance, names),
         *max_change_faults(model.policy.apply, names),
     ]
@@ -110,18 +110,6 @@ def _list_faults(model: CellModel) -> Iterator[Fault]:
                 "each mounting a name of its own: it denotes one body in one place",
             )
         yield from _inertia_faults(payload, index)
-
-
-def _signer_faults(signers: Mapping[str, str]) -> Iterator[Fault]:
-    """Find malformed public keys now, and not at the first signature, long after the recording."""
-    good: dict[str, str] = {}
-    for name, line in signers.items():
-        try:
-            public_keys({**good, name: line})
-        except ConfigurationInconsistent as error:
-            yield Fault(("policy", "apply", "signers", name), error.found, error.expected)
-        else:
-            good[name] = line
 
 
 def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
@@ -302,7 +290,14 @@ def _bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Itera
     if len(model.buses) > 1 and model.sync.producer != RECORDER:
         expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
         yield Fault(("sync", "producer"), f"{model.sync.producer}, with {len(model.buses)} buses", expected)
-    yield from _refresh_faults(model, model.sync.period_us, profiles)
+    for drive in model.drives:
+        refresh_us = profiles[drive].update_period_us
+        if refresh_us > model.sync.period_us:
+            yield Fault(
+                ("sync", "period_us"),
+                f"{model.sync.period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
+                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
+            )
     for index, bus in enumerate(model.buses):
         if model.sync.pacing is Pacing.TIMED:
             yield from _load_faults(model, model.sync.period_us, bus, profiles)
@@ -348,17 +343,6 @@ def _wiring_faults(model: CellModel) -> Iterator[Fault]:
             several = ", on all buses together: a frame is known by its node id alone" if len(names) > 1 else ""
             found = f"{axis.node_id}, used {used[axis.node_id]} times"
             yield Fault(("axes", index, "node_id"), found, f"each node once{several}")
-
-
-def _refresh_faults(model: CellModel, period_us: int, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:
-    for drive in model.drives:
-        refresh_us = profiles[drive].update_period_us
-        if refresh_us > period_us:
-            yield Fault(
-                ("sync", "period_us"),
-                f"{period_us}, while drive {drive} refreshes its objects every {refresh_us} µs",
-                f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
-            )
 
 
 def _load_faults(model: CellModel, period_us: int, bus: Bus, profiles: Mapping[str, DriveProfile]) -> Iterator[Fault]:

@@ -26,44 +26,26 @@ class ControllerFormat(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class GainObject:
-    """Object of a drive that holds its gain: number in the drive = gain × factor."""
-
-    parameter: Parameter
-    factor: float
-
-
-@dataclass(frozen=True, slots=True)
-class Controller:
-    """Destination of the gains."""
-
-    file: str | None  #: the controller file, relative to the cell file; None if the gains go only to the drives
-    gains: tuple[str, ...]  #: key of each axis's number in the file; empty without a file
-    factors: tuple[float, ...] = ()  #: number in the file = gain × factor, one for each of `gains`
-    format: ControllerFormat | None = None  #: format of the file; None to derive it from the suffix
-    #: Objects of the drives, one for each axis; empty if the drives are not written.
-    objects: tuple[GainObject, ...] = ()
-
-
-# The file writes a key alone or with its factor, and an object without the classes of `drivers`.
-
-
-@dataclass(frozen=True, slots=True)
 class GainKey:
     """A key of a controller that keeps its gains in another unit, or with another sign."""
 
     key: FileName
-    factor: _Factor = 1.0
+    factor: _Factor = 1.0  #: number in the file = gain × factor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GainObjectSection:
-    """An object of a drive."""
+class GainObject:
+    """Object of a drive that holds its gain."""
 
     index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]
     subindex: Annotated[int, Field(ge=0, le=0xFF)] = 0
     type: ParameterKind
-    factor: _Factor = 1.0
+    factor: _Factor = 1.0  #: number in the drive = gain × factor
+
+    @property
+    def parameter(self) -> Parameter:
+        """The object for `drivers`."""
+        return Parameter(self.index, self.subindex, self.type)
 
 
 _KEY, _KEY_AND_FACTOR = not_in_file("key"), not_in_file("key and factor")
@@ -78,16 +60,17 @@ _Gain = Annotated[Annotated[FileName, Tag(_KEY)] | Annotated[GainKey, Tag(_KEY_A
 
 
 @dataclass(frozen=True, slots=True)
-class ControllerSection:
-    """`controller`."""
+class Controller:
+    """Destination of the gains."""
 
-    file: FileName | None = None
-    format: ControllerFormat | None = None
-    gains: tuple[_Gain, ...] = ()
-    objects: tuple[GainObjectSection, ...] = ()
+    file: FileName | None = None  #: the controller file, relative to the cell file; None if only the drives are written
+    format: ControllerFormat | None = None  #: format of the file; None to derive it from the suffix
+    gains: tuple[_Gain, ...] = ()  #: key of each axis's number in the file; empty without a file
+    #: Objects of the drives, one for each axis; empty if the drives are not written.
+    objects: tuple[GainObject, ...] = ()
 
     @model_validator(mode="after")
-    def _check_targets(self) -> ControllerSection:
+    def _check_targets(self) -> Controller:
         if (self.file is None) != (not self.gains) or (self.file is None and not self.objects):
             raise ValueError("file and gains of the controller, objects of the drives, or all three")
         if self.file is None and self.format is not None:
@@ -95,23 +78,17 @@ class ControllerSection:
         return self
 
     @property
-    def keys(self) -> tuple[GainKey, ...]:
-        """Each key with its factor."""
-        return tuple(gain if isinstance(gain, GainKey) else GainKey(gain) for gain in self.gains)
+    def keys(self) -> tuple[str, ...]:
+        """Key of each gain in the file."""
+        return tuple(gain.key if isinstance(gain, GainKey) else gain for gain in self.gains)
 
     @property
-    def controller(self) -> Controller:
-        """The controller for the write-back."""
-        return Controller(
-            file=self.file,
-            gains=tuple(gain.key for gain in self.keys),
-            factors=tuple(gain.factor for gain in self.keys),
-            format=self.format,
-            objects=tuple(GainObject(Parameter(o.index, o.subindex, o.type), o.factor) for o in self.objects),
-        )
+    def factors(self) -> tuple[float, ...]:
+        """Factor of each gain: number in the file = gain × factor."""
+        return tuple(gain.factor if isinstance(gain, GainKey) else 1.0 for gain in self.gains)
 
 
-def controller_faults(section: ControllerSection, axes: int, *, on_a_bus: bool) -> Iterator[Fault]:
+def controller_faults(section: Controller, axes: int, *, on_a_bus: bool) -> Iterator[Fault]:
     """Find keys and objects that do not match the axes, and factors of zero.
 
     Args:
@@ -126,7 +103,7 @@ def controller_faults(section: ControllerSection, axes: int, *, on_a_bus: bool) 
     if section.objects and not on_a_bus:
         expected = "bus, and node_id and drive of each axis"
         yield Fault(("controller", "objects"), "objects of drives that no bus leads to", expected)
-    factors = {"gains": [key.factor for key in section.keys], "objects": [entry.factor for entry in section.objects]}
+    factors = {"gains": section.factors, "objects": tuple(entry.factor for entry in section.objects)}
     for kind, values in factors.items():
         for index, factor in enumerate(values):
             if factor == 0.0 or not math.isfinite(factor):

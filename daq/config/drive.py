@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from daq.config.yaml_file import Document, Fault, Positive, StrictModel, describe, parse_yaml, read_model
+from daq.config.yaml_file import Fault, Positive, StrictModel, describe, parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import (
     Amplitude,
@@ -200,7 +200,12 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
     model = read_model(document, DriveModel)
     scale = model.current_scale.scale()
     if scale is None:
-        raise _peak_missing(document)
+        place = ("current_scale", "peak_current_a")
+        expected = "the peak current of this size of drive [A]; no object of the drive reports it"
+        raise ConfigurationInconsistent(
+            **describe(document, [Fault(place, "nothing", expected)]),
+            remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
+        )
     return DriveProfile(
         name=model.name,
         position=model.position.entry(),
@@ -216,16 +221,4 @@ def drive_from_text(text: bytes, name: str) -> DriveProfile:
         rated=None if model.rated is None else model.rated.rated(),
         save=None if model.save is None else model.save.save(),
         toggle_bit=model.toggle_bit,
-    )
-
-
-def _peak_missing(document: Document) -> ConfigurationInconsistent:
-    fault = Fault(
-        ("current_scale", "peak_current_a"),
-        "nothing",
-        "the peak current of this size of drive [A]; no object of the drive reports it",
-    )
-    return ConfigurationInconsistent(
-        **describe(document, [fault]),
-        remedy="copy the profile to drives/ beside your cell file and enter it from the drive's data sheet",
     )

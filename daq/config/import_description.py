@@ -114,14 +114,7 @@ def load_import(path: Path) -> ImportDescription:
         ConfigurationError: the file is missing or wrong.
     """
     document = parse_yaml(read_bytes(path), str(path))
-    description = read_model(document, ImportDescription)
-    faults = _faults(description)
-    if faults:
-        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the import description")
-    return description
-
-
-def _faults(wanted: ImportDescription) -> list[Fault]:
+    wanted = read_model(document, ImportDescription)
     faults = []
     if wanted.rate_hz is not None and wanted.time is not None:
         faults.append(Fault(("time",), "both rate_hz and time", "one of them"))
@@ -138,4 +131,6 @@ def _faults(wanted: ImportDescription) -> list[Fault]:
     named = [c for c in (*wanted.position.columns, *wanted.current.columns) if isinstance(c, str)]
     if named and not wanted.table.header:
         faults.append(Fault(("table", "header"), f"false, and column {named[0]!r} by name", "column numbers from 1"))
-    return faults
+    if faults:
+        raise ConfigurationInconsistent(**describe(document, faults), remedy="correct the import description")
+    return wanted

@@ -15,11 +15,12 @@ import os
 import re
 import stat
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
 
@@ -37,10 +38,24 @@ FileName = Annotated[str, Field(min_length=1, max_length=400, pattern=r"^[^\x00]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class StrictModel(BaseModel):
-    """Schema of a whole file, and of its sections: no unknown keys, no conversions, no NaN."""
+def _beside(name: str, info: ValidationInfo) -> Path:
+    return Path(name) if info.context is None else (info.context / name).resolve()
 
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+if TYPE_CHECKING:
+    FilePath = Path
+else:
+    FilePath = Annotated[FileName, AfterValidator(_beside)]
+    """A path relative to the file that names it; absolute where `read_model` knows the folder of that file."""
+
+
+class StrictModel(BaseModel):
+    """Schema of a whole file, and of its sections: no unknown keys, no conversions, no NaN.
+
+    A schema is built when its first document is read: most programs read few of the kinds.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 Model = TypeVar("Model", bound=StrictModel)
@@ -125,8 +140,9 @@ for _tag, _pattern, _first in _CORE_SCALARS:
 _TAGS = {f"tag:yaml.org,2002:{tag}" for tag in ("null", "bool", "int", "float", "str", "map", "seq")}
 
 
+@lru_cache(maxsize=16)
 def parse_yaml(text: bytes, name: str) -> Document:
-    """Parse one YAML document.
+    """Parse one YAML document. A cell reads its files for their names, their content and their digest: once is enough.
 
     Args:
         text: content of the file.
@@ -202,29 +218,30 @@ def read_bytes(path: Path) -> bytes:
     return content
 
 
-def read_model(document: Document, model: type[Model]) -> Model:
+def read_model(document: Document, model: type[Model], folder: Path | None = None) -> Model:
     """Check a document against its schema.
+
+    Args:
+        document: a parsed file.
+        model: its schema.
+        folder: folder of the file, which makes each `FilePath` in it absolute.
 
     Raises:
         SchemaMismatch: with every unknown key, missing key and wrong type, its line and the nearest known key.
     """
     try:
         # Through JSON, where a list may become a tuple and a word an enum although everything else is strict.
-        return model.model_validate_json(json.dumps(document.tree))
+        return model.model_validate_json(json.dumps(document.tree), context=folder)
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
-        raise _mismatch(document, faults, len(items) - len(faults)) from error
-
-
-def _mismatch(document: Document, faults: list[Fault], others: int) -> SchemaMismatch:
-    # A list counts as empty when its items are wrong; the faults inside say enough.
-    outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
-    inner = [fault for fault in faults if fault.path not in outer]
-    remedy = "correct the file; `drivegain init` shows every key"
-    if others:
-        remedy += f" ({others} more faults are not listed)"
-    return SchemaMismatch(**describe(document, inner), remedy=remedy)
+        # A list counts as empty when its items are wrong; the faults inside say enough.
+        outer = {fault.path[:length] for fault in faults for length in range(len(fault.path))}
+        remedy = "correct the file; `drivegain init` shows every key"
+        if len(items) > len(faults):
+            remedy += f" ({len(items) - len(faults)} more faults are not listed)"
+        inner = [fault for fault in faults if fault.path not in outer]
+        raise SchemaMismatch(**describe(document, inner), remedy=remedy) from error
 
 
 def describe(document: Document, faults: list[Fault]) -> dict[str, str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from daq.config.cell import Cell
-from daq.config.recalibration import Command, Interlock, InterlockFile, PlannedRun, Recalibration
+from daq.config.recalibration import Command, Interlock, PlannedRun, Recalibration
 from daq.errors import JobHeld, NotReleased, TimeBoundReached
 from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
@@ -123,11 +123,11 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
         NotReleased: it does not release the robot.
     """
     if interlock.command is not None:
-        ended = run(interlock.command, (), folder)
+        ended = run(Command(interlock.command, interlock.timeout_s), (), folder)
         if ended.code != 0:
-            raise _held(f"interlock command {interlock.command.command[0]}", str(ended), "exit code 0")
+            raise _held(f"interlock command {interlock.command[0]}", str(ended), "exit code 0")
     if interlock.file is not None:
-        _require_file(interlock.file, now)
+        _require_file(interlock.file, interlock, now)
 
 
 def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
@@ -147,12 +147,12 @@ def mount(section: Recalibration, planned: PlannedRun, run: Runner) -> None:
         )
 
 
-def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
-    subject = f"interlock file {file.path}"
-    expected = f"{file.says!r} in its first line, written within the last {file.max_age_s:g} s"
+def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime]) -> None:
+    subject = f"interlock file {file}"
+    expected = f"{interlock.says!r} in its first line, written within the last {interlock.max_age_s:g} s"
     try:
         # A FIFO of that name must not keep us waiting for its other end.
-        descriptor = os.open(file.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
         try:
             # Of the file that is open: a gateway may put another in its place meanwhile.
             found, asked = os.fstat(descriptor), now()
@@ -164,11 +164,11 @@ def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
     except OSError as error:
         raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
-    if says != file.says:
+    if says != interlock.says:
         raise _held(subject, repr(says[:80]), expected)
     age_s = asked.timestamp() - found.st_mtime
     # A time in the future is of another clock: the age is unknown.
-    if not -file.max_age_s <= age_s <= file.max_age_s:
+    if not -interlock.max_age_s <= age_s <= interlock.max_age_s:
         raise _held(subject, f"an age of {age_s:.0f} s", expected)
 
 

@@ -90,13 +90,15 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
     """Load the approved plan, or make the plan of the seed once a session."""
     if planned.plan_file is not None:
         return load_plan(planned.plan_file, context.cell)
-    path = session.folder / f"plan-{planned.seed}-{planned.duration_s:g}s.yaml"
+    assert planned.plan is not None  # the schema requires one of the two
+    seed, duration_s = planned.plan.seed, planned.plan.duration_s
+    path = session.folder / f"plan-{seed}-{duration_s:g}s.yaml"
     if path.exists():
         with suppress(ConfigurationError):  # what was damaged is made again
             return load_plan(path, context.cell)
-    context.journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
+    context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
     try:
-        save_plan(context.tools.plan(context.cell, seed=planned.seed, duration_s=planned.duration_s), path)
+        save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
     except OSError as error:
         raise OutputFailed.of(path, error) from error
     return load_plan(path, context.cell)  # as a person can read it

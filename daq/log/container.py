@@ -209,14 +209,6 @@ class RecordFile:
         """Make the error for an MCAP file that is not a log of a cell."""
         return LogForeign(str(self.path), found=found, expected=expected, remedy="is this a log of a cell?")
 
-    def definition(self, offset: int, opcode: int, body: bytes) -> McapRecord:
-        """Parse a schema or channel inside the chunk at an offset."""
-        if opcode == Opcode.SCHEMA:
-            schema: Schema = _parse(Schema.read, body, self, offset)
-            return schema
-        channel: Channel = _parse(Channel.read, body, self, offset)
-        return channel
-
     def unpack(self, offset: int, chunk: Chunk) -> bytes:
         """Decompress a chunk.
 
@@ -335,7 +327,8 @@ class ChunkContents:
             if end > len(data):
                 raise self._file.corrupt(offset, "a record beyond the end of its chunk", "one inside")
             if data[start] in {Opcode.SCHEMA, Opcode.CHANNEL}:
-                self.define(self._file.definition(offset, data[start], data[start + 9 : end]))
+                read = Schema.read if data[start] == Opcode.SCHEMA else Channel.read
+                self.define(_parse(read, data[start + 9 : end], self._file, offset))
             start = end
         return start
 

@@ -14,10 +14,9 @@ from daq.config.cell import DEGREE, Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomplete, PositionImplausible, RunInvalid
 from daq.log.metadata import Readback
-from daq.log.reader import Log, LossyLogs, SampleBlock, read_log, reports_only_losses
+from daq.log.reader import Log, LossyLogs, read_log, reports_only_losses
 from drivers.stream.sample import CellEvent, EventKind
 from ident.data.run import Recording, Run
-from ident.model.bodies import Payload
 
 _LOG = logging.getLogger("drivegain")
 FloatArray = NDArray[np.float64]
@@ -104,17 +103,11 @@ def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.
         )
     known = cell_from_bundle(log.head.files, names={"cell.yaml": f"{path}, cell.yaml"}) if cell is None else cell
     run = run_from_log(log, known, lossy)
-    if cell is not None and run.payload is not None:
-        run = replace(run, payload=_weighed_again(run.payload, cell))
+    if cell is not None and (payload := run.payload) is not None and "m" in payload.known:
+        for weighed in cell.payloads:
+            if (weighed.name, weighed.mounting) == (payload.name, payload.mounting):
+                run = replace(run, payload=replace(payload, known={**payload.known, "m": weighed.mass_kg}))
     return run, known
-
-
-def _weighed_again(payload: Payload, cell: Cell) -> Payload:
-    """Correct the mass of a payload by another description of the cell."""
-    for weighed in cell.payloads:
-        if (weighed.name, weighed.mounting) == (payload.name, payload.mounting) and "m" in payload.known:
-            return replace(payload, known={**payload.known, "m": weighed.mass_kg})
-    return payload
 
 
 def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> Run:
@@ -146,36 +139,45 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)
-    position_rad = scale.joint_position(_positions(log))
-    valid = _answered(samples) & ~_saturated(samples, cell)
-    _check_saturation(str(log.path), samples, cell)
+    counter = [axis.position_rad_per_count is None for axis in log.head.readback.axes]
+    counts = np.where(counter, unwrapped(samples.position_counts), samples.position_counts)
+    position_rad = scale.joint_position(counts)
+    bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
+    limited = samples.statusword & np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16) != 0
+    share = limited.mean(axis=0)
+    worst = int(np.argmax(share))
+    if share[worst] > LARGEST_SATURATED:
+        raise CurrentSaturated(
+            f"{log.path}, axis {cell.axes[worst].name}",
+            found=f"a limit active in {100.0 * share[worst]:.1f} % of the samples",
+            expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
+            remedy="plan slower moves, or a smaller payload",
+        )
+    answered = samples.missing[:, None] >> np.arange(len(cell.axes), dtype=np.uint32) & 1 == 0
+    valid = answered & ~limited
     check_limits(str(log.path), position_rad, cell, valid)
+    run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
     return Run(
         name=name,
         time_s=(samples.cycle - samples.cycle[0]).astype(np.float64) / rate_hz,
         position_rad=position_rad,
         current_a=samples.current_raw * scale.current_per_unit,
-        payload=log.head.run.payload,
+        payload=run.payload,
         move=moves(log.events, samples.time_ns),
         digest=log.digest,
         valid=valid,
         started_s=float(samples.time_ns[0]) * 1e-9,
         partial=log.partial or accepted,
-        recording=_recording(log, cell),
-    )
-
-
-def _recording(log: Log, cell: Cell) -> Recording:
-    run, drives = log.head.run, [axis.drive for axis in log.head.readback.axes]
-    return Recording(
-        # An import knows no time and writes 0.
-        recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
-        entered_kg=run.entered_kg,
-        serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
-        saturated_percent=tuple(float(share) for share in 100.0 * _saturated(log.samples, cell).mean(axis=0)),
-        lost_cycles=log.statistics.lost_cycles,
-        missing=log.statistics.missing,
-        controller_sha256=run.controller_sha256,
+        recording=Recording(
+            # An import knows no time and writes 0.
+            recorded_s=run.started_wall_ns * 1e-9 if run.started_wall_ns else None,
+            entered_kg=run.entered_kg,
+            serials=tuple(serial if type(serial := drive.get("serial")) is int else None for drive in drives),
+            saturated_percent=tuple((100.0 * share).tolist()),
+            lost_cycles=log.statistics.lost_cycles,
+            missing=log.statistics.missing,
+            controller_sha256=run.controller_sha256,
+        ),
     )
 
 
@@ -221,46 +223,22 @@ def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray
             )
 
 
-def unwrapped(counts: NDArray[np.int32]) -> NDArray[np.int64]:
+def unwrapped(
+    counts: NDArray[np.int32], before: tuple[NDArray[np.int32], NDArray[np.int64]] | None = None
+) -> NDArray[np.int64]:
     """Unwrap the positions of a 32 bit encoder counter, shape (k, n).
 
     A jump of more than half the range between two samples is a wrap: no motor makes 2³¹ counts in one period.
+
+    Args:
+        counts: positions of k samples, shape (k, n).
+        before: counter and unwrapped count of the sample before them, shape (n,) each; None at the start of a log.
     """
+    counter, count = (counts[0], counts[0].astype(np.int64)) if before is None else before
     # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
-    steps = np.diff(counts.astype(np.int32).view(np.uint32), axis=0).view(np.int32)
-    return np.concatenate((counts[:1].astype(np.int64), steps)).cumsum(axis=0, dtype=np.int64)
-
-
-def _positions(log: Log) -> NDArray[np.int64]:
-    """Return motor counts, unwrapped if they are an encoder's and not scaled by an import, shape (k, n)."""
-    counts = log.samples.position_counts
-    counter = np.array([axis.position_rad_per_count is None for axis in log.head.readback.axes])
-    return np.where(counter, unwrapped(counts), counts)
-
-
-def _answered(samples: SampleBlock) -> NDArray[np.bool_]:
-    """Return whether each axis answered the SYNC, shape (k, n)."""
-    bits = np.arange(samples.position_counts.shape[1], dtype=np.uint32)
-    return np.asarray((samples.missing[:, None] >> bits & 1) == 0, dtype=np.bool_)
-
-
-def _saturated(samples: SampleBlock, cell: Cell) -> NDArray[np.bool_]:
-    """Return whether the amplifier reports an active limit (6041h, bit of its profile), shape (k, n)."""
-    bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
-    masks = np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16)
-    return np.asarray((samples.statusword & masks) != 0, dtype=np.bool_)
-
-
-def _check_saturation(name: str, samples: SampleBlock, cell: Cell) -> None:
-    share = _saturated(samples, cell).mean(axis=0)
-    worst = int(np.argmax(share))
-    if share[worst] > LARGEST_SATURATED:
-        raise CurrentSaturated(
-            f"{name}, axis {cell.axes[worst].name}",
-            found=f"a limit active in {100.0 * share[worst]:.1f} % of the samples",
-            expected=f"at most {100.0 * LARGEST_SATURATED:g} %",
-            remedy="plan slower moves, or a smaller payload",
-        )
+    words = np.concatenate((counter[None, :], counts)).astype(np.int32).view(np.uint32)
+    steps = np.diff(words, axis=0).view(np.int32)
+    return np.asarray(count + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
 
 
 def _check_cycles(log: Log, rate_hz: float) -> None:

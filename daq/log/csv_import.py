@@ -71,7 +71,13 @@ def import_csv(
     files = {name: read_table(data / name, wanted.table) for name in names}
     position = numbers(files[wanted.position.file], wanted.position.columns)
     current = numbers(files[wanted.current.file], wanted.current.columns)
-    _check_lengths(files)
+    if len({len(file.rows) for file in files.values()}) > 1:
+        raise TableUnfit(
+            ", ".join(str(file.path) for file in files.values()),
+            found=" and ".join(f"{len(file.rows)} rows in {name}" for name, file in files.items()),
+            expected="as many in each",
+            remedy="one of them ends early, or they are of different runs; export them again",
+        )
     rate_hz = _rate_hz(wanted, files)
     counts, count_rad = _counts(wanted, cell, position, files[wanted.position.file])
     _check_current(current, wanted, files[wanted.current.file])
@@ -104,8 +110,10 @@ def import_csv(
         # A crash of an import loses no sample, so no clock is needed to flush in time.
         with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0) as log:
             opened = True
-            for sample in _samples(counts, raw, rate_hz):
-                log.write(sample)
+            time_ns = np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64).tolist()
+            silent = (0,) * len(cell.axes)
+            for cycle, row in enumerate(zip(time_ns, counts.tolist(), raw.tolist(), strict=True)):
+                log.write(Sample(cycle, row[0], tuple(row[1]), tuple(row[2]), silent))
             log.conclude(valid=True)
     except BaseException:
         if opened:
@@ -154,13 +162,6 @@ def _counts(
         offset_rad = np.array([axis.zero_offset_rad for axis in cell.axes])
         angle_rad = (angle_rad - offset_rad) @ cell.ratio.T
     return quantise(angle_rad)
-
-
-def _samples(counts: IntArray, raw: IntArray, rate_hz: float) -> Sequence[Sample]:
-    time_ns = np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64).tolist()
-    silent = (0,) * counts.shape[1]
-    rows = zip(time_ns, counts.tolist(), raw.tolist(), strict=True)
-    return [Sample(k, t, tuple(q), tuple(v), silent) for k, (t, q, v) in enumerate(rows)]
 
 
 def _rate_hz(wanted: ImportDescription, files: dict[str, TableFile]) -> float:
@@ -228,17 +229,6 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             remedy="add it to the cell file",
         )
     _payload(wanted, cell)
-
-
-def _check_lengths(files: dict[str, TableFile]) -> None:
-    lengths = {name: len(file.rows) for name, file in files.items()}
-    if len(set(lengths.values())) > 1:
-        raise TableUnfit(
-            ", ".join(str(file.path) for file in files.values()),
-            found=" and ".join(f"{length} rows in {name}" for name, length in lengths.items()),
-            expected="as many in each",
-            remedy="one of them ends early, or they are of different runs; export them again",
-        )
 
 
 def _check_current(current: FloatArray, wanted: ImportDescription, file: TableFile) -> None:
@@ -434,7 +424,11 @@ def _not_numeric(file: TableFile, indices: list[int]) -> TableUnfit:
         fields = file.fields(row)
         for index in indices:
             text = fields[index].replace(",", ".") if file.table.decimal == "," else fields[index]
-            if not _finite(text):
+            try:
+                finite = math.isfinite(float(text))
+            except ValueError:
+                finite = False
+            if not finite:
                 label = file.names[index] if file.names else str(index + 1)
                 return TableUnfit(
                     f"{file.path}:{file.first_line + number}, column {label}",
@@ -445,10 +439,3 @@ def _not_numeric(file: TableFile, indices: list[int]) -> TableUnfit:
     return TableUnfit(
         str(file.path), found="fields that are no numbers", expected="numbers", remedy="check the decimal sign"
     )
-
-
-def _finite(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
-from daq.log.conversion import moves, scaling
+from daq.log.conversion import moves, scaling, unwrapped
 from daq.log.reader import LogReader, SampleBlock
 from drivers.stream.sample import CellEvent
 
@@ -101,8 +101,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
     except OSError as error:
         raise OutputFailed.of(out, error) from error
     said = reader.statistics
-    partial = said.partial or log.name.endswith(".part")
-    return Exported(names, rows, partial, said.valid, said.reason)
+    return Exported(names, rows, reader.partial, said.valid, said.reason)
 
 
 def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iterator[Columns]:
@@ -123,19 +122,11 @@ def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iter
         counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
         if last is None:
             first_ns = int(block.time_ns[0])
-            last = block.position_counts[0], block.position_counts[0].astype(np.int64)
-        unwrapped = _continued(last, block.position_counts)
-        last = block.position_counts[-1], unwrapped[-1]
-        counts = np.where(counter, unwrapped, block.position_counts)
+        counted = unwrapped(block.position_counts, last)
+        last = block.position_counts[-1], counted[-1]
+        counts = np.where(counter, counted, block.position_counts)
         joints = scale.joint_position(counts)
         yield _columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns)
-
-
-def _continued(last: tuple[NDArray[np.int32], NDArray[np.int64]], counts: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Continue `daq.log.conversion.unwrapped` from the last counter and unwrapped count, shape (n,) each."""
-    all_counts = np.concatenate((last[0][None, :], counts)).astype(np.int32)
-    steps = np.diff(all_counts.view(np.uint32), axis=0).view(np.int32)
-    return np.asarray(last[1] + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
 
 
 def _columns(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Annotated, Any, TypeVar
+
+from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError
 
 from ident.model.bodies import LINK_PARAMETERS, Payload
+
+T = TypeVar("T")
 
 RUN, STATISTICS, READBACK = "drivegain.run", "drivegain.statistics", "readback.json"
 """Names of two metadata records and an attachment."""
@@ -55,13 +58,16 @@ class RunInfo:
         return self.started_wall_ns - self.started_monotonic_ns
 
 
+_Count = Annotated[int, Field(ge=0, le=LARGEST_COUNT)]
+
+
 @dataclass(frozen=True, slots=True)
 class RunStatistics:
     """Facts known when a recording ends."""
 
-    samples: int  #: number of cycles in the log
-    lost_cycles: int  #: number of cycles missing from it
-    missing: tuple[int, ...]  #: number of samples without an answer, for each axis
+    samples: _Count  #: number of cycles in the log
+    lost_cycles: _Count  #: number of cycles missing from it
+    missing: tuple[_Count, ...]  #: number of samples without an answer, for each axis
     valid: bool  #: whether the recorder considers the run usable
     reason: str = ""  #: why not
     partial: bool = False  #: the log was salvaged from a recording that was never finished
@@ -104,13 +110,10 @@ def run_from_record(record: Mapping[str, str]) -> RunInfo:
         raise ValueError(f"version {record['version']!r} of the log contract; this software reads {VERSION}")
     payload = None
     if Role(record["role"]) is Role.LOADED:
-        known = json.loads(record["payload_known"])
-        if not isinstance(known, dict) or not known.keys() <= set(LINK_PARAMETERS):
-            raise ValueError(f"known payload parameters {record['payload_known']!r}")
-        numbers = {key: _number(value) for key, value in known.items()}
-        if not all(map(math.isfinite, numbers.values())) or numbers.get("m", 1.0) <= 0.0:
-            raise ValueError(f"known payload {record['payload_known']!r}: not finite numbers with a mass above 0")
-        payload = Payload(record["payload"], record["mounting"], numbers)
+        known = _validated(dict[str, FiniteFloat], record["payload_known"])
+        if not known.keys() <= set(LINK_PARAMETERS) or known.get("m", 1.0) <= 0.0:
+            raise ValueError(f"known payload {record['payload_known']!r:.80}: expected parameters with a mass above 0")
+        payload = Payload(record["payload"], record["mounting"], known)
     rate_hz = float(record["rate_hz"])
     if not 0.0 < rate_hz < 1e6:
         raise ValueError(f"sampling rate {record['rate_hz']!r}")
@@ -159,27 +162,30 @@ def statistics_from_record(record: Mapping[str, str]) -> RunStatistics:
         KeyError: an entry is missing.
         ValueError: an entry is invalid.
     """
-    missing, valid = json.loads(record["missing"]), json.loads(record["valid"])
-    partial = json.loads(record.get("partial", "false"))
-    if not (isinstance(valid, bool) and isinstance(partial, bool) and isinstance(missing, list)):
-        found = f"missing {record['missing']!r}, valid {record['valid']!r}, partial {partial!r}"
-        raise ValueError(found)  # noqa: TRY004 - a foreign record
     offset_ns = record.get("wall_minus_monotonic_ns", "")
-    samples, lost_cycles = int(record["samples"]), int(record["lost_cycles"])
-    for count in (samples, lost_cycles, *missing):
-        if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= LARGEST_COUNT:
-            raise ValueError(f"a count of {count!r:.40}")
-    if max(missing, default=0) > samples:
-        raise ValueError(f"{max(missing)} answers missing in {samples} samples")
-    return RunStatistics(
-        samples=samples,
-        lost_cycles=lost_cycles,
-        missing=tuple(missing),
-        valid=valid,
-        reason=record["reason"],
-        partial=partial,
-        wall_minus_monotonic_ns=int(offset_ns) if offset_ns else None,
-    )
+    tree = {
+        "samples": int(record["samples"]),
+        "lost_cycles": int(record["lost_cycles"]),
+        "missing": json.loads(record["missing"]),
+        "valid": json.loads(record["valid"]),
+        "reason": record["reason"],
+        "partial": json.loads(record.get("partial", "false")),
+        "wall_minus_monotonic_ns": int(offset_ns) if offset_ns else None,
+    }
+    statistics = _validated(RunStatistics, json.dumps(tree))
+    if max(statistics.missing, default=0) > statistics.samples:
+        raise ValueError(f"{max(statistics.missing)} answers missing in {statistics.samples} samples")
+    return statistics
+
+
+def _validated(kind: type[T], data: str | bytes) -> T:
+    """Decode a foreign JSON document; a ValueError names the first place that does not fit."""
+    try:
+        return TypeAdapter(kind).validate_json(data, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place, expected = ".".join(map(str, first["loc"])), first["msg"].removeprefix("Input should be ")
+        raise ValueError(f"{place or 'the whole'} is {first['input']!r:.40}, expected {expected}") from error
 
 
 def sealed(record: Mapping[str, str]) -> dict[str, str]:
@@ -203,14 +209,7 @@ def _checksum(record: Mapping[str, str]) -> str:
     return f"{zlib.crc32(json.dumps(sorted(record.items())).encode()):08x}"
 
 
-def _number(value: object) -> float:
-    """Convert a number of a foreign JSON document; NaN for anything else, also for an integer beyond any float."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return math.nan
-    try:
-        return float(value)
-    except OverflowError:
-        return math.nan
+_Quantum = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +217,9 @@ class AxisReadback:
     """Answers of the amplifier of one axis."""
 
     name: str  #: name of the axis
-    current_per_unit: float  #: unit of the reference (A) per raw unit, from the profile's formula and objects
+    current_per_unit: _Quantum  #: unit of the reference (A) per raw unit, from the profile's formula and objects
     #: Motor angle of a count [rad]; None for 2π / counts per revolution of the cell.
-    position_rad_per_count: float | None = None
+    position_rad_per_count: _Quantum | None = None
     #: Identity, serial number, rated current, PDO mapping and whatever else the amplifier reported.
     drive: dict[str, Any] = field(default_factory=dict)
 
@@ -229,7 +228,7 @@ class AxisReadback:
 class Readback:
     """Answers of all amplifiers when a recording started. Without them raw numbers have no unit."""
 
-    axes: tuple[AxisReadback, ...]
+    axes: Annotated[tuple[AxisReadback, ...], Field(min_length=1)]
 
 
 def readback_of_drives(names: Sequence[str], ampere_per_unit: Sequence[float], answers: Mapping[str, Any]) -> Readback:
@@ -259,30 +258,4 @@ def readback_from_bytes(data: bytes) -> Readback:
     Raises:
         ValueError: it is not a readback.
     """
-    try:
-        tree = json.loads(data)
-    except RecursionError as error:
-        raise ValueError("nested too deep") from error
-    axes = tree.get("axes") if isinstance(tree, dict) else None
-    if not isinstance(axes, list) or not axes:
-        raise ValueError("no list of axes")
-    return Readback(tuple(_axis(axis) for axis in axes))
-
-
-def _axis(tree: Any) -> AxisReadback:
-    tree = tree if isinstance(tree, dict) else {}
-    name, drive, angle = tree.get("name"), tree.get("drive", {}), tree.get("position_rad_per_count")
-    if not (isinstance(name, str) and isinstance(drive, dict)):
-        raise ValueError(f"axis {name!r}: name or drive")  # noqa: TRY004 - one kind of error for a foreign attachment
-    return AxisReadback(
-        name=name,
-        current_per_unit=_quantum(name, "current_per_unit", tree.get("current_per_unit")),
-        position_rad_per_count=None if angle is None else _quantum(name, "position_rad_per_count", angle),
-        drive=drive,
-    )
-
-
-def _quantum(name: str, key: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value <= sys.float_info.max:
-        raise ValueError(f"axis {name!r}: {key} is {value!r:.40}, expected a positive number")
-    return float(value)
+    return _validated(Readback, data)

@@ -64,6 +64,7 @@ class Log:
         samples: all samples.
         events: in the order of the log.
         statistics: the recorder's summary at the end.
+        partial: the end of the recording is unknown: it was salvaged, or never got its final name.
     """
 
     path: Path
@@ -72,15 +73,7 @@ class Log:
     samples: SampleBlock
     events: tuple[CellEvent, ...]
     statistics: RunStatistics
-
-    @property
-    def partial(self) -> bool:
-        """Whether the end of the recording is unknown: it was salvaged, or never got its final name."""
-        return _partial(self.path, self.statistics)
-
-
-def _partial(path: Path, statistics: RunStatistics) -> bool:
-    return statistics.partial or path.name.endswith(UNFINISHED)
+    partial: bool
 
 
 class LogReader:
@@ -161,7 +154,11 @@ class LogReader:
             if isinstance(record, Attachment):
                 self._attachments[record.name] = record.data
             elif isinstance(record, Metadata):
-                self._metadata[record.name] = self._entries(offset, record)
+                try:
+                    self._metadata[record.name] = unsealed(record.metadata)
+                except ValueError as error:
+                    found = f"metadata {record.name!r} with {error}"
+                    raise self._file.corrupt(offset, found, "those that were sealed") from error
             elif isinstance(record, Header) and record.profile != "ros2":
                 raise self._file.foreign(f"profile {record.profile!r}", "ros2")
             elif isinstance(record, Chunk):
@@ -200,18 +197,10 @@ class LogReader:
         except (KeyError, ValueError, RecursionError) as error:
             raise self._incomplete(error, f"metadata {STATISTICS!r}") from error
 
-    def _entries(self, offset: int, record: Metadata) -> dict[str, str]:
-        try:
-            return unsealed(record.metadata)
-        except ValueError as error:
-            raise self._file.corrupt(
-                offset, f"metadata {record.name!r} with {error}", "those that were sealed"
-            ) from error
-
     @property
     def partial(self) -> bool:
         """See `Log.partial`; after the iteration."""
-        return _partial(self.path, self.statistics)
+        return self.statistics.partial or self.path.name.endswith(UNFINISHED)
 
     def _block(self, offset: int, chunks: list[NDArray[np.void]]) -> SampleBlock:
         # Joined as bytes: numpy would convert the fields chunk by chunk.
@@ -269,14 +258,10 @@ def read_log(path: Path) -> Log:
             expected=f"{statistics.samples}, as its recorder counted",
             remedy="another tool may have cut the log; take the original",
         )
-    return Log(path, reader.digest, head, _joined(blocks), tuple(reader.events), statistics)
-
-
-def _joined(blocks: list[SampleBlock]) -> SampleBlock:
-    """Join all samples; the blocks are freed, so that a long log is not in memory twice."""
     columns = {name: [getattr(block, name) for block in blocks] for name in SampleBlock.__slots__}
-    blocks.clear()
-    return SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+    blocks.clear()  # so that a long log is not in memory twice
+    samples = SampleBlock(**{name: np.concatenate(columns.pop(name)) for name in SampleBlock.__slots__})
+    return Log(path, reader.digest, head, samples, tuple(reader.events), statistics, reader.partial)
 
 
 MASKED = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -16,7 +16,7 @@ from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
 from daq.log.reader import LogReader, SampleBlock
 from daq.log.writer import LogContent, LogWriter
-from drivers.stream.sample import CellEvent, EventKind, Sample
+from drivers.stream.sample import EventKind, Sample
 
 _HARMLESS = (
     EventKind.EMCY_RESET,
@@ -57,9 +57,19 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
         ConfigurationError: the cell configuration in it is inconsistent.
     """
     _refuse_running(damaged)
-    _refuse_name_of_the_whole(damaged, out)
+    if damaged == out.with_name(out.name + UNFINISHED):
+        raise UsageError(
+            str(out),
+            found="the name of the whole recording",
+            expected="a name that shows that it is partial",
+            remedy=f"choose another --out, such as {out.stem}-partial{out.suffix}",
+        )
     if not damaged.name.endswith(UNFINISHED):
-        _refuse_whole(damaged)
+        with suppress(LogUnreadable):
+            for _ in LogReader(damaged):
+                pass
+            expected = "a damaged or unfinished one"
+            raise UsageError(str(damaged), found="a whole log", expected=expected, remedy="use it as it is")
     reader = LogReader(damaged)
     blocks = reader.until_damage()
     first = next(blocks, None)
@@ -91,57 +101,32 @@ def _copy(
 ) -> None:
     known_events = 0
     for block in blocks:
-        _check_width(reader.path, block, axes)
+        width = block.position_counts.shape[1]
+        if width != axes:
+            raise LogIncomplete(
+                str(reader.path),
+                found=f"samples of {width} axes",
+                expected=f"{axes}, as in its cell configuration",
+                remedy="it is not a recording of this software",
+            )
         for event in reader.events[known_events:]:
             log.event(event)
         known_events = len(reader.events)
-        for sample in _samples(block):
-            log.write(sample)
+        columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
+        for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
+            log.write(Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing))
         progress(log.statistics.samples)
     for event in reader.events[known_events:]:
         log.event(event)
-    log.conclude(*_verdict(reader, log.statistics), partial=True)
-
-
-def _samples(block: SampleBlock) -> Iterator[Sample]:
-    columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
-    for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
-        yield Sample(cycle, time_ns, tuple(position), tuple(current), tuple(statusword), missing)
-
-
-def _verdict(reader: LogReader, counted: RunStatistics) -> tuple[bool, str]:
-    """Return the recorder's own verdict if it was written; else that of the losses and faults in samples and events."""
     if reader.concluded:
-        return reader.statistics.valid, reader.statistics.reason
-    found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
-    found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
-    found += [_event_text(event) for event in reader.events if event.kind not in _HARMLESS][:3]
-    return not found, ", ".join(found)
-
-
-def _event_text(event: CellEvent) -> str:
-    return f"{event.kind.value} ({event.text})"
-
-
-def _check_width(damaged: Path, block: SampleBlock, axes: int) -> None:
-    width = block.position_counts.shape[1]
-    if width != axes:
-        raise LogIncomplete(
-            str(damaged),
-            found=f"samples of {width} axes",
-            expected=f"{axes}, as in its cell configuration",
-            remedy="it is not a recording of this software",
-        )
-
-
-def _refuse_name_of_the_whole(damaged: Path, out: Path) -> None:
-    if damaged == out.with_name(out.name + UNFINISHED):
-        raise UsageError(
-            str(out),
-            found="the name of the whole recording",
-            expected="a name that shows that it is partial",
-            remedy=f"choose another --out, such as {out.stem}-partial{out.suffix}",
-        )
+        valid, reason = reader.statistics.valid, reader.statistics.reason
+    else:  # no verdict of the recorder: that of the losses and faults in samples and events
+        counted = log.statistics
+        found = [f"{counted.lost_cycles} cycles lost"] if counted.lost_cycles else []
+        found += [f"{sum(counted.missing)} missing answers"] if any(counted.missing) else []
+        found += [f"{event.kind.value} ({event.text})" for event in reader.events if event.kind not in _HARMLESS][:3]
+        valid, reason = not found, ", ".join(found)
+    log.conclude(valid, reason, partial=True)
 
 
 def _refuse_running(damaged: Path) -> None:
@@ -157,15 +142,3 @@ def _refuse_running(damaged: Path) -> None:
             ) from error
         except OSError:
             return  # a file system without locks
-
-
-def _refuse_whole(damaged: Path) -> None:
-    reader = LogReader(damaged)
-    try:
-        for _ in reader:
-            pass
-    except LogUnreadable:
-        return
-    raise UsageError(
-        str(damaged), found="a whole log", expected="a damaged or unfinished one", remedy="use it as it is"
-    )

@@ -231,23 +231,19 @@ class LogWriter:
         """Rename the finished log without replacing a file that has appeared meanwhile."""
         try:
             self.path.hardlink_to(self.part)
-        except FileExistsError as error:
-            raise self._name_taken() from error
-        except OSError:  # a file system without hard links
-            if self.path.exists():
-                raise self._name_taken() from None
+        except OSError as error:
+            # Without an existing file it is a file system without hard links.
+            if isinstance(error, FileExistsError) or self.path.exists():
+                raise UsageError(
+                    str(self.path),
+                    found="a file of that name, which was not there when the recording began",
+                    expected="none",
+                    remedy=f"nothing was replaced: the whole recording is {self.part}; give it another name without "
+                    f"{UNFINISHED}, or move the other file away",
+                ) from error
             self.part.rename(self.path)
         else:
             self.part.unlink()
-
-    def _name_taken(self) -> UsageError:
-        return UsageError(
-            str(self.path),
-            found="a file of that name, which was not there when the recording began",
-            expected="none",
-            remedy=f"nothing was replaced: the whole recording is {self.part}; give it another name without "
-            f"{UNFINISHED}, or move the other file away",
-        )
 
     def _open(self) -> None:
         # Data CRCs protect attachments and metadata too, which are outside chunks.

@@ -15,7 +15,6 @@ from rich.text import Text
 from daq.config.bus import bus_loads, frame_bits
 from daq.config.cell import Pacing
 from daq.report.text import picked, plain_table, printable
-from drivers.canopen.link import nmt_name
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
 
@@ -53,6 +52,8 @@ _IDENTITY = ("vendor_id", "product_code", "serial")
 
 def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[str, Any]]:
     """Rows of the nodes of one bus, configured or found."""
+    from drivers.canopen.link import nmt_name  # noqa: PLC0415 - `info` shows currents without the CAN library
+
     homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
     nodes = {node.node_id: node for node in found}
@@ -129,6 +130,8 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
         ampere: amperes per raw unit of each axis' current, None where unknown.
         events: texts of recent events, oldest first.
     """
+    from drivers.canopen.link import nmt_name  # noqa: PLC0415 - as above
+
     axes = []
     for declared, axis, position, ampere_per_unit in zip(
         cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
@@ -11,7 +12,9 @@ from rich.table import Table
 from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, render, unformatted
 from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
-from ident.discovery.before_after import GainChange
+
+if TYPE_CHECKING:  # `history` needs no effects
+    from ident.discovery.before_after import GainChange
 
 _SIGMAS = 2.0
 _BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes

@@ -235,11 +235,10 @@ def in_force(cell: Cell, store: HistoryStore) -> str | None:
         return store.in_force(drives_of(cell.name)) if controller.objects else None
     try:
         target = str(resolve_links(file))
-        scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.gains)
+        scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.keys)
     except (ControllerUnfit, OSError):
         return None
-    factors = controller.factors or (1.0,) * len(scalars)
-    numbers = dict(zip(cell.axis_names, zip(scalars, factors, strict=True), strict=True))
+    numbers = dict(zip(cell.axis_names, zip(scalars, controller.factors, strict=True), strict=True))
     known, writes = store.in_force(target), [event.digest for event in store.events()]
     # Where several have these numbers: the one that the history names, else the one that was written last.
     order = [digest for digest in (known, *reversed(writes)) if digest is not None]

@@ -269,9 +269,10 @@ def defer_full_gc() -> Iterator[None]:
     A search through all that the program and its libraries have made takes tens of milliseconds, in which nothing else
     of the process runs: so many periods without SYNC at 1 kHz, and a run that is marked invalid.
     """
-    young, middle, old = gc.get_threshold()
-    gc.set_threshold(young, middle, NEVER)
+    before = gc.get_threshold()
+    # Python's own limits for young objects, which the command line raises: each of these searches takes microseconds.
+    gc.set_threshold(700, 10, NEVER)
     try:
         yield
     finally:
-        gc.set_threshold(young, middle, old)
+        gc.set_threshold(*before)

@@ -101,8 +101,8 @@ class FileTarget:
                 expected="the controller's file and the key of each gain",
                 remedy="add `controller: {file: ..., gains: [...]}` to the cell file",
             )
-        keys = dict(zip(cell.axis_names, controller.gains, strict=True))
-        factors = dict(zip(cell.axis_names, controller.factors, strict=True)) if controller.factors else {}
+        keys = dict(zip(cell.axis_names, controller.keys, strict=True))
+        factors = dict(zip(cell.axis_names, controller.factors, strict=True))
         return cls(chosen, keys, controller.format, factors, cell)
 
     @property

@@ -15,7 +15,6 @@ Text that does not fit is a ValueError with what was found.
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import struct
 from dataclasses import dataclass
@@ -24,10 +23,11 @@ from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from cryptography.hazmat.primitives.kdf.scrypt import Scrypt
 
-UNTRUSTED, TRUSTED = "untrusted comment: ", "trusted comment: "
-_KEY, _PREHASHED, _CHECK = b"Ed", b"ED", b"B2"
+from daq.config.signers import KEY_ALGORITHM, UNTRUSTED, PublicKey, decode_line, shown_id
+
+TRUSTED = "trusted comment: "
+_PREHASHED, _CHECK = b"ED", b"B2"
 _SCRYPT, _PLAIN = b"Sc", b"\0\0"
-_PUBLIC = struct.Struct("<2s8s32s")
 _SECRET = struct.Struct("<2s2s2s32sQQ104s")
 _BODY = struct.Struct("<8s32s32s32s")
 _SIGNATURE = struct.Struct("<2s8s64s")
@@ -39,42 +39,6 @@ _MEMLIMIT_ALLOWED, _OPSLIMIT_ALLOWED = 2**30, 2**26
 
 
 @dataclass(frozen=True, slots=True)
-class PublicKey:
-    """Key that a signature is checked with."""
-
-    key_id: bytes  #: 8 bytes that name the key pair
-    key: bytes  #: Ed25519 public key, 32 bytes
-
-    @property
-    def line(self) -> str:
-        """One line, for `minisign -P` and a cell file."""
-        return base64.b64encode(_PUBLIC.pack(_KEY, self.key_id, self.key)).decode()
-
-    @property
-    def text(self) -> str:
-        """Content of its file."""
-        return f"{UNTRUSTED}minisign public key {_shown(self.key_id)}\n{self.line}\n"
-
-    def check(self, signature: Signature, content: bytes) -> None:
-        """Check that the holder of the secret key signed these bytes and this comment.
-
-        Raises:
-            ValueError: they did not.
-        """
-        if signature.key_id != self.key_id:
-            raise ValueError(f"a signature of key {_shown(signature.key_id)}, not of {_shown(self.key_id)}")
-        public = Ed25519PublicKey.from_public_bytes(self.key)
-        try:
-            public.verify(signature.signature, hashlib.blake2b(content).digest())
-        except InvalidSignature:
-            raise ValueError("a signature of other content") from None
-        try:
-            public.verify(signature.whole, signature.signature + signature.comment.encode())
-        except InvalidSignature:
-            raise ValueError("a trusted comment that was changed") from None
-
-
-@dataclass(frozen=True, slots=True)
 class SecretKey:
     """Key that a file is signed with, in memory only."""
 
@@ -83,7 +47,7 @@ class SecretKey:
 
     def __repr__(self) -> str:
         """Hide the secret, which must not reach a log with a traceback."""
-        return f"SecretKey({_shown(self.key_id)})"
+        return f"SecretKey({shown_id(self.key_id)})"
 
     @property
     def public(self) -> PublicKey:
@@ -107,10 +71,10 @@ class SecretKey:
         if password:
             body = _BODY.pack(self.key_id, self.seed, public, _checksum(self.key_id, self.seed, public))
             body = _xor(body, _stream(password, salt, _OPSLIMIT, _MEMLIMIT))
-            packed = _SECRET.pack(_KEY, _SCRYPT, _CHECK, salt, _OPSLIMIT, _MEMLIMIT, body)
+            packed = _SECRET.pack(KEY_ALGORITHM, _SCRYPT, _CHECK, salt, _OPSLIMIT, _MEMLIMIT, body)
         else:
             body = _BODY.pack(self.key_id, self.seed, public, bytes(32))
-            packed = _SECRET.pack(_KEY, _PLAIN, _CHECK, bytes(32), 0, 0, body)
+            packed = _SECRET.pack(KEY_ALGORITHM, _PLAIN, _CHECK, bytes(32), 0, 0, body)
         kind = "encrypted" if password else "unencrypted"
         return f"{UNTRUSTED}minisign {kind} secret key\n{base64.b64encode(packed).decode()}\n"
 
@@ -132,17 +96,23 @@ class Signature:
         return f"{UNTRUSTED}signature by drivegain\n{signed}\n{TRUSTED}{self.comment}\n{whole}\n"
 
 
-def parse_public_key(text: str) -> PublicKey:
-    """Parse a public key: its one line of base64, or its file with the comment above.
+def check_signature(key: PublicKey, signature: Signature, content: bytes) -> None:
+    """Check that the holder of the secret key signed these bytes and this comment.
 
     Raises:
-        ValueError: it is none.
+        ValueError: they did not.
     """
-    lines = text.strip().splitlines()
-    algorithm, key_id, key = _PUBLIC.unpack(_decoded(lines[-1] if lines else "", _PUBLIC.size, "a public key"))
-    if algorithm != _KEY or len(lines) > 2:
-        raise ValueError(f"a key of algorithm {algorithm!r}, or more than a key")
-    return PublicKey(key_id, key)
+    if signature.key_id != key.key_id:
+        raise ValueError(f"a signature of key {shown_id(signature.key_id)}, not of {shown_id(key.key_id)}")
+    public = Ed25519PublicKey.from_public_bytes(key.key)
+    try:
+        public.verify(signature.signature, hashlib.blake2b(content).digest())
+    except InvalidSignature:
+        raise ValueError("a signature of other content") from None
+    try:
+        public.verify(signature.whole, signature.signature + signature.comment.encode())
+    except InvalidSignature:
+        raise ValueError("a trusted comment that was changed") from None
 
 
 def is_encrypted(text: str) -> bool:
@@ -180,35 +150,25 @@ def parse_signature(text: str) -> Signature:
     shaped = len(lines) == _SIGNATURE_LINES and lines[0].startswith(UNTRUSTED) and lines[2].startswith(TRUSTED)
     if not shaped:
         raise ValueError("no signature: expected four lines, comment, signature, trusted comment, signature")
-    packed = _decoded(lines[1], _SIGNATURE.size, "a signature")
+    packed = decode_line(lines[1], _SIGNATURE.size, "a signature")
     algorithm, key_id, signature = _SIGNATURE.unpack(packed)
     if algorithm != _PREHASHED:
         raise ValueError(f"a signature of kind {algorithm!r}, not the prehashed kind ED (`minisign -S -H` makes it)")
-    whole = _decoded(lines[3], 64, "the signature of the trusted comment")
+    whole = decode_line(lines[3], 64, "the signature of the trusted comment")
     return Signature(key_id, signature, lines[2].removeprefix(TRUSTED), whole)
 
 
 def _parts(text: str) -> tuple[bytes, bytes, int, int, bytes]:
     lines = text.strip().splitlines()
-    packed = _decoded(lines[-1] if lines else "", _SECRET.size, "a secret key")
+    packed = decode_line(lines[-1] if lines else "", _SECRET.size, "a secret key")
     algorithm, kdf, check, salt, opslimit, memlimit, body = _SECRET.unpack(packed)
-    if algorithm != _KEY or check != _CHECK or kdf not in {_SCRYPT, _PLAIN}:
+    if algorithm != KEY_ALGORITHM or check != _CHECK or kdf not in {_SCRYPT, _PLAIN}:
         raise ValueError(f"a key of algorithm {algorithm!r}, key derivation {kdf!r}, checksum {check!r}")
     return kdf, salt, opslimit, memlimit, body
 
 
-def _decoded(line: str, size: int, what: str) -> bytes:
-    try:
-        decoded = base64.b64decode(line.strip(), validate=True)
-    except (binascii.Error, ValueError) as error:
-        raise ValueError(f"text that is not base64 where {what} should be") from error
-    if len(decoded) != size:
-        raise ValueError(f"{len(decoded)} bytes where {what} has {size}")
-    return decoded
-
-
 def _checksum(key_id: bytes, seed: bytes, public: bytes) -> bytes:
-    return hashlib.blake2b(_KEY + key_id + seed + public, digest_size=32).digest()
+    return hashlib.blake2b(KEY_ALGORITHM + key_id + seed + public, digest_size=32).digest()
 
 
 def _stream(password: str, salt: bytes, opslimit: int, memlimit: int) -> bytes:
@@ -229,8 +189,3 @@ def _scrypt_parameters(opslimit: int, memlimit: int) -> tuple[int, int]:
 
 def _xor(left: bytes, right: bytes) -> bytes:
     return bytes(a ^ b for a, b in zip(left, right, strict=True))
-
-
-def _shown(key_id: bytes) -> str:
-    """Format a key id as minisign prints it."""
-    return key_id[::-1].hex().upper()

@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import stat
 from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
+from daq.config.signers import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
 from daq.config.yaml_file import MAX_BYTES
 from daq.errors import (
     CalibrationMissing,
-    ConfigurationInconsistent,
     OutputFailed,
     SignatureInvalid,
     UsageError,
 )
 from daq.files import read_regular, replace_file
 from daq.writeback.minisign import (
-    UNTRUSTED,
-    PublicKey,
     SecretKey,
+    check_signature,
     is_encrypted,
-    parse_public_key,
     parse_secret_key,
     parse_signature,
 )
 
 SUFFIX = ".minisig"
-_NAME = re.compile(r"[^\W_][\w.-]{0,63}")
 _LARGEST_BYTES = 16_384
 
 
@@ -139,7 +135,7 @@ def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = N
         path = signature_path(file, name)
         if path.exists() or path.is_symlink():
             try:
-                key.check(parse_signature(_text_of(path)), content)
+                check_signature(key, parse_signature(_text_of(path)), content)
             except (ValueError, OSError) as error:
                 raise SignatureInvalid(
                     str(path),
@@ -151,35 +147,8 @@ def signers_of(file: Path, trusted: Mapping[str, str], content: bytes | None = N
     return tuple(found)
 
 
-def public_keys(trusted: Mapping[str, str]) -> dict[str, PublicKey]:
-    """Parse and check the keys of the trusted persons.
-
-    Raises:
-        ConfigurationInconsistent: see `signers_of`.
-    """
-    keys: dict[str, PublicKey] = {}
-    for name, line in trusted.items():
-        problem = None if _NAME.fullmatch(name) else "a name that cannot be part of a file name"
-        try:
-            key = parse_public_key(line)
-        except ValueError as error:
-            problem = str(error)
-        else:
-            same = [other for other, known in keys.items() if known.key == key.key]
-            problem = f"the key of {same[0]}" if same else problem
-            keys[name] = key
-        if problem is not None:
-            raise ConfigurationInconsistent(
-                f"trusted signer {name!r}",
-                found=problem,
-                expected="a public key of their own, the line that `drivegain sign key` prints",
-                remedy="correct it in the cell file",
-            )
-    return keys
-
-
 def _checked(name: str) -> str:
-    if not _NAME.fullmatch(name):
+    if not SIGNER_NAME.fullmatch(name):
         raise UsageError(
             "name of the signer",
             found=repr(name),

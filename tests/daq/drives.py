@@ -24,7 +24,7 @@ from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.parameters import Saving
 from drivers.canopen.sdo import SdoPolicy
-from drivers.profiles.profile import Axis, Mapping, Parameter, ParameterKind
+from drivers.profiles.profile import Axis, Mapping, ParameterKind
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.node import Node
@@ -34,8 +34,8 @@ from tests.daq.calibrations import NAMEPLATE, demo_calibration
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 ACTOR = Applier("Kim", "kim")
 CONFIGS = Path(__file__).parents[2] / "configs"
-WHOLE = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
-REAL = GainObject(Parameter(0x2003, 2, ParameterKind.F32), 1.0)
+WHOLE = GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1000.0)
+REAL = GainObject(index=0x2003, subindex=2, type=ParameterKind.F32, factor=1.0)
 
 
 def demo_cell(folder: Path, *objects: GainObject) -> Cell:
@@ -43,7 +43,7 @@ def demo_cell(folder: Path, *objects: GainObject) -> Cell:
     cell = load_cell(CONFIGS / "cells" / "demo.yaml")
     return replace(
         cell,
-        controller=Controller(None, (), objects=objects or (WHOLE,) * len(cell.axes)),
+        controller=Controller(objects=objects or (WHOLE,) * len(cell.axes)),
         history=HistoryPlace(folder / "demo.history.sqlite", folder / "demo.audit.jsonl"),
     )
 

@@ -28,19 +28,17 @@ def _cell(folder: Path, controller: str) -> Cell:
 
 def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
     cell = _cell(tmp_path, f"{{file: robot.cfg, format: xml, gains: {KEYS}}}")
-    assert cell.controller == Controller(
-        "robot.cfg",
-        ("a", "b", "c", "d", "e", "f"),
-        (1.0, 1000.0, -1.0, 1.0, 1.0, 1.0),
-        ControllerFormat.XML,
-    )
+    assert cell.controller is not None
+    assert (cell.controller.file, cell.controller.format) == ("robot.cfg", ControllerFormat.XML)
+    assert cell.controller.keys == ("a", "b", "c", "d", "e", "f")
+    assert (cell.controller.factors, cell.controller.objects) == ((1.0, 1000.0, -1.0, 1.0, 1.0, 1.0), ())
     assert cell.controller_path == tmp_path / "robot.cfg"
 
 
 def test_objects_alone_and_beside_a_file(tmp_path: Path) -> None:
-    reported = GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1000.0)
+    reported = GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1000.0)
     alone = _cell(tmp_path, f"{{objects: {OBJECTS}}}")
-    assert alone.controller == Controller(None, (), objects=(reported,) * 6)
+    assert alone.controller == Controller(objects=(reported,) * 6)
     assert alone.controller_path is None
     beside = _cell(tmp_path, f"{{file: robot.json, gains: [a, b, c, d, e, f], objects: {OBJECTS}}}")
     assert beside.controller is not None

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from daq.cli.terminal import interruptible
-from daq.config.recalibration import Command, Interlock, InterlockFile
+from daq.config.recalibration import Command, Interlock
 from daq.errors import (
     BusTaken,
     ConfigurationInconsistent,
@@ -366,8 +366,7 @@ def test_a_run_whose_payload_is_not_the_cells_is_refused(
 
 def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
     path = tmp_path / "interlock"
-    file = InterlockFile(path, "closed", 5.0)
-    interlock = Interlock(Command(("some", "program"), 1.0), file)
+    interlock = Interlock(command=("some", "program"), timeout_s=1.0, file=path, max_age_s=5.0)
 
     def ask(code: int | None = 0, later_s: float = 0.0) -> None:
         now = BEGAN + timedelta(seconds=later_s)
@@ -403,7 +402,7 @@ def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path)
         at[0] += timedelta(seconds=9)
         return Finished(0, "")
 
-    interlock = Interlock(Command(("some", "program"), 10.0), InterlockFile(path, "closed", 5.0))
+    interlock = Interlock(command=("some", "program"), file=path, max_age_s=5.0)
     with pytest.raises(NotReleased, match="an age of 9 s"):
         require_release(interlock, slow, lambda: at[0], tmp_path)
 
@@ -411,7 +410,7 @@ def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path)
 def test_an_interlock_that_is_no_file_says_no_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
     for path in (tmp_path / "fifo", tmp_path, Path(os.devnull)):
-        interlock = Interlock(None, InterlockFile(path, "closed", 5.0))
+        interlock = Interlock(file=path, max_age_s=5.0)
         with pytest.raises(NotReleased, match=r"no regular file|is a directory"):
             require_release(interlock, run_command, lambda: BEGAN, tmp_path)
 

@@ -14,7 +14,7 @@ import yaml
 from pydantic import TypeAdapter
 
 from daq.config.cell_file import load_cell
-from daq.config.recalibration import RecalibrationSection, RunSection
+from daq.config.recalibration import PlannedRun, RecalibrationSection, SeededPlan
 from daq.errors import SchemaMismatch
 from daq.jobs.session import Basis, Fitted, Outcome, begin, last_good, remove_old, resumable_session, save, sessions
 from tests.daq.jobs.rig import BEGAN, make_rig
@@ -65,10 +65,9 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
     section = load_cell(file).recalibration
     assert section is not None
     assert section.runs[0].plan_file == (file.parent / "plans" / "a.yaml").resolve()
-    assert (section.runs[1].seed, section.runs[1].duration_s) == (1, 40.0)
+    assert section.runs[1].plan == SeededPlan(seed=1, duration_s=40.0)
     assert section.interlock.command is None
-    assert section.interlock.file is not None
-    assert section.interlock.file.path == (file.parent / "state" / "interlock").resolve()
+    assert section.interlock.file == (file.parent / "state" / "interlock").resolve()
     assert section.metrics == (file.parent.parent / "metrics").resolve()
     assert section.folder == (file.parent / "demo.recalibration").resolve()
 
@@ -76,7 +75,7 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
     (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
     TypeAdapter(RecalibrationSection).validate_json(json.dumps(yaml.safe_load(example)["recalibration"]))
-    for section in (RecalibrationSection, RunSection):
+    for section in (RecalibrationSection, PlannedRun):
         for key in fields(section):
             assert re.search(rf"\b{key.name}:", example), key.name
 

@@ -35,7 +35,7 @@ from drivers.errors import (
     ParametersMixed,
     SetupRefused,
 )
-from drivers.profiles.profile import Mapping, ObjectEntry, Parameter, ParameterKind
+from drivers.profiles.profile import Mapping, ObjectEntry, ParameterKind
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.node import NmtCommand, NmtState
@@ -441,12 +441,12 @@ def test_the_gates_are_those_of_a_file(address: BusAddress, listener: Listener, 
     ("gain_object", "says"),
     [
         (
-            GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1.0),
+            GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1.0),
             "± 0.14, which the number 34 does not represent",
         ),
-        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e9), "does not fit i32"),
-        (GainObject(Parameter(0x2003, 1, ParameterKind.I32), 1e-3), "the number 0 does not represent"),
-        (GainObject(Parameter(0x2003, 1, ParameterKind.U32), -1.0), "does not fit u32"),
+        (GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e9), "does not fit i32"),
+        (GainObject(index=0x2003, subindex=1, type=ParameterKind.I32, factor=1e-3), "the number 0 does not represent"),
+        (GainObject(index=0x2003, subindex=1, type=ParameterKind.U32, factor=-1.0), "does not fit u32"),
     ],
 )
 def test_an_object_that_cannot_hold_the_gain_is_refused(

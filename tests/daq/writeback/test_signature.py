@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.cli.app import main
+from daq.config.signers import parse_public_key
 from daq.errors import (
     CalibrationMissing,
     CalibrationRefused,
@@ -90,9 +91,9 @@ def calibration(tmp_path: Path) -> Path:
 def test_minisigns_own_files_are_read_and_written_alike() -> None:
     key = minisign.parse_secret_key(SECRET)
     assert key.public.line == PUBLIC
-    assert minisign.parse_public_key(key.public.text) == key.public
+    assert parse_public_key(key.public.text) == key.public
     theirs = minisign.parse_signature(SIGNATURE)
-    key.public.check(theirs, CONTENT)
+    minisign.check_signature(key.public, theirs, CONTENT)
     # Ed25519 is deterministic: the same key, content and comment have one signature.
     assert key.sign(CONTENT, "made by minisign 0.11") == theirs
     assert key.text("", b"").splitlines()[1] == SECRET.splitlines()[1]
@@ -143,7 +144,7 @@ def test_every_changed_bit_of_the_content_is_noticed(place: int, bit: int) -> No
     changed = bytearray(CONTENT)
     changed[place % len(CONTENT)] ^= 1 << bit
     with pytest.raises(ValueError, match="other content"):
-        key.public.check(minisign.parse_signature(SIGNATURE), bytes(changed))
+        minisign.check_signature(key.public, minisign.parse_signature(SIGNATURE), bytes(changed))
 
 
 @settings(max_examples=200, deadline=None)
@@ -151,10 +152,10 @@ def test_every_changed_bit_of_the_content_is_noticed(place: int, bit: int) -> No
 def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int, letter: str) -> None:
     """Behind "untrusted comment: " any text is allowed; the last letters of a base64 text have meaningless bits."""
     changed = SIGNATURE[:place] + letter + SIGNATURE[place + 1 :]
-    public = minisign.parse_public_key(PUBLIC)
+    public = parse_public_key(PUBLIC)
     try:
         read = minisign.parse_signature(changed)
-        public.check(read, CONTENT)
+        minisign.check_signature(public, read, CONTENT)
     except ValueError:
         return
     assert read == minisign.parse_signature(SIGNATURE)
@@ -163,7 +164,7 @@ def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(place: int,
 @settings(max_examples=200, deadline=None)
 @given(st.text(max_size=300) | st.binary(max_size=200).map(lambda raw: base64.b64encode(raw).decode()))
 def test_what_is_no_key_and_no_signature_is_reported_and_never_trusted(text: str) -> None:
-    for parse in (minisign.parse_public_key, minisign.parse_secret_key, minisign.parse_signature):
+    for parse in (parse_public_key, minisign.parse_secret_key, minisign.parse_signature):
         with pytest.raises(ValueError, match=r".+"):
             parse(text)
 
@@ -252,7 +253,7 @@ def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration
 def test_a_password_protects_the_key(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna", "grüne Bohne")
     assert needs_password(secret)
-    assert minisign.parse_public_key(public.text).key not in base64.b64decode(secret.read_text().splitlines()[1])
+    assert parse_public_key(public.text).key not in base64.b64decode(secret.read_text().splitlines()[1])
     for wrong in ("", "grüne bohne"):
         with pytest.raises(UsageError, match="a secret key of"):
             sign(calibration, secret, "anna", password=wrong)
