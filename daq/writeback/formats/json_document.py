@@ -16,13 +16,10 @@ from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPat
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
-_NUMBER = r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?"
-_PLAIN = r"[^\"\\\x00-\x1f]*"
-_STRING = rf"\"{_PLAIN}(?:\\(?:[\"\\/bfnrt]|u[0-9a-fA-F]{{4}}){_PLAIN})*\""
 _TOKEN = re.compile(
-    rf"[ \t\r\n]*(?:(?P<number>{_NUMBER})|(?P<string>{_STRING})|(?P<word>true|false|null)|(?P<mark>[\[\]{{}}:,]))"
+    r"(?P<number>-?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?)"
+    r"|(?P<string>\"[^\"\\]*(?:\\.[^\"\\]*)*\")|(?P<word>true|false|null)|(?P<mark>[\[\]{}:,])"
 )
-_SPACE = re.compile(r"[ \t\r\n]*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +28,60 @@ class JsonDocument(ControllerDocument):
 
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`; a file with a key twice is refused."""
-        leaves = _Scan(self.name, self.text).leaves()
+        leaves = self._scanned()
         return tuple(self._locate(leaves, key) for key in keys)
 
     def readings(self) -> tuple[Leaves, Leaves]:
         """Read with our scanner, and with Python's parser."""
-        scanned = _Scan(self.name, self.text).leaves()
-        return {path: leaf.text for path, leaf in scanned.items()}, _loaded(self.text, self.name)
+        return {path: leaf.text for path, leaf in self._scanned().items()}, self._loaded()
+
+    def _scanned(self) -> dict[KeyPath, _Leaf]:
+        """Return every value with its place, and `{}` or `[]` with the size of every object and list."""
+        self._loaded()  # refuses all that is not JSON: the scanner need not
+        tokens = (_Leaf(token.lastgroup or "", token[0], token.start()) for token in _TOKEN.finditer(self.text))
+        return dict(self._scan(tokens, (), next(tokens)))
+
+    def _scan(self, tokens: Iterator[_Leaf], path: KeyPath, token: _Leaf) -> Iterator[tuple[KeyPath, _Leaf]]:
+        if len(path) > MAX_DEPTH:
+            raise self._no_json(f"more than {MAX_DEPTH} lists in lists")
+        if token.text not in ("{", "["):
+            yield path, token
+            return
+        size = 0
+        for inner in tokens:
+            if inner.text in ("}", "]"):
+                break
+            if inner.text == ",":
+                continue
+            if token.text == "{":
+                next(tokens)  # the colon
+                yield from self._scan(tokens, (*path, json.loads(inner.text)), next(tokens))
+            else:
+                yield from self._scan(tokens, (*path, str(size)), inner)
+            size += 1
+        yield (*path, "{}" if token.text == "{" else "[]"), _Leaf("size", str(size), token.start)
+
+    def _loaded(self) -> dict[KeyPath, str]:
+        """Read the leaves with Python's parser; numbers stay text."""
+        try:
+            tree = json.loads(
+                self.text.removeprefix(_BYTE_ORDER_MARK),
+                parse_float=str,
+                parse_int=str,
+                parse_constant=_refuse_constant,
+                object_pairs_hook=_unique,
+            )
+        except (ValueError, RecursionError) as error:
+            raise self._no_json(str(error)) from error
+        return dict(_walk((), tree))
+
+    def _no_json(self, found: str) -> ControllerUnfit:
+        return ControllerUnfit(
+            self.name,
+            found=f"no JSON ({found})",
+            expected=f"one JSON document, each key once, at most {MAX_DEPTH} lists in lists",
+            remedy="correct the file (JSON knows no comments, no NaN and no Infinity); nothing was written",
+        )
 
     def _locate(self, leaves: dict[KeyPath, _Leaf], key: str) -> Scalar:
         path = tuple(key.split("."))
@@ -81,107 +125,17 @@ def json_document(content: bytes, name: str) -> JsonDocument:
     return JsonDocument(name, utf8(content, name, "JSON"))
 
 
-class _Scan:
-    """A scan of the text."""
-
-    def __init__(self, name: str, text: str) -> None:
-        self._name = name
-        self._text = text
-        self._at = len(_BYTE_ORDER_MARK) if text.startswith(_BYTE_ORDER_MARK) else 0
-        self._found: dict[KeyPath, _Leaf] = {}
-
-    def leaves(self) -> dict[KeyPath, _Leaf]:
-        """Return every value with its place, and `{}` or `[]` with the size of every object and list.
-
-        Raises:
-            ControllerUnfit: this is no JSON, or a key is there twice.
-        """
-        self._value((), self._next())
-        match = _SPACE.match(self._text, self._at)
-        if match is None or match.end() != len(self._text):
-            raise self._wrong(match.end() if match else self._at, "the end of the file")
-        return self._found
-
-    def _value(self, path: KeyPath, token: _Leaf) -> None:
-        if len(path) > MAX_DEPTH:
-            raise self._wrong(token.start, f"at most {MAX_DEPTH} lists in lists", "more")
-        if token.text == "{":
-            self._object(path, token)
-        elif token.text == "[":
-            self._list(path, token)
-        elif token.kind == "mark":
-            raise self._wrong(token.start, "a value")
-        else:
-            self._found[path] = token
-
-    def _object(self, path: KeyPath, begin: _Leaf) -> None:
-        size = 0
-        keys: set[str] = set()
-        token = self._next()
-        while size or token.text != "}":
-            if token.kind != "string":
-                raise self._wrong(token.start, "a key in quotes")
-            key: str = json.loads(token.text)
-            if key in keys:
-                raise self._wrong(token.start, "each key once", f"{token.text:.60} a second time")
-            keys.add(key)
-            self._mark(":")
-            self._value((*path, key), self._next())
-            size += 1
-            if self._mark(",}").text == "}":
-                break
-            token = self._next()
-        self._found[*path, "{}"] = _Leaf("size", str(size), begin.start)
-
-    def _list(self, path: KeyPath, begin: _Leaf) -> None:
-        size = 0
-        token = self._next()
-        while size or token.text != "]":
-            self._value((*path, str(size)), token)
-            size += 1
-            if self._mark(",]").text == "]":
-                break
-            token = self._next()
-        self._found[*path, "[]"] = _Leaf("size", str(size), begin.start)
-
-    def _mark(self, allowed: str) -> _Leaf:
-        token = self._next()
-        if token.kind != "mark" or token.text not in allowed:
-            raise self._wrong(token.start, " or ".join(allowed))
-        return token
-
-    def _next(self) -> _Leaf:
-        match = _TOKEN.match(self._text, self._at)
-        if match is None:
-            space = _SPACE.match(self._text, self._at)
-            raise self._wrong(space.end() if space else self._at, "a value, a key or a mark of JSON")
-        self._at = match.end()
-        kind = match.lastgroup or ""
-        return _Leaf(kind, match[kind], match.start(kind))
-
-    def _wrong(self, at: int, expected: str, found: str | None = None) -> ControllerUnfit:
-        shown = found or (repr(self._text[at : at + 20]) if at < len(self._text) else "the end of the file")
-        line = self._text.count("\n", 0, at) + 1
-        return ControllerUnfit(
-            f"{self._name}:{line}",
-            found=shown,
-            expected=f"{expected}, as JSON has it",
-            remedy="correct the file (JSON knows no comments, no NaN and no Infinity); nothing was written",
-        )
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name}, which is no number")
 
 
-def _loaded(text: str, name: str) -> dict[KeyPath, str]:
-    """Read the leaves with Python's parser; numbers stay text."""
-    try:
-        tree = json.loads(text.removeprefix(_BYTE_ORDER_MARK), parse_float=str, parse_int=str, parse_constant=str)
-    except (ValueError, RecursionError) as error:
-        raise ControllerUnfit(
-            name,
-            found=f"no JSON ({error})",
-            expected="one JSON document",
-            remedy="correct the file; nothing was written",
-        ) from error
-    return dict(_walk((), tree))
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise ValueError(f"{json.dumps(key):.60} a second time")
+        found[key] = value
+    return found
 
 
 def _walk(path: KeyPath, tree: Any) -> Iterator[tuple[KeyPath, str]]:

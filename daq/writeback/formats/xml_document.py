@@ -8,8 +8,8 @@ or to expand.
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
@@ -17,52 +17,67 @@ from daq.errors import ControllerUnfit
 from daq.writeback.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Leaves, Scalar, unfit
 
 TEXT = "text()"
-_ENCODING_OF_NONE = "utf-8"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Element:
-    """An element; places are bytes of the file.
+    """An element; places are bytes of the file."""
 
-    Attributes:
-        label: its name, and its number in the file: a path from the root would grow with the depth.
-        start, end: of its start tag's `<`, and of its end tag's.
-        pieces: text, comments and instructions between its elements, each in its place.
-    """
-
-    name: str
-    attributes: dict[str, str]
-    label: str
-    start: int
-    line: int
-    ends: list[int] = field(default_factory=list)
-    children: list[Element] = field(default_factory=list)
+    name: str  #: as it is written, prefix included
+    attributes: dict[str, str]  #: values by name
+    label: str  #: its name, and its number in the file: a path from the root would grow with the depth
+    start: int  #: place of its start tag's `<`
+    line: int  #: from 1
+    end: int = 0  #: place of its end tag's `<`; that of its start tag where it is empty
+    children: list[Element] = field(default_factory=list)  #: elements within it
+    #: Text, comments and instructions between its elements, each in its place.
     pieces: list[tuple[str, str]] = field(default_factory=list)
 
-    @property
-    def end(self) -> int:
-        """Place of its end tag's `<`; that of its start tag where it is empty."""
-        return self.ends[0]
 
+def parse(content: bytes, name: str) -> tuple[Element, str]:
+    """Read a whole file, without recursion however deep it is.
 
-@dataclass(frozen=True, slots=True)
-class ParsedXml:
-    """A file as expat sees it."""
-
-    root: Element  #: its root element
-    around: Element  #: parent of the root, with the comments beside it
-    encoding: str  #: as declared
-
-
-def parse(content: bytes, name: str) -> ParsedXml:
-    """Read a whole file.
+    Returns:
+        an element around the root, with the comments beside it, and the encoding as declared.
 
     Raises:
         ControllerUnfit: it is no XML, or has a document type.
     """
-    reader = _Reader(name)
+    around, encodings = Element("", {}, "", 0, 0), ["utf-8"]
+    opened, count = [around], itertools.count(1)
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+
+    def piece(kind: str, text: str) -> None:
+        opened[-1].pieces.append((kind, text))
+
+    def document_type(*_: object) -> None:
+        raise ControllerUnfit(
+            name,
+            found="a document type (<!DOCTYPE …>)",
+            expected="XML without one: it may define entities and fetch other files",
+            remedy="remove it if the controller does without; nothing was written",
+        )
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        label = f"{tag}#{next(count)}"
+        element = Element(tag, attributes, label, parser.CurrentByteIndex, parser.CurrentLineNumber)
+        opened[-1].children.append(element)
+        piece("element()", tag)
+        opened.append(element)
+
+    def end(_: str) -> None:
+        opened.pop().end = parser.CurrentByteIndex
+
+    parser.XmlDeclHandler = lambda _version, encoding, _standalone: encodings.append(encoding or encodings[0])
+    parser.StartDoctypeDeclHandler = document_type
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = lambda text: piece(TEXT, text)
+    parser.CommentHandler = lambda text: piece("comment()", text)
+    parser.ProcessingInstructionHandler = lambda target, text: piece(f"?{target}", text)
     try:
-        reader.read(content)
+        parser.Parse(content, True)
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise ControllerUnfit(
             name,
@@ -70,62 +85,7 @@ def parse(content: bytes, name: str) -> ParsedXml:
             expected="one XML document",
             remedy="correct the file; nothing was written",
         ) from error
-    return ParsedXml(reader.root.children[0], reader.root, reader.encoding)
-
-
-class _Reader:
-    """Build the tree from expat's events, without recursion however deep the file is."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self.encoding = _ENCODING_OF_NONE
-        self.root = Element("", {}, "", 0, 0)
-        self._open = [self.root]
-        self._count = 0
-        self._parser = expat.ParserCreate()
-        self._parser.buffer_text = True
-        self._parser.XmlDeclHandler = self._declaration
-        self._parser.StartDoctypeDeclHandler = self._document_type
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.CharacterDataHandler = lambda text: self._piece(TEXT, text)
-        self._parser.CommentHandler = lambda text: self._piece("comment()", text)
-        self._parser.ProcessingInstructionHandler = lambda target, text: self._piece(f"?{target}", text)
-
-    def read(self, content: bytes) -> None:
-        """Parse a whole file."""
-        self._parser.Parse(content, True)
-
-    def _declaration(self, version: str, encoding: str | None, standalone: int) -> None:
-        self.encoding = encoding or _ENCODING_OF_NONE
-
-    def _document_type(self, *_: object) -> None:
-        raise ControllerUnfit(
-            self._name,
-            found="a document type (<!DOCTYPE …>)",
-            expected="XML without one: it may define entities and fetch other files",
-            remedy="remove it if the controller does without; nothing was written",
-        )
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        parent = self._open[-1]
-        self._count += 1
-        element = Element(
-            name,
-            attributes,
-            f"{name}#{self._count}",
-            self._parser.CurrentByteIndex,
-            self._parser.CurrentLineNumber,
-        )
-        parent.children.append(element)
-        parent.pieces.append(("element()", name))
-        self._open.append(element)
-
-    def _end(self, name: str) -> None:
-        self._open.pop().ends.append(self._parser.CurrentByteIndex)
-
-    def _piece(self, kind: str, text: str) -> None:
-        self._open[-1].pieces.append((kind, text))
+    return around, encodings[-1]
 
 
 _SPACE = " \t\r\n"
@@ -150,24 +110,34 @@ class XmlDocument(ControllerDocument):
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`; a file with a document type is refused."""
         content = self.content
-        root = parse(content, self.name).root
-        return tuple(self._locate(content, root, key) for key in keys)
+        around, _ = parse(content, self.name)
+        return tuple(self._locate(content, around, key) for key in keys)
 
     def readings(self) -> tuple[Leaves]:
         """Read every attribute, piece of text, comment and instruction, and the order of the elements."""
-        return (dict(_leaves(self)),)
+        leaves: dict[KeyPath, str] = {}
+        around, _ = parse(self.content, self.name)
+        waiting = [around]
+        while waiting:
+            element = waiting.pop()
+            leaves |= {(element.label, f"@{name}"): value for name, value in element.attributes.items()}
+            for position, (kind, text) in enumerate(element.pieces, start=1):
+                leaves[element.label, f"{kind}[{position}]"] = text
+            waiting.extend(element.children)
+        return (leaves,)
 
     def leaf(self, key: str) -> KeyPath:
         """Return the path of an element's text, or of an attribute."""
-        return self._find(parse(self.content, self.name).root, key).leaf
+        around, _ = parse(self.content, self.name)
+        element, attribute = self._find(around, key)
+        return (element.label, f"{TEXT}[1]" if attribute is None else f"@{attribute}")
 
     def number(self, leaf: str) -> str:
         """Return a number without the blanks around it."""
         return leaf.strip(_SPACE)
 
-    def _locate(self, content: bytes, root: Element, key: str) -> Scalar:
-        place = self._find(root, key)
-        element = place.element
+    def _locate(self, content: bytes, around: Element, key: str) -> Scalar:
+        element, attribute = self._find(around, key)
         tag = len(content[: element.start].decode(self.encoding))
         at = tag + 1 + len(element.name)
         attributes: dict[str, tuple[int, str]] = {}
@@ -175,8 +145,8 @@ class XmlDocument(ControllerDocument):
             group = 2 if match[2] is not None else 3
             attributes[match[1]] = (match.start(group), match[group])
             at = match.end()
-        if place.attribute is not None:
-            start, written = attributes[place.attribute]
+        if attribute is not None:
+            start, written = attributes[attribute]
         else:
             start = self.text.index(">", at) + 1
             # An empty element <Gain/> ends where it begins.
@@ -193,22 +163,26 @@ class XmlDocument(ControllerDocument):
         start += written.index(number)
         return Scalar(key, float(number), number, start, start + len(number), self.text.count("\n", 0, start) + 1)
 
-    def _find(self, root: Element, key: str) -> _Place:
+    def _find(self, around: Element, key: str) -> tuple[Element, str | None]:
+        """Return the element that a path names, and its attribute where it names one."""
         steps, attribute = self._steps(key)
-        candidates, walked = [root], ""
-        for position, step in enumerate(steps):
-            inside = candidates if position == 0 else candidates[0].children
-            candidates = step.choose(inside)
-            if len(candidates) != 1:
-                raise self._not_one(key, step, candidates, inside, walked)
-            walked = f"{walked}/{step.written}".lstrip("/")
-        element = candidates[0]
-        if attribute is None:
-            return _Place(element, None)
-        if attribute not in element.attributes:
+        element, walked = around, ""
+        for step in steps:
+            found = [one for one in element.children if one.name == step.name and step.having <= one.attributes.items()]
+            found = found if step.number is None else found[step.number - 1 : step.number]
+            place = walked or "the file"
+            if not found:
+                has = ", ".join(dict.fromkeys(one.name for one in element.children)) or "no elements"
+                raise unfit(self.name, key, f"no {step.written} in {place} (it has {has:.200})", CORRECT_KEY)
+            if len(found) > 1:
+                lines = ", ".join(str(one.line) for one in found[:12])
+                remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
+                raise unfit(self.name, key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
+            element, walked = found[0], f"{walked}/{step.written}".lstrip("/")
+        if attribute is not None and attribute not in element.attributes:
             has = ", ".join(f"@{name}" for name in list(element.attributes)[:12]) or "none"
             raise unfit(self.name, key, f"no attribute @{attribute} in {walked} (it has {has})", CORRECT_KEY)
-        return _Place(element, attribute)
+        return element, attribute
 
     def _steps(self, key: str) -> tuple[list[_Step], str | None]:
         """Split a path into its elements and its attribute."""
@@ -216,7 +190,7 @@ class XmlDocument(ControllerDocument):
         at = 1 if key.startswith("/") else 0
         while (match := _STEP.match(key, at)) is not None:
             conditions = [(c[1], c[2] if c[2] is not None else c[3], c[4]) for c in re.finditer(_CONDITION, match[2])]
-            having = tuple((name, value) for name, value, _ in conditions if name)
+            having = frozenset((name, value) for name, value, _ in conditions if name)
             number = next((int(position) for name, _, position in conditions if not name), None)
             steps.append(_Step(match[0], match[1], having, number))
             at = match.end()
@@ -235,30 +209,6 @@ class XmlDocument(ControllerDocument):
             f"{CORRECT_KEY}: Robot/Axis[@name='J1']/Gain, or Robot/Axis[1]/@gain",
         )
 
-    def _not_one(
-        self, key: str, step: _Step, found: list[Element], inside: list[Element], walked: str
-    ) -> ControllerUnfit:
-        place = walked or "the file"
-        if found:
-            lines = ", ".join(str(element.line) for element in found[:12])
-            remedy = f"choose one by an attribute ({step.name}[@name='…']) or its number ({step.name}[1])"
-            return unfit(self.name, key, f"{len(found)} of {step.written} in {place}, on lines {lines}", remedy)
-        has = ", ".join(dict.fromkeys(element.name for element in inside)) or "no elements"
-        return unfit(self.name, key, f"no {step.written} in {place} (it has {has:.200})", CORRECT_KEY)
-
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """An element, or one of its attributes."""
-
-    element: Element
-    attribute: str | None
-
-    @property
-    def leaf(self) -> KeyPath:
-        """Path among the leaves."""
-        return (self.element.label, f"{TEXT}[1]" if self.attribute is None else f"@{self.attribute}")
-
 
 @dataclass(frozen=True, slots=True)
 class _Step:
@@ -266,17 +216,8 @@ class _Step:
 
     written: str  #: as in the path
     name: str  #: of the element
-    having: tuple[tuple[str, str], ...]  #: attributes with their values
+    having: frozenset[tuple[str, str]]  #: attributes with their values
     number: int | None  #: among those, from 1; None where there must be one alone
-
-    def choose(self, elements: list[Element]) -> list[Element]:
-        """Select the elements that the step means."""
-        meant = [
-            element
-            for element in elements
-            if element.name == self.name and all(element.attributes.get(name) == value for name, value in self.having)
-        ]
-        return meant if self.number is None else meant[self.number - 1 : self.number]
 
 
 def xml_document(content: bytes, name: str) -> XmlDocument:
@@ -286,7 +227,7 @@ def xml_document(content: bytes, name: str) -> XmlDocument:
         ControllerUnfit: they are no XML, have a document type, or are in an encoding in which ASCII is not one byte a
             character.
     """
-    encoding = parse(content, name).encoding
+    _, encoding = parse(content, name)
     ascii_characters = bytes(range(128))
     try:
         text = content.decode(encoding)
@@ -301,15 +242,3 @@ def xml_document(content: bytes, name: str) -> XmlDocument:
             remedy="save the file as UTF-8; nothing was written",
         )
     return XmlDocument(name, text, encoding)
-
-
-def _leaves(document: XmlDocument) -> Iterator[tuple[KeyPath, str]]:
-    """Walk over all leaves of a document."""
-    waiting = [parse(document.content, document.name).around]
-    while waiting:
-        element = waiting.pop()
-        for name, value in element.attributes.items():
-            yield (element.label, f"@{name}"), value
-        for position, (kind, text) in enumerate(element.pieces, start=1):
-            yield (element.label, f"{kind}[{position}]"), text
-        waiting.extend(element.children)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -28,27 +29,16 @@ class YamlDocument(ControllerDocument):
     ruamel.yaml reads YAML 1.2 and PyYAML reads YAML 1.1: whichever the controller uses, it sees the same.
     """
 
-    # A frozen text has one tree, and composing it is expensive.
-    _composed: list[Node] = field(default_factory=list, init=False, repr=False, compare=False)
-    _readings: list[tuple[Leaves, Leaves]] = field(default_factory=list, init=False, repr=False, compare=False)
-
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`."""
-        root = self._root()
+        root = _composed(self.text, self.name, "1.2")
         references = Counter[int]()
         _count_references(root, references)
         return tuple(self._locate(root, key, references) for key in keys)
 
     def readings(self) -> tuple[Leaves, Leaves]:
         """Read as YAML 1.2 and as YAML 1.1."""
-        if not self._readings:
-            self._readings.append((_leaves(self._root()), _leaves(_composed_1_1(self.text, self.name))))
-        return self._readings[0]
-
-    def _root(self) -> Node:
-        if not self._composed:
-            self._composed.append(_composed_1_2(self.text, self.name))
-        return self._composed[0]
+        return _leaves(_composed(self.text, self.name, "1.2")), _leaves(_composed(self.text, self.name, "1.1"))
 
     def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
         node = root
@@ -67,7 +57,8 @@ class YamlDocument(ControllerDocument):
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
         # An anchor or a tag may precede the number; an escape within quotes makes its text another than its value.
-        opened = self.text[start - 1 : start] == quote if quote else self._begins(node, start)
+        begins = start == node.start_mark.index or self.text[start - 1].isspace()
+        opened = self.text[start - 1 : start] == quote if quote else begins
         if not opened or self.text[start:end] != node.value or not _NUMBER.fullmatch(node.value):
             raise unfit(self.name, key, f"{node.value!r:.60}", "write a plain decimal number")
         if _OCTAL.fullmatch(node.value):
@@ -78,9 +69,6 @@ class YamlDocument(ControllerDocument):
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
             raise unfit(self.name, key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float")
         return Scalar(key, float(node.value), node.value, start, end, node.start_mark.line + 1)
-
-    def _begins(self, node: ScalarNode, start: int) -> bool:
-        return start == node.start_mark.index or self.text[start - 1].isspace()
 
     def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
         place = ".".join(walked) or "the file"
@@ -112,38 +100,22 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
     return YamlDocument(name, utf8(content, name, "YAML"))
 
 
-def _composed_1_2(text: str, name: str) -> Node:
+@lru_cache(maxsize=8)  # composing is expensive, and a write reads each of its two texts several times
+def _composed(text: str, name: str, version: str) -> Any:
     try:
-        root: Node | None = YAML(typ="safe", pure=True).compose(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        raise ControllerUnfit(
-            name,
-            found=f"no YAML ({' '.join(str(error).split())[:200]})",
-            expected="one YAML document",
-            remedy="correct the file; nothing was written",
-        ) from error
-    if root is None:
-        raise ControllerUnfit(
-            name,
-            found="an empty file",
-            expected="the controller's parameters",
-            remedy="is this the right file?",
-        )
-    return root
-
-
-def _composed_1_1(text: str, name: str) -> yaml.Node:
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        if version == "1.2":
+            root = YAML(typ="safe", pure=True).compose(text)
+        else:
+            root = yaml.compose(text, Loader=yaml.SafeLoader)
         found = "nothing in it"
-    except yaml.YAMLError as error:
+    except (YAMLError, yaml.YAMLError, ValueError, RecursionError) as error:
         root, found = None, " ".join(str(error).split())[:200]
     if root is None:
         raise ControllerUnfit(
             name,
-            found=f"no YAML 1.1 ({found})",
-            expected="one YAML document that readers of both YAML 1.1 and 1.2 understand",
-            remedy="correct the file; nothing was written",
+            found=f"no YAML {version} ({found})",
+            expected="the controller's parameters, in one YAML document for readers of both YAML 1.1 and 1.2",
+            remedy="is this the right file? If it is, correct it; nothing was written",
         )
     return root
 
