@@ -1,13 +1,14 @@
-"""Read, replace and hash files: a file is replaced whole or not at all, and only regular files are read."""
+"""Read, replace, hash and lock files: a file is replaced whole or not at all, and only regular files are read."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import os
 import stat
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
@@ -97,6 +98,63 @@ def sha256_of(path: Path) -> str | None:
     with suppress(OSError), open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
     return None
+
+
+_LOCK_MODE = 0o644  #: Every user may read it, and that is enough to lock it (not on NFS, which requires write access)
+
+
+@contextmanager
+def hold_lock(lock: Path) -> Iterator[None]:
+    """Hold a lock file; the system releases it even after a kill.
+
+    The file is removed at the end. Another process may have opened it just before: its lock is then on a file without
+    a name, which it detects by the inode, and it takes the lock anew.
+
+    Raises:
+        BlockingIOError: another process holds it.
+        OSError: from the file system, or something else has that name.
+    """
+    while True:
+        descriptor = _open_lock(lock)
+        try:
+            held = os.fstat(descriptor)
+            _check(held, lock)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            try:
+                is_named = os.path.samestat(held, lock.stat())
+            except FileNotFoundError:
+                is_named = False
+            if is_named:
+                try:
+                    yield
+                finally:
+                    # Another user's may stay, where only they may remove it: it is not held.
+                    with suppress(OSError):
+                        lock.unlink()
+                return
+        finally:
+            os.close(descriptor)
+
+
+def _open_lock(lock: Path) -> int:
+    """Open the lock file, made where there is none; one that another user has left excludes nobody."""
+    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # a FIFO of that name must not keep us waiting
+    while True:
+        with suppress(FileExistsError):
+            descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _LOCK_MODE)
+            try:
+                os.fchmod(descriptor, _LOCK_MODE)  # whatever the umask
+            except BaseException:  # an interrupt too: a lock that others cannot open must not stay behind
+                os.close(descriptor)
+                lock.unlink(missing_ok=True)
+                raise
+            return descriptor
+        # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's file.
+        with suppress(FileNotFoundError):  # whose owner was done just now
+            try:
+                return os.open(lock, flags | os.O_RDWR)
+            except PermissionError:
+                return os.open(lock, flags | os.O_RDONLY)
 
 
 def _check(found: os.stat_result, path: Path) -> None:

@@ -7,7 +7,6 @@ computer; a foreign master is detected on the bus itself (BusBusy).
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import os
 import re
@@ -21,6 +20,7 @@ from pathlib import Path
 
 from daq.config.cell import Bus, Cell, WeighedPayload
 from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError
+from daq.files import hold_lock
 from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
 from daq.report.bus import actual_current_note
@@ -30,7 +30,6 @@ from ident.model.model import DriveTrain
 
 SHARED_FOLDERS = (Path("/run/lock"), Path("/var/lock"), Path("/tmp"))
 """Tried in this order; all users of a computer must come to the same one, so TMPDIR is not asked."""
-MODE = 0o644
 VIRTUAL = "virtual"  #: python-can's bus within one process: a bus of that name in another process is another bus
 
 
@@ -51,7 +50,18 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
     buses = sorted({lock_name(bus): bus for bus in cell.buses}.items())
     with ExitStack() as held:
         for name, bus in buses:
-            held.enter_context(_held(where / name, bus))
+            lock = where / name
+            try:
+                held.enter_context(hold_lock(lock))
+            except BlockingIOError as error:
+                raise BusTaken(
+                    f"bus {bus.interface}:{bus.channel}",
+                    found=f"another recording or job of drivegain on it (it holds {lock})",
+                    expected="one at a time: two of them would move one robot",
+                    remedy=f"wait for its end; `fuser {lock}` shows its process",
+                ) from error
+            except OSError as error:
+                raise OutputFailed.of(lock, error) from error
         yield
 
 
@@ -89,70 +99,6 @@ def _shared_folder() -> Path:
             if folder.stat().st_mode & stat.S_IWOTH:
                 return folder
     return SHARED_FOLDERS[-1]
-
-
-@contextmanager
-def _held(lock: Path, bus: Bus) -> Iterator[None]:
-    """Hold the lock file and remove it at the end; others recognise by its inode that it is gone."""
-    while True:
-        try:
-            descriptor = _open(lock)
-        except OSError as error:
-            raise OutputFailed.of(lock, error) from error
-        try:
-            _check_regular(descriptor, lock)
-            _take(descriptor, lock, bus)
-            if _is_at(descriptor, lock):
-                try:
-                    yield
-                finally:
-                    # In a shared folder it stays where another user made it.
-                    with suppress(OSError):
-                        lock.unlink()
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _open(lock: Path) -> int:
-    """To read is enough to lock; and to open another user's file in a shared folder, O_CREAT must not be asked for."""
-    while True:
-        with suppress(FileNotFoundError):
-            # O_NONBLOCK: a FIFO of that name must not keep us waiting for its other end.
-            return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with suppress(FileExistsError):
-            made = os.open(lock, os.O_RDONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE)
-            # Whatever the umask says: who cannot open it would not learn that the bus is taken.
-            os.fchmod(made, MODE)
-            return made
-
-
-def _check_regular(descriptor: int, lock: Path) -> None:
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        raise OutputFailed(
-            str(lock),
-            found="something that is no regular file",
-            expected="the lock file of the bus, or none",
-            remedy="nothing has moved; see who has put it there, and remove it",
-        )
-
-
-def _take(descriptor: int, lock: Path, bus: Bus) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise BusTaken(
-            f"bus {bus.interface}:{bus.channel}",
-            found=f"another recording or job of drivegain on it (it holds {lock})",
-            expected="one at a time: two of them would move one robot",
-            remedy=f"wait for its end; `fuser {lock}` shows its process",
-        ) from error
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    with suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    return False
 
 
 FreeBytes = Callable[[Path], int]  #: Room left for this user on the disk of a folder [bytes]

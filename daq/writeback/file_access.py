@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import re
 import shlex
@@ -20,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from daq.errors import CalibrationRefused, ControllerUnfit
-from daq.files import fsync_folder, replace_file
+from daq.files import fsync_folder, hold_lock, replace_file
 from daq.writeback.formats.document import read_bytes
 from daq.writeback.request import short_digest
 
@@ -125,74 +124,25 @@ def _circle(file: Path) -> ControllerUnfit:
     )
 
 
-_MODE = 0o644  #: Every user may read it, and that is enough to lock it (not on NFS, which requires write access)
-
-
 @contextlib.contextmanager
 def exclusive_writer(target: Path) -> Iterator[None]:
-    """Hold the file's lock; the system releases it even after a kill.
-
-    The lock file is removed at the end. A second writer may have opened it just before: its lock is then on a file
-    without a name, which it detects by the inode, and it takes the lock anew.
+    """Exclude other writers of a file.
 
     Raises:
-        CalibrationRefused: another drivegain holds it.
-        OSError: from the file system.
+        CalibrationRefused: another drivegain writes it.
+        OSError: see `daq.files.hold_lock`.
     """
-    lock = target.parent / f".{target.name}.lock"
-    while True:
-        descriptor = _opened(lock)
+    with contextlib.ExitStack() as held:
         try:
-            _take(descriptor, target)
-            if _is_at(descriptor, lock):
-                try:
-                    yield
-                finally:
-                    # Another user's may stay, where only they may remove it: it is not held.
-                    with contextlib.suppress(PermissionError):
-                        lock.unlink(missing_ok=True)
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _opened(lock: Path) -> int:
-    """Open the lock file, made where there is none; one that another user has left excludes no other writer."""
-    flags = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    while True:
-        with contextlib.suppress(FileExistsError):
-            descriptor = os.open(lock, flags | os.O_RDWR | os.O_CREAT | os.O_EXCL, _MODE)
-            try:
-                os.fchmod(descriptor, _MODE)  # whatever the umask
-            except BaseException:  # an interrupt too: a lock that others cannot open must not stay behind
-                os.close(descriptor)
-                lock.unlink(missing_ok=True)
-                raise
-            return descriptor
-        # Without O_CREAT: in a folder with the sticky bit the system refuses it for another user's file.
-        with contextlib.suppress(FileNotFoundError):  # whose owner was done just now
-            try:
-                return os.open(lock, flags | os.O_RDWR)
-            except PermissionError:
-                return os.open(lock, flags | os.O_RDONLY)
-
-
-def _take(descriptor: int, target: Path) -> None:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise CalibrationRefused(
-            str(target),
-            found="another drivegain writing it",
-            expected="one writer at a time",
-            remedy="wait until it has finished, then take a new dry run",
-        ) from error
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    with contextlib.suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    return False
+            held.enter_context(hold_lock(target.parent / f".{target.name}.lock"))
+        except BlockingIOError as error:
+            raise CalibrationRefused(
+                str(target),
+                found="another drivegain writing it",
+                expected="one writer at a time",
+                remedy="wait until it has finished, then take a new dry run",
+            ) from error
+        yield
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,8 +175,15 @@ class Backup:
 
 def backups(target: Path) -> tuple[Backup, ...]:
     """Backups beside a controller file, oldest first."""
-    found = (_backup(target, path) for path in target.parent.iterdir())
-    return tuple(sorted((backup for backup in found if backup is not None), key=lambda b: (b.stamp, b.count)))
+    name = re.compile(
+        re.escape(target.name) + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak"
+    )
+    found = [
+        Backup(path, match[1], int(match[2] or 0), match[3], match[4])
+        for path in target.parent.iterdir()
+        if (match := name.fullmatch(path.name)) is not None
+    ]
+    return tuple(sorted(found, key=lambda one: (one.stamp, one.count)))
 
 
 def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
@@ -276,11 +233,3 @@ def put_back(backup: Path, target: Path) -> None:
     backup.replace(target)
     with contextlib.suppress(OSError):
         fsync_folder(target.parent)
-
-
-def _backup(target: Path, path: Path) -> Backup | None:
-    """Parse the name of a backup; None for any other file."""
-    match = re.fullmatch(
-        re.escape(target.name) + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak", path.name
-    )
-    return None if match is None else Backup(path, match[1], int(match[2] or 0), match[3], match[4])
