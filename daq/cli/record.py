@@ -203,8 +203,8 @@ def plan_verb(
     from daq.cli.terminal import check_output, progress_bar, writing
     from daq.config.cell_file import load_cell
     from daq.report.plan import plan_document, plan_text
-    from daq.workflow.experiment import RUNS, experiment_of, paths_of
-    from daq.workflow.plan import extra_moves, plan
+    from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
+    from daq.workflow.plan import plan
     from daq.workflow.plan_file import save_plan
     from ident.planning.verdict import verdicts
 

@@ -44,7 +44,7 @@ def validate_verb(
         validation_tables,
         validation_view,
     )
-    from daq.workflow.cross_validation import cross_validate
+    from daq.workflow.validate import cross_validate
 
     page_file = None if out is None else out / "tables.md"
     check_output(page_file, (calibration, *logs), TABLES)

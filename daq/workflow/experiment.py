@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import cycle, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.motion.move import Trapezoid, synchronised
 from ident.data.conditioning import decimator
-from ident.model.kinematics import Motion
+from ident.model.kinematics import Motion, poses
 from ident.model.robot import JointKind, Robot
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.excitation import (
@@ -29,6 +29,7 @@ from ident.planning.excitation import (
     side_of_cube,
     visible,
 )
+from ident.planning.verdict import ExtraMoves
 
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
@@ -286,3 +287,80 @@ def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
 def duration_of(cell: Cell, moves: Sequence[PlannedMove]) -> float:
     """From the first target to the end of the last dwell [s]."""
     return float(sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves))
+
+
+SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
+EXTRA_POSTURES = 300
+POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
+SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
+STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
+
+
+def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
+    """Some five seconds of each kind, within limits and clear of everything; the same every time.
+
+    For every axis: fast with the arm stretched, fast with it folded (as the last link is seen from that axis), slow
+    with it stretched, and fast together with a neighbour; and of all axes together.
+    """
+    lower, upper = np.array([axis.limits.position for axis in experiment.cell.axes]).T
+    margin = POSITION_MARGIN * (upper - lower)
+    low, high = lower + margin, upper - margin
+    sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
+    postures = sampled[experiment.scene.checker.margins(sampled) > 0.0]
+    names = experiment.cell.axis_names
+    found = []
+    robot = experiment.design.expectation.model.robot
+    at = poses(robot, postures)
+    for axis, name in enumerate(names):
+        # Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m].
+        way = at.origin_m[-1] - at.origin_m[axis + 1]
+        if robot.joints[axis].kind is not JointKind.PRISMATIC:
+            way = np.cross(at.rotation[axis + 1] @ robot.joints[axis].axis, way)
+        lever = np.linalg.norm(way, axis=1)
+        stretched, folded = postures[np.argsort(-lever, kind="stable")], postures[np.argsort(lever, kind="stable")]
+        other = axis + 1 if axis + 1 < len(names) else axis - 1
+        kinds: list[tuple[str, FloatArray, tuple[int, ...], float]] = [
+            (f"fast moves of {name} with the arm stretched", stretched, (axis,), 1.0),
+            (f"fast moves of {name} with the arm folded", folded, (axis,), 1.0),
+            (f"slow moves of {name} with the arm stretched", stretched, (axis,), SLOW),
+        ]
+        if other >= 0:
+            kinds.append((f"fast moves of {name} and {names[other]} together", postures, (axis, other), 1.0))
+        found += [_swings(experiment, words, at, axes, speed, (low, high)) for words, at, axes, speed in kinds]
+    found.append(_swings(experiment, "fast moves of all axes", postures, tuple(range(len(names))), 1.0, (low, high)))
+    return tuple(extra for extra in found if extra is not None)
+
+
+def _swings(
+    experiment: Experiment,
+    words: str,
+    postures: FloatArray,
+    axes: Sequence[int],
+    speed: float,
+    ends: tuple[FloatArray, FloatArray],
+) -> ExtraMoves | None:
+    """There and back in the first few postures in which that is clear; None when there are none."""
+    velocity = np.array([axis.limits.velocity for axis in experiment.cell.axes]) * speed
+    acceleration = np.array([axis.limits.acceleration for axis in experiment.cell.axes])
+    low, high = ends
+    moved = list(axes)
+    paths: list[Trapezoid] = []
+    for posture in postures:
+        for stroke in STROKES:
+            inwards = 0.5 * (1.0 - stroke) * (high - low)
+            start, end = posture.copy(), posture.copy()
+            start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+            if experiment.scene.checker.obstruction(start, end) is None:
+                there = synchronised(start, end, velocity, acceleration)
+                paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
+                break
+        if len(paths) >= 6:
+            break
+    chosen: list[Trapezoid] = []
+    seconds = 0.0
+    for path in cycle(paths):
+        chosen.append(path)
+        seconds += path.duration_s
+        if seconds >= SECONDS:
+            break
+    return ExtraMoves(words, seconds, experiment.excitation(chosen)[0]) if chosen else None

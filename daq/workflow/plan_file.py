@@ -14,7 +14,7 @@ from daq.config.yaml_file import StrictModel, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent
 from daq.files import replace_file
 from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
-from daq.workflow.plan import Plan, units_of
+from daq.workflow.plan import Plan
 from ident.planning.clearance import Checker
 
 LONGEST_S = 3600.0
@@ -114,7 +114,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         predicted_std_percent=model.predicted_std_percent,
         duration_s=duration_s,
         moves=moves,
-        units=units_of(cell),
+        units=tuple(axis.unit for axis in cell.axes),
     )
 
 
@@ -126,7 +126,7 @@ def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     key = "target_deg" if move.target is None else "target"
     values = move.target_deg or move.target or ()
     where = f"{path}: moves[{number}].{key}"
-    expected_key = _key(units_of(cell))
+    expected_key = _key(tuple(axis.unit for axis in cell.axes))
     if key != expected_key:
         units = ", ".join(f"{axis.name} {axis.unit.name}" for axis in cell.axes)
         raise ConfigurationInconsistent(
