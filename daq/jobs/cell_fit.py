@@ -84,14 +84,7 @@ class Fitted:
 def fit_cell(
     cell: CellLogs, loop: Loop, created: datetime, clock: Callable[[], float] = time.perf_counter
 ) -> Fitted | Failure:
-    """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs.
-
-    Args:
-        cell: with its logs, which this process can read.
-        loop: whether to look for effects.
-        created: when, for the calibration.
-        clock: for the seconds.
-    """
+    """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs."""
     begun_s = clock()
     every_log = (*cell.fit, *cell.holdout)
     paths: dict[Path, StoredLog] = {}

@@ -176,14 +176,6 @@ def fit_fleet(
 ) -> tuple[FleetRow, ...]:
     """Fit every cell that has logs; the failure of one is in its row.
 
-    Args:
-        logs: of all cells.
-        pool: workers.
-        loop: whether missing effects are added.
-        cache: of calibrations, None for none.
-        now: time of day, for the calibrations.
-        report_progress: of progress, by cells; while heads are read, by logs.
-
     Returns:
         the rows, by cell and configuration; logs of unknown cells come last.
 
@@ -232,11 +224,6 @@ def each(
     """Run work in a pool, and yield the results as they finish.
 
     No more is submitted than there are workers, so that neither tasks nor results pile up.
-
-    Args:
-        submit: submits a piece to the pool.
-        work: in pieces.
-        pool: workers.
 
     Yields:
         each piece with its result or its exception.

@@ -49,11 +49,6 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
 
     It has a session of its own: a Ctrl-C that stops us does not end it half-way unasked, and when it takes too long, or
     we are interrupted, all that it started is ended with it.
-
-    Args:
-        command: program, arguments, and how long it may take.
-        further: arguments behind those.
-        folder: in which it runs.
     """
     try:
         process = subprocess.Popen(
@@ -193,10 +188,6 @@ LEFT_BEHIND = (
 def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
     """Check identity and state of every drive; nothing is changed and nothing moves.
 
-    Args:
-        cell: its file.
-        block_signals: keeps signals away while the network is closed.
-
     Raises:
         DriveFault: one has a fault; to reset it is a person's decision.
         StateRefused: one has power already: another controller drives this robot.
@@ -222,9 +213,6 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
     """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
 
     There is no alarm outside the main thread, where Python handles no signals.
-
-    Args:
-        minutes: limit [min].
 
     Raises:
         TimeBoundReached: in the block.

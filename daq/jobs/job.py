@@ -39,15 +39,6 @@ def recalibrate(
 ) -> Conclusion:
     """Recalibrate a cell, or finish the session of an earlier job.
 
-    Args:
-        cell_file: of the cell.
-        cell: read from it.
-        tools: functions that the job calls.
-        journal: receives every event.
-        who: name of the job in audit and logs.
-        block_signals: keeps signals away while the axes are stopped.
-        lock_folder: of the bus's lock, see `daq.workflow.safeguards`.
-
     Raises:
         JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next line.
         DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, the

@@ -233,13 +233,7 @@ def write_metrics(
 ) -> Path:
     """Write the metrics for the textfile collector of the Prometheus node exporter; the file is replaced whole.
 
-    Args:
-        folder: of the collector.
-        cell: its name.
-        conclusion: of the job. Where its session has no calibration, figures are those of the last good one.
-        ended: end of the job.
-        duration_s: of the job [s].
-        good: last good session, None where there was none.
+    Where the session of this job has no calibration, figures are those of the last good one.
 
     Raises:
         OutputFailed: the file system refuses.

@@ -62,13 +62,7 @@ class CheckedScene:
 
 
 def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
-    """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart.
-
-    Args:
-        cell: with or without declared clearance.
-        robot: of the cell.
-        mass_kg: of the payload that will be mounted, for the guess of its size.
-    """
+    """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart."""
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
     capsules = declared.capsules or guessed_capsules(robot)
     last = robot.joint_count - 1
@@ -150,12 +144,7 @@ class Experiment:
     remarks: tuple[str, ...]  #: what was assumed, in words
 
     def excitation(self, paths: Sequence[Trapezoid], thinning: int = 1) -> tuple[Excitation, tuple[slice, ...]]:
-        """Rows of several moves, one after the other, and which of them belong to which move.
-
-        Args:
-            paths: the moves.
-            thinning: takes every so manieth row only.
-        """
+        """Rows of several moves, one after the other, and which of them belong to which move."""
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]

@@ -222,10 +222,6 @@ def _fit(
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
     """Every estimator on the logs of a fit, which are read again for each filter.
 
-    Args:
-        fitted: with free gains.
-        progress: receives a line for each step.
-
     Raises:
         UsageError: its gains were held fixed.
     """
@@ -392,13 +388,10 @@ def axis_of(placed: PlacedEffect, cell: Cell) -> str:
 
 
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a fit with free gains; the logs are read again.
+    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
 
     The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
     scaled from the prediction as the fit's deviation is: moves determine the ratio, not the size of the noise.
-
-    Args:
-        fitted: effects, if it has any, are left out of the judgement.
     """
     found = fitted.identification
     estimate, system = found.estimate, found.system

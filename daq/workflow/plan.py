@@ -136,13 +136,7 @@ class Search:
                 moves = [self._clear_start()]
 
     def improve(self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]) -> Draft:
-        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed.
-
-        Args:
-            draft: to begin with.
-            tries: proposals; every one of them is made.
-            progress: receives the number of tries and the predicted deviations so far [%].
-        """
+        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed."""
         best, worst = self._judge(draft, np.inf)
         done = 0
         while done < tries:

@@ -93,10 +93,6 @@ class Recorded:
 def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> CanopenNetwork:
     """The amplifiers of a cell; use it as a context manager.
 
-    Args:
-        cell: its file.
-        block_signals: keeps signals away while the axes are stopped.
-
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
@@ -234,12 +230,6 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
 
     Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
     confirm; if it were only closed, that would be lost.
-
-    Args:
-        samples: of `drivers.motion.execute.execute`.
-        log: open.
-        room: for it.
-        check_every: samples, between two looks at the room.
 
     Raises:
         DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.

@@ -117,14 +117,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
-    """Size of a log at most: as if nothing could be compressed [bytes].
-
-    Args:
-        names: of the axes.
-        rate_hz: samples a second.
-        duration_s: of the run [s].
-        attached: files at its start, by name.
-    """
+    """Size of a log at most: as if nothing could be compressed [bytes]."""
     state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
     of_states = 1e9 / JOINT_STATE_NS * (MESSAGE_HEAD_BYTES + len(state) + INDEX_BYTES)
@@ -133,12 +126,7 @@ def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float,
 
 
 class DiskRoom:
-    """The room for one log.
-
-    Args:
-        log: to be written.
-        free: free bytes of a folder's disk.
-    """
+    """The room for one log."""
 
     def __init__(self, log: Path, free: FreeBytes = free_bytes) -> None:
         self._log = log
@@ -192,10 +180,6 @@ def _megabytes(number: int) -> str:
 def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
     """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
 
-    Args:
-        cell: with nameplate gains and drive train.
-        readings: of its drives, in the order of the axes (drivers.scale.read_scale).
-
     Returns:
         What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
 
@@ -231,11 +215,6 @@ def agree(one_kg: float, other_kg: float, within_kg: float) -> bool:
 
 def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | None) -> None:
     """Refuse a mass from the scale that is not the cell file's, before anything moves.
-
-    Args:
-        cell: with the tolerance.
-        payload: that is mounted, with the mass of the cell file.
-        entered_kg: from the scale; None where none was entered.
 
     Raises:
         UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.

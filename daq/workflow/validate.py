@@ -160,12 +160,7 @@ def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
 
 
 def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
-    """Why a calibration says nothing of a run with this payload; empty where it does.
-
-    Args:
-        calibration: whose payload parameters are named by their mounting.
-        payload: as the log has it, None without load.
-    """
+    """Why a calibration says nothing of a run with this payload; empty where it does."""
     if payload is None or set(payload.known) == set(LINK_PARAMETERS):
         return ""
     if "m" not in payload.known:
@@ -179,14 +174,6 @@ def predicted(
     calibration: Calibration, conditioning: Conditioning, model: Model, log: Path, run: Run, configuration_sha256: str
 ) -> Validation:
     """One run under one calibration.
-
-    Args:
-        calibration: with gains and parameters.
-        conditioning: `conditioning_of` the calibration.
-        model: of the log's cell.
-        log: where the run was read.
-        run: of that log.
-        configuration_sha256: of the cell that the log carries.
 
     Raises:
         IdentificationError: the calibration cannot speak of this run.
