@@ -16,7 +16,7 @@ from daq.config.recalibration import Recalibration
 from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, OutputFailed
 from daq.jobs.interlock import Runner, check_drives, require_release, run_command
 from daq.jobs.journal import Journal, Level
-from daq.jobs.session import Session, last_good
+from daq.jobs.session import Session
 from daq.ledger.store import HistoryStore
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
@@ -156,12 +156,6 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
             remedy="set the clock (`timedatectl`), or where it is right, move that folder away: it was made by a wrong "
             "one; ages, history and audit would be in the wrong order",
         )
-
-
-def due_in(found: tuple[Session, ...], every_h: float, now: datetime) -> timedelta:
-    """Time until the next calibration is due, counted from the start of the last good one; not positive when it is."""
-    good = last_good(found)
-    return timedelta(0) if good is None else good.began + timedelta(hours=every_h) - now
 
 
 def before_motion(context: JobContext) -> None:

@@ -13,7 +13,7 @@ from daq.config.recalibration import Recalibration
 from daq.errors import ExitCode
 from daq.files import sha256_of
 from daq.jobs import session as sessions
-from daq.jobs.context import JobContext, Tools, before_motion, due_in, require_clock, section_of, target_of
+from daq.jobs.context import JobContext, Tools, before_motion, require_clock, section_of, target_of
 from daq.jobs.decision import decide_outcome
 from daq.jobs.interlock import time_bound
 from daq.jobs.journal import Journal, Level
@@ -134,9 +134,9 @@ def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | 
     """Conclude early where no calibration is due; also checks the clock, on which every age depends."""
     found = sessions.sessions(section.folder, cell.name)
     require_clock(found, now)
-    left = due_in(found, section.every_h, now)
     good = sessions.last_good(found)
-    if left <= timedelta(0) or good is None:
+    left = timedelta(0) if good is None else good.began + timedelta(hours=section.every_h) - now
+    if good is None or left <= timedelta(0):
         return None
     hours = left.total_seconds() / 3600.0
     remark = f"The calibration of session {good.state.session} is good for another {hours:.1f} h (every_h)."

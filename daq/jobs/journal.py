@@ -64,7 +64,9 @@ class Journal:
         """
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
-            details = ", ".join(f"{name} {_text(value)}" for name, value in fields.items())
+            values = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in fields.items()}
+            details = ", ".join(f"{name} {value}" for name, value in values.items())
+            details = "".join(letter if letter.isprintable() else " " for letter in details)
             line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
         else:
             known = {"session": self.session, "step": self.step}
@@ -94,11 +96,6 @@ def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
         if environment.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}":
             return Form.JOURNAL
     return Form.JSON
-
-
-def _text(value: object) -> str:
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _plain(value: object) -> object:

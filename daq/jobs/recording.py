@@ -39,7 +39,6 @@ from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
-from ident.model.bodies import Payload
 
 WARM_UP = "warm-up"
 
@@ -79,7 +78,16 @@ def record_runs(context: JobContext, session: Session) -> Session:
         mount(context.section, planned, context.tools.run)
         run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
-            _warm_up(context.within(step=WARM_UP), session, planned, plans[planned.name])
+            # The moves of the run, recorded under the same supervision; the log is dropped.
+            plan, out = plans[planned.name], log_of(session, WARM_UP)
+            passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
+            for number in range(1, passes + 1):
+                said = context.within(step=WARM_UP).journal
+                said.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
+                out.unlink(missing_ok=True)
+                out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+                _record(context, planned, plan, out)
+                out.unlink()
             warm = True
         run = _record_valid(run_context, session, planned, plans[planned.name])
         session = session.update(runs=(*session.state.runs, run))
@@ -100,18 +108,6 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
     except OSError as error:
         raise OutputFailed.of(path, error) from error
     return load_plan(path, context.cell)  # as a person can read it
-
-
-def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> None:
-    """Repeat the moves of a run until the joints are warm; recorded under the same supervision, the log is dropped."""
-    passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
-    for number in range(1, passes + 1):
-        context.journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
-        out = log_of(session, WARM_UP)
-        out.unlink(missing_ok=True)
-        out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
-        _record(context, planned, plan, out)
-        out.unlink()
 
 
 def _record_valid(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> RecordedRun:
@@ -151,13 +147,15 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
     def released() -> None:
         require_release(context.section.interlock, context.tools.run, context.tools.now, context.section.working_folder)
 
+    # `section_of` has checked that the cell has it.
+    payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
     released()
     return context.tools.record(
         context.file,
         context.cell,
         plan,
         out,
-        payload=payload_of(context.cell, planned),
+        payload=payload,
         entered_kg=planned.mass_kg,
         operator=context.who,
         granted_by=f"the policy of cell {context.cell.name} and its interlock, for {context.who}",
@@ -167,13 +165,6 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
         # Waiting for the drives and mapping their PDOs takes seconds, in which the cell may be opened.
         before_motion=released,
     )
-
-
-def payload_of(cell: Cell, planned: PlannedRun) -> Payload | None:
-    """Payload of a run; `section_of` has checked that the cell has it."""
-    if planned.payload is None:
-        return None
-    return next(payload.payload for payload in cell.payloads if payload.name == planned.payload)
 
 
 def _set_aside(out: Path, journal: Journal) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 
 import numpy as np
@@ -67,12 +67,16 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     capsules = declared.capsules or guessed_capsules(robot)
     last = robot.joint_count - 1
     if not any(capsule.link == last for capsule in capsules):
-        capsules = (*capsules, guessed_payload(robot, mass_kg))
+        # Around a steel body of that mass on the last link, from a side in front of the joint to three of them.
+        side, axis = side_of_cube(mass_kg), robot.joints[-1].axis
+        capsules = (*capsules, Capsule("payload", last, _point(side * axis), _point(2.0 * side * axis), side))
+    links = [capsule.link for capsule in capsules]
+    parents = [robot.joints[link].parent if link != BASE else None for link in links]
     candidates = tuple(
         (first, second)
         for second in range(len(capsules))
         for first in range(second)
-        if not _neighbours(robot, capsules[first].link, capsules[second].link)
+        if links[first] not in (links[second], parents[second]) and parents[first] != links[second]
     )
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
@@ -83,7 +87,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     together = tuple(
         (capsules[a].name, capsules[b].name) for (a, b), kept in zip(candidates, apart, strict=True) if not kept
     )
-    scene = Scene(capsules, pairs, declared.obstacles, declared.workspace, confined, declared.minimum_m)
+    scene = replace(everything, pairs=pairs)
     return CheckedScene(Checker(robot, scene), not declared.capsules, together)
 
 
@@ -105,18 +109,6 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
     return tuple(capsules)
 
 
-def guessed_payload(robot: Robot, mass_kg: float) -> Capsule:
-    """Around a steel body of that mass on the last link, from a side in front of the joint to three of them."""
-    side = side_of_cube(mass_kg)
-    axis = robot.joints[-1].axis
-    return Capsule("payload", robot.joint_count - 1, _point(side * axis), _point(2.0 * side * axis), side)
-
-
-def _neighbours(robot: Robot, first: int, second: int) -> bool:
-    parents = [robot.joints[link].parent if link != BASE else None for link in (first, second)]
-    return first == second or parents[0] == second or parents[1] == first
-
-
 def _point(vector: FloatArray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
@@ -128,6 +120,7 @@ NOISE_SHARE = 0.006
 """Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
 current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
 LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
+RATE_HZ = 1000.0  #: Sampling rate that the rows are predicted for
 RUNS: tuple[int | None, ...] = (None, 0)  #: What is mounted while the moves are made: nothing, then the payload
 
 
@@ -185,7 +178,15 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     Raises:
         ConfigurationInconsistent: the cell declares no payload, or none of that name.
     """
-    mounted = _payload(cell, payload)
+    found = [declared for declared in cell.payloads if payload in (None, declared.name)]
+    if not found:
+        raise ConfigurationInconsistent(
+            f"payloads of cell {cell.name!r}",
+            found=", ".join(declared.name for declared in cell.payloads) or "none",
+            expected="a weighed payload" if payload is None else repr(payload),
+            remedy="gains show only beside a known mass: weigh a body and declare it under `payloads`",
+        )
+    mounted = found[0]
     model = model_of(cell)
     expected = nominal_payload(model.robot, mounted.drawn)
     velocity = np.array([axis.limits.velocity for axis in cell.axes])
@@ -211,21 +212,13 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         "to row",
         *scene.remarks,
     )
-    period, edge = _rows(cell)
-    return Experiment(cell, Design(expectation, visible(model, fast_motion)), scene, mounted, period, edge, remarks)
-
-
-def _payload(cell: Cell, name: str | None) -> WeighedPayload:
-    found = [payload for payload in cell.payloads if name in (None, payload.name)]
-    if not found:
-        names = ", ".join(payload.name for payload in cell.payloads) or "none"
-        raise ConfigurationInconsistent(
-            f"payloads of cell {cell.name!r}",
-            found=names,
-            expected="a weighed payload" if name is None else repr(name),
-            remedy="gains show only beside a known mass: weigh a body and declare it under `payloads`",
-        )
-    return found[0]
+    design = Design(expectation, visible(model, fast_motion))
+    # A row counts when its filter window is so far from a standstill that enough of its weight is outside.
+    filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
+    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
+    inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
+    period, edge = filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+    return Experiment(cell, design, scene, mounted, period, edge, remarks)
 
 
 def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> Motion:
@@ -238,16 +231,6 @@ def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> 
         path = synchronised(start, end, velocity, acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
     return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
-
-
-def _rows(cell: Cell) -> tuple[float, float]:
-    """Time between rows, and how far from a standstill a row's filter window must be for it to count [s]."""
-    conditioning = cell.conditioning
-    rate_hz = 1000.0
-    filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
-    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
-    inside = int(np.searchsorted(weight, conditioning.standstill_share))
-    return filter_.factor / rate_hz, max(filter_.half - inside, 0) / rate_hz
 
 
 @dataclass(frozen=True, slots=True)
