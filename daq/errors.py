@@ -266,7 +266,4 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
 
 def exit_code(kind: type[BaseException]) -> ExitCode | None:
     """Exit code of an exception class, or None for a foreign one."""
-    for root, code in EXIT_CODES:
-        if issubclass(kind, root):
-            return code
-    return None
+    return next((code for root, code in EXIT_CODES if issubclass(kind, root)), None)

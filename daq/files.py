@@ -196,11 +196,7 @@ _KERNEL = ("security.", "trusted.")
 
 
 def _copy_attributes(descriptor: int, like: Path) -> None:
-    """Copy access lists and other extended attributes.
-
-    Raises:
-        OSError: one of them cannot be kept: without its access list a file is open to more people, or to fewer.
-    """
+    """Copy access lists and other extended attributes; without its list a file is open to more people, or to fewer."""
     try:
         wanted, found = os.listxattr(like), os.listxattr(descriptor)
     except OSError as error:

@@ -22,7 +22,7 @@ from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
-from daq.writeback.target import Proposal, Written
+from daq.writeback.target import Proposal, Written, audited_change
 from ident.calibration import Calibration
 from ident.drift.change import FALSE_ALARM
 
@@ -162,15 +162,7 @@ def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256
         "base_sha256": proposal.edit.base_sha256,
         "after_sha256": after_sha256,
         "changes": [
-            {
-                "axis": change.axis,
-                "key": change.key,
-                "old": _finite(change.old),
-                "new": _finite(change.new),
-                "std": _finite(change.std),
-                "unit": change.unit,
-                "change_percent": _finite(change.change_percent),
-            }
+            {**audited_change(change), "change_percent": _finite(change.change_percent)}
             for change in proposal.edit.changes
         ],
         "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],

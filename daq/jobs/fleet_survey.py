@@ -111,16 +111,13 @@ def _regular(path: Path) -> Path:
     """Check that a log is a regular file before it is opened: a pipe or a device would never end."""
     if path.is_symlink() and not path.exists():
         found = f"a link to {path.readlink()}, which leads nowhere"
-        raise _no_log(path, found, "mount or copy what it leads to, or move the link away")
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode):
+        remedy = "mount or copy what it leads to, or move the link away"
+    elif not stat.S_ISREG(mode := path.stat().st_mode):
         found = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
-        raise _no_log(path, found, f"put the log there, or give this a name without {ENDING}")
-    return path
-
-
-def _no_log(path: Path, found: str, remedy: str) -> LogMissing:
-    return LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
+        remedy = f"put the log there, or give this a name without {ENDING}"
+    else:
+        return path
+    raise LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
 
 
 def _copy(log: StoredLog, folder: Path) -> Path:

@@ -64,21 +64,19 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
     with process:
         try:
             said = _said(process, command.timeout_s)
-        except subprocess.TimeoutExpired:
-            _end(process)
-            return Finished(None, f"not ended within {command.timeout_s:g} s")
-        except BaseException:
-            _end(process)
+        except BaseException as error:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            if process.stdout is not None:
+                process.stdout.close()
+            if isinstance(error, subprocess.TimeoutExpired):
+                return Finished(None, f"not ended within {command.timeout_s:g} s")
             raise
     return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:])
 
 
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
-    """The end of what a program says until it has ended; the rest of it is read, and not kept.
-
-    Raises:
-        subprocess.TimeoutExpired: it takes longer.
-    """
+    """The end of what a program says until it has ended; the rest of it is read, and not kept."""
     assert process.stdout is not None
     ends_s, said = time.monotonic() + timeout_s, b""
     with selectors.DefaultSelector() as output:
@@ -92,13 +90,6 @@ def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
                 return said
             said = (said + piece)[-_KEPT_BYTES:]
     raise subprocess.TimeoutExpired(process.args, timeout_s)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    if process.stdout is not None:
-        process.stdout.close()
 
 
 NOTHING = "none"  #: Argument of the mount command for a run without load

@@ -168,12 +168,7 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
 
 
 def _set_aside(out: Path, journal: Journal) -> None:
-    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one.
-
-    Raises:
-        UsageError: the log is still being written.
-        OutputFailed: the file system refuses.
-    """
+    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one."""
     part = out.with_name(out.name + UNFINISHED)
     try:
         if out.exists():

@@ -40,9 +40,6 @@ class Conclusion:
     remark: str  #: reason, in one sentence
 
 
-CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}  #: Exit codes of outcomes without an error; the others are OK
-
-
 def report_success(context: JobContext, session: Session) -> Conclusion:
     """Report a session whose state has its outcome.
 
@@ -51,7 +48,8 @@ def report_success(context: JobContext, session: Session) -> Conclusion:
     """
     outcome = session.state.outcome or Outcome.STOPPED
     remark = "" if session.state.decision is None else session.state.decision.remark
-    return _report(context, session, outcome, CODES.get(outcome, ExitCode.OK), remark, "")
+    code = ExitCode.PROPOSED if outcome is Outcome.PROPOSED else ExitCode.OK
+    return _report(context, session, outcome, code, remark, "")
 
 
 def report_failure(context: JobContext, folder: Path, error: BaseException) -> None:

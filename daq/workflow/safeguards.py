@@ -82,15 +82,14 @@ def _address(bus: Bus) -> str:
     except (OSError, UnicodeError):
         return bus.host.lower()
     # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
-    address = min((_unmapped(str(where[0])) for *_, where in found), key=lambda one: (one.version, str(one)))
+    addresses: list[IPv4Address | IPv6Address] = []
+    for *_, where in found:
+        address = ip_address(str(where[0]))
+        # One of IPv4 within IPv6 (::ffff:10.0.0.7) is that of IPv4.
+        addresses.append((address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address)
+    address = min(addresses, key=lambda one: (one.version, str(one)))
     # Who connects to the unspecified address comes to this machine, as by a loopback address.
     return "localhost" if address.is_loopback or address.is_unspecified else str(address)
-
-
-def _unmapped(written: str) -> IPv4Address | IPv6Address:
-    """An address; of one of IPv4 within IPv6 (::ffff:10.0.0.7) that of IPv4."""
-    address = ip_address(written)
-    return (address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address
 
 
 def _shared_folder() -> Path:
@@ -139,15 +138,11 @@ class DiskRoom:
             DiskSpaceShort: there is less than that, and a reserve.
             OutputFailed: there is no such folder.
         """
-        free = self._ask()
-        if free < needed_bytes + RESERVE_BYTES:
-            raise DiskSpaceShort(
-                str(self._log.parent),
-                found=f"{_megabytes(free)} free",
-                expected=f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in "
-                "reserve",
-                remedy="nothing has moved; free space, name a folder on another disk, or plan a shorter run",
-            )
+        self._require(
+            needed_bytes + RESERVE_BYTES,
+            f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in reserve",
+            "nothing has moved; free space, name a folder on another disk, or plan a shorter run",
+        )
 
     def check(self) -> None:
         """Ask while the log grows.
@@ -156,21 +151,20 @@ class DiskRoom:
             DiskSpaceShort: the reserve is all that is left.
             OutputFailed: the folder has gone.
         """
-        free = self._ask()
-        if free < RESERVE_BYTES:
-            raise DiskSpaceShort(
-                str(self._log),
-                found=f"{_megabytes(free)} left on its disk",
-                expected=f"{_megabytes(RESERVE_BYTES)} in reserve",
-                remedy="the axes were sent a stop; the log up to there is finished and marked invalid: free space and "
-                "record again",
-            )
+        self._require(
+            RESERVE_BYTES,
+            f"{_megabytes(RESERVE_BYTES)} in reserve",
+            "the axes were sent a stop; the log up to there is finished and marked invalid: free space, record again",
+        )
 
-    def _ask(self) -> int:
+    def _require(self, least_bytes: int, expected: str, remedy: str) -> None:
         try:
-            return self._free(self._log.parent)
+            free = self._free(self._log.parent)
         except OSError as error:
             raise OutputFailed.of(self._log.parent, error) from error
+        if free < least_bytes:
+            found = f"{_megabytes(free)} left on its disk"
+            raise DiskSpaceShort(str(self._log), found=found, expected=expected, remedy=remedy)
 
 
 def _megabytes(number: int) -> str:
