@@ -49,6 +49,8 @@ drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
 
@@ -241,6 +243,19 @@ class OutputFailed(DaqError):
             expected="a folder that can be written, with room",
             remedy="nothing was changed; free space or rights, or choose another folder",
         )
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report a refusal of the file system within the block as an output that failed.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
 
 
 class DiskSpaceShort(OutputFailed):

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daq.cli.terminal import at_most_one, interruptible, writing
+from daq.cli.terminal import at_most_one, interruptible
+from daq.errors import writing
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError

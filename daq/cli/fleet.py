@@ -39,7 +39,8 @@ def fleet_verb(
     """
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_replaceable, print_view, progress_bar, writing
+    from daq.cli.terminal import check_replaceable, print_view, progress_bar
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
     from daq.jobs.fleet import fit_fleet, worker_pool

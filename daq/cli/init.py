@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from daq.cli.terminal import writing
+from daq.errors import writing
 from daq.cli.verb import Verb
 from daq.environment import shipped_configurations
 from daq.errors import UsageError

@@ -200,7 +200,8 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_output, progress_bar, writing
+    from daq.cli.terminal import check_output, progress_bar
+    from daq.errors import writing
     from daq.config.cell_file import load_cell
     from daq.report.plan import plan_document, plan_text
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of

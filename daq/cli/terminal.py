@@ -51,15 +51,6 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
         )
 
 
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Report a refusal of the file system within the block as an output that failed."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
-
-
 def one_of(remedy: str, **options: object) -> None:
     """Require exactly one of several options, by their names on the command line."""
     if not any(options.values()):

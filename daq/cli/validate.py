@@ -33,7 +33,8 @@ def validate_verb(
     the gains give (Tables 7, 8); with --beside every calibration side by side (Table 6 too). With unloaded logs among
     the others, the payload mass does not depend on the calibration's robot parameters.
     """
-    from daq.cli.terminal import check_output, print_view, status, writing
+    from daq.cli.terminal import check_output, print_view, status
+    from daq.errors import writing
     from daq.config.cell_file import load_cell
     from daq.files import replace_file
     from daq.report.paper_tables import page

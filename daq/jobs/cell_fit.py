@@ -24,9 +24,9 @@ from daq.errors import (
     ExitCode,
     LogsDiffer,
     LogUnreadable,
-    OutputFailed,
     UsageError,
     exit_code,
+    writing,
 )
 from daq.files import read_regular, replace_file
 from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
@@ -209,10 +209,8 @@ class CalibrationCache:
             (file, fitted.content),
             (file.with_suffix(".json"), json.dumps(state, indent=1).encode()),
         ):
-            try:
+            with writing(path):
                 replace_file(path, content)
-            except OSError as error:
-                raise OutputFailed.of(path, error) from error
         return file
 
     def _inputs(self, cell: CellLogs) -> str:
@@ -235,12 +233,10 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
     return CalibrationCache(folder, loop)
 
 

@@ -13,7 +13,7 @@ from daq.config.cell import Cell, MotionPolicy
 from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import Recalibration
-from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, OutputFailed
+from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
 from daq.jobs.interlock import Runner, check_drives, require_release, run_command
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import Session
@@ -166,10 +166,8 @@ def before_motion(context: JobContext) -> None:
         OutputFailed: the session's folder is gone.
     """
     section, tools = context.section, context.tools
-    try:
+    with writing(section.folder):
         free_mb = tools.free(section.folder) / 1e6
-    except OSError as error:
-        raise OutputFailed.of(section.folder, error) from error
     if free_mb < section.min_free_mb:
         raise DiskSpaceShort(
             str(section.folder),

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from daq.config.policy import AppliedBy
-from daq.errors import DaqError, OutputFailed
+from daq.errors import DaqError, writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
@@ -101,10 +101,8 @@ def decide_outcome(context: JobContext, session: Session, calibration: Calibrati
 
 
 def _apply(context: JobContext, proposal: Proposal[FileEdit], now: datetime) -> Written | None:
-    try:
+    with writing(proposal.edit.file):
         return context.tools.apply(proposal, now, audit=context.target.history.audit, who=context.who)
-    except OSError as error:
-        raise OutputFailed.of(proposal.edit.file, error) from error
 
 
 def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256: str) -> None:
@@ -167,11 +165,9 @@ def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256
         ],
         "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
     }
-    try:
+    with writing(session.folder / PROPOSAL):
         replace_file(session.folder / PROPOSAL, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode())
         replace_file(session.folder / DIFF, proposal.edit.diff.encode())
-    except OSError as error:
-        raise OutputFailed.of(session.folder / PROPOSAL, error) from error
 
 
 def _finite(number: float) -> float | None:

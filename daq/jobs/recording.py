@@ -20,8 +20,8 @@ from daq.errors import (
     ConfigurationError,
     DataError,
     LogUnreadable,
-    OutputFailed,
     RunInvalid,
+    writing,
 )
 from daq.files import sha256_of
 from daq.jobs.context import JobContext
@@ -103,10 +103,8 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
         with suppress(ConfigurationError):  # what was damaged is made again
             return load_plan(path, context.cell)
     context.journal.say(Level.INFO, "planning", seed=planned.seed, duration_s=planned.duration_s)
-    try:
+    with writing(path):
         save_plan(context.tools.plan(context.cell, seed=planned.seed, duration_s=planned.duration_s), path)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return load_plan(path, context.cell)  # as a person can read it
 
 
@@ -170,7 +168,7 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
 def _set_aside(out: Path, journal: Journal) -> None:
     """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one."""
     part = out.with_name(out.name + UNFINISHED)
-    try:
+    with writing(out):
         if out.exists():
             aside = next(_free_names(out, "aside"))
             out.rename(aside)
@@ -184,8 +182,6 @@ def _set_aside(out: Path, journal: Journal) -> None:
                 aside = part.rename(aside.with_name(aside.name + UNFINISHED))
                 journal.say(Level.NOTICE, "nothing to salvage", found=error.found)
             journal.say(Level.NOTICE, "half a recording kept as partial", log=aside.name)
-    except OSError as error:
-        raise OutputFailed.of(out, error) from error
 
 
 def _free_names(out: Path, kind: str) -> Iterator[Path]:
@@ -222,11 +218,9 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         raise
     calibration = context.tools.calibration(closed, context.tools.now())
     path, report = session.folder / CALIBRATION, session.folder / REPORT
-    try:
+    with writing(path):
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     context.tools.save_report(closed, changed, calibration, report)
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
     for sentence in fit.sentences:

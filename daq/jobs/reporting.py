@@ -14,7 +14,7 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
-from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code
+from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import JobContext
@@ -72,7 +72,7 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
     Raises:
         AuditUnusable, OutputFailed: it could not be written.
     """
-    try:
+    with writing(context.target.history.audit):
         return append(
             context.target.history.audit,
             action,
@@ -81,8 +81,6 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
             subject=str(session.folder),
             details={"session": session.state.session, "cell": context.cell.name, **details},
         )
-    except OSError as error:
-        raise OutputFailed.of(context.target.history.audit, error) from error
 
 
 def _report(
@@ -111,12 +109,10 @@ def _report(
     conclusion = Conclusion(outcome, int(code), session, remark)
     level = Level.NOTICE if outcome.good else Level.ERROR
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
-    try:
+    with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
         summary = json.dumps(document(conclusion, context.file), indent=2, ensure_ascii=False) + "\n"
         replace_file(session.folder / SUMMARY_JSON, summary.encode())
-    except OSError as error:
-        raise OutputFailed.of(session.folder, error) from error
     found = sessions.sessions(context.section.folder, context.cell.name)
     if context.section.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -259,12 +255,10 @@ def write_metrics(
     if calibration is not None:
         _set_calibration_gauges(gauge, calibration, cell)
     path = folder / f"drivegain_{file_stem(cell)}.prom"
-    try:
+    with writing(path):
         write_to_textfile(str(path), registry)
         # The collector is another user, and a service's umask may be strict.
         path.chmod(0o644)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return path
 
 

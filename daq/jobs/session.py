@@ -19,7 +19,7 @@ from typing import Literal
 from pydantic import ValidationError
 
 from daq.config.yaml_file import StrictModel
-from daq.errors import OutputFailed
+from daq.errors import writing
 from daq.files import read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
@@ -210,12 +210,10 @@ def begin(folder: Path, basis: Basis, now: datetime) -> Session:
     """
     stamp = now.astimezone(UTC).strftime(_STAMP)
     names = (stamp, *(f"{stamp}-{number:02d}" for number in range(2, 100)))
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         name = next(name for name in names if not (folder / name).exists())
         (folder / name).mkdir()
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
     at = now.isoformat(timespec="seconds")
     state = SessionState(
         session=name,
@@ -235,10 +233,8 @@ def save(session: Session) -> Session:
         OutputFailed: the file system refuses.
     """
     path = session.folder / STATE
-    try:
+    with writing(path):
         replace_file(path, (session.state.model_dump_json(indent=2) + "\n").encode())
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return session
 
 

@@ -19,7 +19,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
 from daq.config.cell import Bus, Cell, WeighedPayload
-from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError
+from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writing
 from daq.files import hold_lock
 from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
@@ -158,10 +158,8 @@ class DiskRoom:
         )
 
     def _require(self, least_bytes: int, expected: str, remedy: str) -> None:
-        try:
+        with writing(self._log.parent):
             free = self._free(self._log.parent)
-        except OSError as error:
-            raise OutputFailed.of(self._log.parent, error) from error
         if free < least_bytes:
             found = f"{_megabytes(free)} left on its disk"
             raise DiskSpaceShort(str(self._log), found=found, expected=expected, remedy=remedy)
