@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -158,23 +158,13 @@ def _as_entry(value: Any) -> Any:
             # NaN marks an axis that did not move; the reader refuses any other number that is not finite.
             return {"axes": [None if math.isnan(axis) else axis for axis in value.axes], "total": value.total}
         case Gain():
-            return {
-                "axis": value.axis,
-                "value": value.value,
-                "std": value.std,
-                "std_percent": _percent(value.std, abs(value.value)),
-                "unit": value.unit,
-                "nameplate": value.nameplate,
-                "change_percent": _percent(value.value - value.nameplate, value.nameplate),
-            }
+            change_percent = _percent(value.value - value.nameplate, value.nameplate)
+            std_percent = _percent(value.std, abs(value.value))
+            entry = GainEntry.model_construct(**asdict(value), std_percent=std_percent, change_percent=change_percent)
+            return entry.model_dump()
         case Parameter():
-            return {
-                "name": value.name,
-                "value": value.value,
-                "std": value.std,
-                "std_percent": _percent(value.std, abs(value.value)),
-                "unit": value.unit,
-            }
+            std_percent = _percent(value.std, abs(value.value))
+            return ParameterEntry.model_construct(**asdict(value), std_percent=std_percent).model_dump()
     return {f.name: _as_entry(getattr(value, f.name)) for f in fields(value)} if is_dataclass(value) else value
 
 

@@ -111,7 +111,8 @@ class Search:
             if len(moves) >= MIN_MOVES:
                 return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
             most = max(most, moves, key=len)
-        raise self._unfit(f"room for {len(most)} moves", "at least 5, better 30", "allow a longer run")
+        found = f"room for {len(most)} moves"
+        raise _unfit(self._cell, self._duration_s, found, "at least 5, better 30", "allow a longer run")
 
     def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
         moves, paths = [self._clear_start()], list[Trapezoid]()
@@ -251,15 +252,14 @@ class Search:
         return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
 
     def _blocked(self, what: str) -> UsageError:
-        return self._unfit(
-            f"no clear {what} among hundreds of random ones",
-            "room to move in",
-            "correct `workspace` and `clearance` in the cell file, or the joint limits",
-        )
+        found = f"no clear {what} among hundreds of random ones"
+        remedy = "correct `workspace` and `clearance` in the cell file, or the joint limits"
+        return _unfit(self._cell, self._duration_s, found, "room to move in", remedy)
 
-    def _unfit(self, found: str, expected: str, remedy: str) -> UsageError:
-        subject = f"plan of {self._duration_s:g} s for cell {self._cell.name!r}"
-        return UsageError(subject, found=found, expected=expected, remedy=remedy)
+
+def _unfit(cell: Cell, duration_s: float, found: str, expected: str, remedy: str) -> UsageError:
+    subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
+    return UsageError(subject, found=found, expected=expected, remedy=remedy)
 
 
 _Way = tuple[tuple[float, ...], PlannedMove]
@@ -308,22 +308,13 @@ def plan(
     information = np.sum(experiment.informations(draft.paths), axis=0)
     predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
     worst = int(np.argmax(predicted))
-    subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if found > largest_condition:
-        raise UsageError(
-            subject,
-            found=f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges",
-            expected=f"at most {largest_condition:.0f}",
-            remedy=remedy,
-        )
+        words = f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges"
+        raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
     if predicted[worst] > largest_std_percent:
-        raise UsageError(
-            subject,
-            found=f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}",
-            expected=f"at most {largest_std_percent:g} %",
-            remedy=remedy,
-        )
+        words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
+        raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
     return Plan(
         cell=cell.name,
         seed=seed,
