@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.errors import ConfigurationMissing, SchemaMismatch
+from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
+from daq.writeback.formats.xml_document import Element, parse
 from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.model.bodies import Body
@@ -113,18 +113,6 @@ MAX_DEPTH = 64  #: Elements in elements; a URDF has five or so, and readers that
 _TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=>/]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*/?>")
 
 
-@dataclass(slots=True)
-class Element:
-    """One element, and its place in the file [bytes]."""
-
-    name: str  #: of its tag
-    attributes: dict[str, str]  #: as given
-    start: int  #: offset of its '<'
-    tag_end: int  #: offset behind the start tag
-    end: int = -1  #: offset behind the whole element, `tag_end` for <name/>
-    children: list[Element] = field(default_factory=list)  #: one level further down
-
-
 @dataclass(frozen=True, slots=True)
 class Markup:
     """The elements of a URDF."""
@@ -132,7 +120,6 @@ class Markup:
     file: str  #: name in messages
     content: bytes  #: of the file
     root: Element  #: <robot>
-    head_comments: tuple[tuple[int, int], ...]  #: start and end of comments before it
     links: Mapping[str, Element]  #: by their names
     joints: Mapping[str, Element]  #: by their names
     fixed: Mapping[str, Sequence[str]]  #: links that fixed joints hold to a link, by its name
@@ -166,6 +153,27 @@ class Markup:
             raise refused(self.file, f"{len(found)} <{name}> in {what}", "at most one", "remove the wrong one")
         return found[0] if found else None
 
+    def tag_end(self, element: Element) -> int:
+        """Return the offset behind an element's start tag.
+
+        Raises:
+            SchemaMismatch: the tag cannot be read.
+        """
+        tag = _TAG.match(self.content, element.start)
+        if tag is None:
+            found = f"a tag <{element.name}> that cannot be read at byte {element.start}"
+            raise refused(self.file, found, "plain XML")
+        return tag.end()
+
+    def end(self, element: Element) -> int:
+        """Return the offset behind a whole element."""
+        tag_end = self.tag_end(element)
+        return tag_end if self.is_empty(element) else self.content.index(b">", element.end) + 1
+
+    def is_empty(self, element: Element) -> bool:
+        """Whether an element is written as <name/>."""
+        return self.content.startswith(b"/>", self.tag_end(element) - 2)
+
     def indentation(self, at: int) -> bytes:
         """Return the space before an offset in its line; empty where something else is before it."""
         line = self.content[self.content.rfind(b"\n", 0, at) + 1 : at]
@@ -181,10 +189,23 @@ def parse_markup(content: bytes, file: str) -> Markup:
     """
     if len(content) > MAX_BYTES:
         raise refused(file, f"{len(content)} bytes", f"at most {MAX_BYTES}")
-    document, comments = _read(content, file)
-    (root,) = document.children
+    try:
+        content.decode("utf-8")
+        around, encoding = parse(content, file)
+    except UnicodeDecodeError as error:
+        raise refused(file, str(error), "UTF-8", "save it as UTF-8") from error
+    except ControllerUnfit as error:
+        expected = "well-formed XML without a document type: a URDF needs no entities"
+        raise refused(file, error.found, expected, "correct the file") from error
+    if encoding.lower() not in {"utf-8", "us-ascii", "ascii"}:
+        raise refused(file, f"encoding {encoding!r}", "UTF-8", "save it as UTF-8")
+    (root,) = level = around.children
     if root.name != "robot":
         raise refused(file, f"<{root.name}>", "a URDF, <robot> around all")
+    for _ in range(MAX_DEPTH):
+        level = [child for element in level for child in element.children]
+    if level:
+        raise refused(file, f"more than {MAX_DEPTH} elements in each other", "a URDF")
     named: dict[str, dict[str, Element]] = {"link": {}, "joint": {}}
     for element in root.children:
         if element.name in named:
@@ -196,58 +217,7 @@ def parse_markup(content: bytes, file: str) -> Markup:
     for joint in named["joint"].values():
         if joint.attributes.get("type") == "fixed":
             fixed.setdefault(_link_of(file, joint, "parent"), []).append(_link_of(file, joint, "child"))
-    return Markup(file, content, root, comments, named["link"], named["joint"], fixed)
-
-
-def _read(content: bytes, file: str) -> tuple[Element, tuple[tuple[int, int], ...]]:
-    """Return an element around the root, and the places of the comments before the root."""
-    parser = expat.ParserCreate()
-    document = Element("", {}, 0, 0)
-    opened = [document]
-    comments: list[tuple[int, int]] = []
-
-    def declaration(_version: str, encoding: str | None, _standalone: int) -> None:
-        if encoding is not None and encoding.lower() not in {"utf-8", "us-ascii", "ascii"}:
-            raise refused(file, f"encoding {encoding!r}", "UTF-8", "save it as UTF-8")
-
-    def document_type(name: str, *_: object) -> None:
-        # Entities are refused where they could be defined, so none is ever expanded.
-        raise refused(file, f"a document type declaration {name!r}", "none: a URDF needs no entities")
-
-    def begin(name: str, attributes: dict[str, str]) -> None:
-        if len(opened) > MAX_DEPTH:
-            raise refused(file, f"more than {MAX_DEPTH} elements in each other", "a URDF")
-        start = parser.CurrentByteIndex
-        tag = _TAG.match(content, start)
-        if tag is None:
-            raise refused(file, f"a tag <{name}> that cannot be read at byte {start}", "plain XML")
-        element = Element(name, attributes, start, tag.end())
-        opened[-1].children.append(element)
-        opened.append(element)
-
-    def end(_name: str) -> None:
-        element = opened.pop()
-        empty = content[element.tag_end - 2 : element.tag_end] == b"/>"
-        element.end = element.tag_end if empty else content.index(b">", parser.CurrentByteIndex) + 1
-
-    def comment(_text: str) -> None:
-        if not document.children:
-            start = parser.CurrentByteIndex
-            comments.append((start, content.index(b"-->", start) + 3))
-
-    parser.XmlDeclHandler = declaration
-    parser.StartDoctypeDeclHandler = document_type
-    parser.StartElementHandler = begin
-    parser.EndElementHandler = end
-    parser.CommentHandler = comment
-    try:
-        content.decode("utf-8")
-        parser.Parse(content, True)
-    except UnicodeDecodeError as error:
-        raise refused(file, str(error), "UTF-8", "save it as UTF-8") from error
-    except expat.ExpatError as error:
-        raise refused(file, str(error), "well-formed XML", "correct the file") from error
-    return document, tuple(comments)
+    return Markup(file, content, root, named["link"], named["joint"], fixed)
 
 
 def refused(file: str, found: str, expected: str, remedy: str = "give another URDF") -> SchemaMismatch:
@@ -317,7 +287,7 @@ def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], pr
             old = markup.only(markup.find("link", other), "inertial")
             if old is not None:
                 merged.append(other)
-                edits.append((old.start, old.end, _MERGED))
+                edits.append((old.start, markup.end(old), _MERGED))
     out = content
     for start, end, replacement in sorted(edits, reverse=True):
         out = out[:start] + replacement + out[end:]
@@ -352,14 +322,15 @@ def _put(markup: Markup, parent: Element, old: Element | None, lines: list[str])
     """Put an element in the place of the old one, or first into its parent."""
     new = [line.encode() for line in lines]
     if old is not None:
-        return old.start, old.end, (markup.newline + markup.indentation(old.start)).join(new)
+        return old.start, markup.end(old), (markup.newline + markup.indentation(old.start)).join(new)
     indentation = markup.indentation(parent.start)
     inner = markup.newline + indentation + b"  "
     text = inner + inner.join(new)
-    if parent.end != parent.tag_end:
-        return parent.tag_end, parent.tag_end, text
+    tag_end = markup.tag_end(parent)
+    if not markup.is_empty(parent):
+        return tag_end, tag_end, text
     close = markup.newline + indentation + b"</" + parent.name.encode() + b">"
-    return markup.content.rindex(b"/", parent.start, parent.tag_end), parent.tag_end, b">" + text + close
+    return markup.content.rindex(b"/", parent.start, tag_end), tag_end, b">" + text + close
 
 
 def _dynamics(markup: Markup, joint: Element, update: JointUpdate) -> _Edit:
@@ -367,20 +338,21 @@ def _dynamics(markup: Markup, joint: Element, update: JointUpdate) -> _Edit:
     old = markup.only(joint, "dynamics")
     if old is None:
         return _put(markup, joint, None, [f"<dynamics {' '.join(values.values())}/>"])
-    tag = markup.content[old.start : old.tag_end]
+    tag_end = markup.tag_end(old)
+    tag = markup.content[old.start : tag_end]
     for key, written in values.items():
         given = re.search(rb"(?<=\s)" + key.encode() + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
         first = len(b"<dynamics")
         start, end = (first, first) if given is None else given.span()
         tag = tag[:start] + (b" " if given is None else b"") + written.encode() + tag[end:]
-    return old.start, old.tag_end, tag
+    return old.start, tag_end, tag
 
 
 def _header(markup: Markup, provenance: str) -> _Edit:
     # Two hyphens would end the comment's text (XML 1.0, 2.5).
     said = re.sub("-(?=-)|-$", "~", "".join(c if c.isprintable() else " " for c in provenance))
     comment = f"<!-- format: {FORMAT}. {said} -->".encode()
-    for start, end in markup.head_comments:
-        if f"format: {FORMAT}".encode() in markup.content[start:end]:
-            return start, end, comment
+    for earlier in re.finditer(rb"(?s)<!--.*?-->", markup.content[: markup.root.start]):
+        if f"format: {FORMAT}".encode() in earlier[0]:
+            return *earlier.span(), comment
     return markup.root.start, markup.root.start, comment + markup.newline
