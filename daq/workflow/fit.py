@@ -176,13 +176,32 @@ def fit(
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
+
+    def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
+        reading = Reading(used, cell, lossy)
+        declared = reading.cell
+        nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
+        result = identify(
+            model_of(declared),
+            reading.runs(used, "fit"),
+            declared.conditioning,
+            holdout=reading.runs(unseen, "holdout"),
+            method=method,
+            fixed_gains=nameplate if gains_fixed else None,
+        )
+        if not gains_fixed:
+            check_signs(result.estimate, nameplate)
+        check_explained(result.training_error, declared.axis_names)
+        paper = None if gains_fixed else tls(result.system)
+        return Fit(declared, tuple(used), tuple(unseen), tuple(reading.sources), result, (), paper, lossy)
+
     try:
-        return _fit(logs, holdout, method, gains_fixed, cell, lossy)
+        return attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML))
     except PayloadUnseen as error:
         contradicting = ""
         for log in logs:
             try:
-                rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell, lossy).estimate
+                rest = attempt([other for other in logs if other != log], (), Method.ML).estimate
             except IdentificationError:
                 continue
             std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
@@ -191,32 +210,6 @@ def fit(
             )
             break
         raise PayloadUnseen(error.std_percent, error.runs, contradicting) from error
-
-
-def _fit(
-    logs: Sequence[Path],
-    holdout: Sequence[Path],
-    method: Method | None,
-    gains_fixed: bool,
-    cell: Cell | None,
-    lossy: LossyLogs,
-) -> Fit:
-    reading = Reading(logs, cell, lossy)
-    declared = reading.cell
-    nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
-    result = identify(
-        model_of(declared),
-        reading.runs(logs, "fit"),
-        declared.conditioning,
-        holdout=reading.runs(holdout, "holdout"),
-        method=method or (Method.WLS if gains_fixed else Method.ML),
-        fixed_gains=nameplate if gains_fixed else None,
-    )
-    if not gains_fixed:
-        check_signs(result.estimate, nameplate)
-    check_explained(result.training_error, declared.axis_names)
-    paper = None if gains_fixed else tls(result.system)
-    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper, lossy)
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
