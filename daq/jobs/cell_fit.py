@@ -140,7 +140,6 @@ def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = No
     """Convert an error to a row of the table.
 
     Args:
-        error: expected or not.
         paths: temporary copies; the text names the logs instead.
     """
     text = str(error) or type(error).__name__

@@ -100,10 +100,7 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
     """Check that the interlock releases the robot; a program that fails and a file that is unreadable do not.
 
     Args:
-        interlock: of the cell.
-        run: runs its command.
         now: wall clock, asked when the file is: the command before it may take its time.
-        folder: in which the command runs.
 
     Raises:
         NotReleased: it does not release the robot.

@@ -58,7 +58,6 @@ class Journal:
         """Write one event.
 
         Args:
-            level: how much it matters.
             event: what happened, always in the same words.
             fields: plain JSON; what JSON has no word for is spelt as text.
         """
@@ -85,7 +84,6 @@ def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
     """Choose the form for a stream.
 
     Args:
-        stream: standard error.
         environment: of this process; systemd names device and inode of the stream that it reads in JOURNAL_STREAM
             (systemd.exec(5)), so that a stream that was redirected since is recognised.
     """

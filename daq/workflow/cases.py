@@ -130,9 +130,7 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
     """Reduce a payload to the knowledge of a case.
 
     Args:
-        payload: as the log has it.
         cell: whose payload of that name and mounting says what its drawing says.
-        known: how much.
 
     Raises:
         ConfigurationInconsistent: the drawing is asked for, and the cell says no more than the mass.

@@ -172,7 +172,6 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest, nameplate gains.
 
     Args:
-        cell: with a payload.
         payload: name of it, None for the first.
 
     Raises:

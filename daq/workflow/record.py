@@ -124,17 +124,12 @@ def record(
 
     Args:
         cell_file: goes into the log with all it refers to.
-        cell: read from it.
-        plan: its moves.
         out: log to write; must not exist.
         payload: what is mounted, None without load.
         operator: person or job responsible for the recording.
         granted_by: who allows the motion; None refuses it.
-        run_id: unique.
         speed: share of its planned speed that the moves have been given (`daq.workflow.plan.slowed`), for the log.
         entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
-        clocks: wall and monotonic time.
-        free: room on the disk of a folder.
         block_signals: keeps signals away while the axes are stopped.
         progress: receives the number of finished moves and of all.
         before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it

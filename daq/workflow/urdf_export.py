@@ -74,9 +74,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     Args:
         calibration: its gains, payloads and effects take no part; an axis with an accepted effect of friction may have
             any sign of fv and fs, because they are only a part of its friction.
-        model: the declared model of its robot.
         limits: ranges in which the torques are compared, as of `ident.physical.regrouping.random_motion`, shape (4, n).
-        urdf: for the prior.
 
     Raises:
         ModelError: the calibration is of another robot.
@@ -264,8 +262,6 @@ def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], pr
     elements and attributes are the same bytes as before.
 
     Args:
-        content: the user's file.
-        name: what to call it in messages.
         joints: of every moving joint, by its name.
         provenance: for the comment at the head; one of an earlier export is replaced.
 
