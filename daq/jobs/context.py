@@ -76,9 +76,9 @@ class JobContext:
     began_s: float = 0.0  #: start of the job on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
 
-    def within(self, *, session: str | None = None, step: str | None = None) -> JobContext:
-        """The same context, with a journal that names the session or the step."""
-        return replace(self, journal=self.journal.within(session=session, step=step))
+    def within(self, step: str) -> JobContext:
+        """The same context, with a journal that names the step."""
+        return replace(self, journal=replace(self.journal, step=step))
 
 
 def target_of(cell: Cell) -> GainTarget:

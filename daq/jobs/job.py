@@ -54,7 +54,7 @@ def recalibrate(
             return early
         began_s = tools.monotonic_s()
         session = _resumed_or_new(section, cell, tools.now(), journal)
-        journal = journal.within(session=session.state.session)
+        journal = replace(journal, session=session.state.session)
         context = JobContext(cell_file, cell, section, target, tools, journal, who, began_s)
         try:
             audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
@@ -113,9 +113,9 @@ def preview(
 def _run(context: JobContext, session: Session) -> Session:
     """Take the steps that the session lacks; returns it with its outcome."""
     if len(verified_runs(session).state.runs) < len(context.section.runs):
-        before_motion(context.within(step="preflight"))
+        before_motion(context.within("preflight"))
         session = record_runs(context, session)
-    session, calibration = fit_session(context.within(step="fit"), session)
+    session, calibration = fit_session(context.within("fit"), session)
     target, tools = context.target, context.tools
     with Ledger(context.cell, target.history, context.who) as ledger:
         ledger.add(calibration, digest=sha256_of(session.folder / sessions.CALIBRATION) or "", at=tools.now())
@@ -125,9 +125,9 @@ def _run(context: JobContext, session: Session) -> Session:
         for gain in watched:
             if gain.alarm:
                 # Each slice of a slow drift may be small enough to be written without an operator.
-                watching = context.within(step="watch").journal
+                watching = context.within("watch").journal
                 watching.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
-        return decide_outcome(context.within(step="decide"), session, calibration, ledger)
+        return decide_outcome(context.within("decide"), session, calibration, ledger)
 
 
 def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
@@ -148,10 +148,10 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
     session = sessions.resumable_session(found, basis, now, section.resume_within_h)
     if session is None:
         session = sessions.begin(section.folder, basis, now)
-        journal.within(session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
+        replace(journal, session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
         return session
     attempt = session.state.attempt + 1
-    journal.within(session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
+    replace(journal, session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
     return session.update(
         attempt=attempt,
         attempt_began=now.isoformat(timespec="seconds"),

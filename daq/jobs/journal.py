@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum, IntEnum
 from typing import TextIO
@@ -45,14 +45,6 @@ class Journal:
     now: Callable[[], datetime]  #: wall clock with time zone
     session: str = ""  #: of what is said from here on
     step: str = ""  #: of what is said from here on
-
-    def within(self, *, session: str | None = None, step: str | None = None) -> Journal:
-        """The same journal, in a session or a step of it."""
-        return replace(
-            self,
-            session=self.session if session is None else session,
-            step=self.step if step is None else step,
-        )
 
     def say(self, level: Level, event: str, /, **fields: object) -> None:
         """Write one event.

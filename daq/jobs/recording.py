@@ -8,7 +8,6 @@ import uuid
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 from daq.config.cell import Cell
@@ -71,10 +70,10 @@ def record_runs(context: JobContext, session: Session) -> Session:
     session = verified_runs(session)
     made = {run.name for run in session.state.runs}
     left = [planned for planned in context.section.runs if planned.name not in made]
-    plans = {planned.name: _plan(context.within(step="plan"), session, planned) for planned in left}
+    plans = {planned.name: _plan(context.within("plan"), session, planned) for planned in left}
     warm = not left
     for planned in left:
-        run_context = context.within(step=f"record {planned.name}")
+        run_context = context.within(f"record {planned.name}")
         mount(context.section, planned, context.tools.run)
         run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
@@ -82,7 +81,7 @@ def record_runs(context: JobContext, session: Session) -> Session:
             plan, out = plans[planned.name], log_of(session, WARM_UP)
             passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
             for number in range(1, passes + 1):
-                said = context.within(step=WARM_UP).journal
+                said = context.within(WARM_UP).journal
                 said.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
                 out.unlink(missing_ok=True)
                 out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
@@ -234,14 +233,8 @@ def calibration_of_session(session: Session) -> Calibration | None:
     if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
     try:
-        found = _loaded(path, fitted.calibration_sha256)
+        found = load(path)
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
     own = {run.sha256 for run in session.state.runs}
     return found if {source.sha256 for source in found.sources} == own else None
-
-
-@lru_cache(maxsize=2)
-def _loaded(path: Path, _sha256: str) -> Calibration:
-    """Read a calibration once; its digest identifies the content."""
-    return load(path)

@@ -273,65 +273,55 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     For every axis: fast with the arm stretched, fast with it folded (as the last link is seen from that axis), slow
     with it stretched, and fast together with a neighbour; and of all axes together.
     """
-    lower, upper = np.array([axis.limits.position for axis in experiment.cell.axes]).T
+    cell, checker = experiment.cell, experiment.scene.checker
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
+    velocity = np.array([axis.limits.velocity for axis in cell.axes])
+    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
     margin = POSITION_MARGIN * (upper - lower)
     low, high = lower + margin, upper - margin
     sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
-    postures = sampled[experiment.scene.checker.margins(sampled) > 0.0]
-    names = experiment.cell.axis_names
-    found = []
+    clear = sampled[checker.margins(sampled) > 0.0]
+    found: list[ExtraMoves] = []
+
+    def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
+        """There and back in the first few postures in which that is clear."""
+        paths: list[Trapezoid] = []
+        for posture in postures:
+            for stroke in STROKES:
+                inwards = 0.5 * (1.0 - stroke) * (high - low)
+                start, end = posture.copy(), posture.copy()
+                start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+                if checker.obstruction(start, end) is None:
+                    there = synchronised(start, end, velocity * speed, acceleration)
+                    paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
+                    break
+            if len(paths) >= 6:
+                break
+        chosen: list[Trapezoid] = []
+        seconds = 0.0
+        for path in cycle(paths):
+            chosen.append(path)
+            seconds += path.duration_s
+            if seconds >= SECONDS:
+                break
+        if chosen:
+            found.append(ExtraMoves(words, seconds, experiment.excitation(chosen)[0]))
+
+    names = cell.axis_names
     robot = experiment.design.expectation.model.robot
-    at = poses(robot, postures)
+    at = poses(robot, clear)
     for axis, name in enumerate(names):
         # Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m].
         way = at.origin_m[-1] - at.origin_m[axis + 1]
         if robot.joints[axis].kind is not JointKind.PRISMATIC:
             way = np.cross(at.rotation[axis + 1] @ robot.joints[axis].axis, way)
         lever = np.linalg.norm(way, axis=1)
-        stretched, folded = postures[np.argsort(-lever, kind="stable")], postures[np.argsort(lever, kind="stable")]
+        stretched, folded = clear[np.argsort(-lever, kind="stable")], clear[np.argsort(lever, kind="stable")]
+        swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
+        swing(f"fast moves of {name} with the arm folded", folded, [axis])
+        swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW)
         other = axis + 1 if axis + 1 < len(names) else axis - 1
-        kinds: list[tuple[str, FloatArray, tuple[int, ...], float]] = [
-            (f"fast moves of {name} with the arm stretched", stretched, (axis,), 1.0),
-            (f"fast moves of {name} with the arm folded", folded, (axis,), 1.0),
-            (f"slow moves of {name} with the arm stretched", stretched, (axis,), SLOW),
-        ]
         if other >= 0:
-            kinds.append((f"fast moves of {name} and {names[other]} together", postures, (axis, other), 1.0))
-        found += [_swings(experiment, words, at, axes, speed, (low, high)) for words, at, axes, speed in kinds]
-    found.append(_swings(experiment, "fast moves of all axes", postures, tuple(range(len(names))), 1.0, (low, high)))
-    return tuple(extra for extra in found if extra is not None)
-
-
-def _swings(
-    experiment: Experiment,
-    words: str,
-    postures: FloatArray,
-    axes: Sequence[int],
-    speed: float,
-    ends: tuple[FloatArray, FloatArray],
-) -> ExtraMoves | None:
-    """There and back in the first few postures in which that is clear; None when there are none."""
-    velocity = np.array([axis.limits.velocity for axis in experiment.cell.axes]) * speed
-    acceleration = np.array([axis.limits.acceleration for axis in experiment.cell.axes])
-    low, high = ends
-    moved = list(axes)
-    paths: list[Trapezoid] = []
-    for posture in postures:
-        for stroke in STROKES:
-            inwards = 0.5 * (1.0 - stroke) * (high - low)
-            start, end = posture.copy(), posture.copy()
-            start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
-            if experiment.scene.checker.obstruction(start, end) is None:
-                there = synchronised(start, end, velocity, acceleration)
-                paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
-                break
-        if len(paths) >= 6:
-            break
-    chosen: list[Trapezoid] = []
-    seconds = 0.0
-    for path in cycle(paths):
-        chosen.append(path)
-        seconds += path.duration_s
-        if seconds >= SECONDS:
-            break
-    return ExtraMoves(words, seconds, experiment.excitation(chosen)[0]) if chosen else None
+            swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
+    swing("fast moves of all axes", clear, list(range(len(names))))
+    return tuple(found)

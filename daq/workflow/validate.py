@@ -98,13 +98,10 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
     """
     conditioning = conditioning_of(calibration)
     validations: list[Validation] = []
-    known: tuple[str, Model] | None = None
     for log in logs:
         run, described = load_run(log, cell)
         check_cell(calibration, log, described)
-        if known is None or known[0] != described.digest:
-            known = (described.digest, model_of(described))
-        validations.append(predicted(calibration, conditioning, known[1], log, run, described.digest))
+        validations.append(predicted(calibration, conditioning, model_of(described), log, run, described.digest))
     return tuple(validations)
 
 
@@ -178,7 +175,19 @@ def predicted(
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    run = replace(run, payload=_left_to_the_log(calibration, run))
+    payload = run.payload
+    if payload is not None:
+        # What the calibration itself says of it, given or identified, is not taken from the log.
+        own = _of_mounting(calibration, payload)
+        mass, weighed = own.get("m"), payload.known.get("m")
+        if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+            raise DataUnfit(
+                run.name,
+                f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
+                "give each way of mounting a name of its own",
+            )
+        left = {name: value for name, value in payload.known.items() if name not in own}
+        run = replace(run, payload=replace(payload, known=left))
     roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
@@ -197,21 +206,6 @@ def predicted(
         predicted_nm=filter_(predict_torque(calibration, model, data).T),
         use=use,
     )
-
-
-def _left_to_the_log(calibration: Calibration, run: Run) -> Payload | None:
-    """The run's payload without what the calibration itself says of it, given or identified."""
-    if run.payload is None:
-        return None
-    own = _of_mounting(calibration, run.payload)
-    mass, weighed = own.get("m"), run.payload.known.get("m")
-    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
-        raise DataUnfit(
-            run.name,
-            f"carries {weighed:g} kg on mounting {run.payload.mounting!r}; the calibration has {mass.value:g} kg: "
-            "give each way of mounting a name of its own",
-        )
-    return replace(run.payload, known={name: value for name, value in run.payload.known.items() if name not in own})
 
 
 def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:
