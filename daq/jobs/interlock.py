@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-import stat
 import subprocess
 import threading
 import time
@@ -19,6 +18,7 @@ from types import FrameType
 from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock, InterlockFile, PlannedRun, Recalibration
 from daq.errors import JobHeld, NotReleased, TimeBoundReached
+from daq.files import open_regular
 from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
@@ -134,16 +134,10 @@ def _require_file(file: InterlockFile, now: Callable[[], datetime]) -> None:
     subject = f"interlock file {file.path}"
     expected = f"{file.says!r} in its first line, written within the last {file.max_age_s:g} s"
     try:
-        # A FIFO of that name must not keep us waiting for its other end.
-        descriptor = os.open(file.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        try:
+        with open_regular(file.path) as stream:
             # Of the file that is open: a gateway may put another in its place meanwhile.
-            found, asked = os.fstat(descriptor), now()
-            if not stat.S_ISREG(found.st_mode):
-                raise _held(subject, "no regular file", expected)
-            head = os.read(descriptor, _LOOK_BYTES)
-        finally:
-            os.close(descriptor)
+            found, asked = os.fstat(stream.fileno()), now()
+            head = stream.read(_LOOK_BYTES)
     except OSError as error:
         raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()

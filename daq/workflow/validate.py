@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,23 +122,17 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
         CalibrationUnreadable: they are not all there.
     """
     expected = Conditioning().document()
-    found = calibration.filter
-    numbers = {name: value for name, value in found.items() if not isinstance(value, list)}
-    speeds = found.get("standstill_rad_s")
-    if not isinstance(speeds, list) or numbers.keys() | {"standstill_rad_s"} != expected.keys():
+    found: dict[str, Any] = dict(calibration.filter)
+    lists = [name for name, value in found.items() if isinstance(value, list)]
+    if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
         raise CalibrationUnreadable(
             f"calibration of cell {calibration.cell!r}, filter",
             found=", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing",
             expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
             remedy="fit the logs again with this drivegain",
         )
-    return Conditioning(
-        position_cutoff_hz=numbers["position_cutoff_hz"],
-        position_order=round(numbers["position_order"]),
-        decimation_cutoff_hz=numbers["decimation_cutoff_hz"],
-        standstill_rad_s=tuple(speeds),
-        standstill_share=numbers["standstill_share"],
-    )
+    order, speeds = round(found.pop("position_order")), tuple(found.pop("standstill_rad_s"))
+    return Conditioning(**found, position_order=order, standstill_rad_s=speeds)
 
 
 def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
