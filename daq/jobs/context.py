@@ -66,9 +66,9 @@ class GainTarget:
 class JobContext:
     """Everything that the steps of a job share."""
 
-    file: Path  #: the cell file, the cell, and its `recalibration`
-    cell: Cell  #: the cell file, the cell, and its `recalibration`
-    section: Recalibration  #: the cell file, the cell, and its `recalibration`
+    file: Path  #: cell file
+    cell: Cell  #: read from it
+    section: Recalibration  #: its `recalibration`
     target: GainTarget  #: controller file that the gains are compared with and written to
     tools: Tools  #: functions that the job calls
     journal: Journal  #: log of the job, labelled with session and step

@@ -51,11 +51,11 @@ class ReducedLogs:
     """Logs of one cell, read once; what is known of a payload is chosen afterwards."""
 
     cell: Cell  #: as the logs describe it, or as given
-    logs: tuple[Path, ...]  #: of the fit, and those that it has not seen
-    holdout: tuple[Path, ...]  #: of the fit, and those that it has not seen
-    sources: tuple[Source, ...]  #: the same, with digests and roles
-    used: Reduction  #: their rows, reduced
-    unseen: Reduction  #: their rows, reduced
+    logs: tuple[Path, ...]  #: of the fit
+    holdout: tuple[Path, ...]  #: those that it must not see
+    sources: tuple[Source, ...]  #: all of them, with digests and roles
+    used: Reduction  #: rows of `logs`, reduced
+    unseen: Reduction  #: rows of `holdout`, reduced
 
 
 @dataclass(frozen=True, slots=True)
