@@ -13,9 +13,8 @@ from rich.console import Console
 
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, say_written
-from daq.errors import writing
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
+from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError, writing
 from daq.report.text import printable
 
 if TYPE_CHECKING:

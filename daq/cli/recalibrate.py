@@ -108,8 +108,8 @@ def install_units(
 
     The timer does not catch up on a missed date, and the job checks the interlock before every motion.
     """
-    from daq.errors import writing
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of

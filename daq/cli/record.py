@@ -201,8 +201,8 @@ def plan_verb(
     these moves made once without load and once with the payload.
     """
     from daq.cli.terminal import check_output, progress_bar
-    from daq.errors import writing
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.report.plan import plan_document, plan_text
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.plan import plan

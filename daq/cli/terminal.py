@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from daq.errors import OutputFailed, UsageError
+from daq.errors import UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:

@@ -34,8 +34,8 @@ def validate_verb(
     the others, the payload mass does not depend on the calibration's robot parameters.
     """
     from daq.cli.terminal import check_output, print_view, status
-    from daq.errors import writing
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.report.paper_tables import page
     from daq.report.validation import (
