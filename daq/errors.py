@@ -1,43 +1,15 @@
 """Errors of the service, and the exit code of every error of the three packages.
 
 DaqError
-├── UsageError                  the command asks for something that cannot be done            exit 2
-├── CalibrationRefused          a check of the write-back failed; nothing was written         exit 3
-│   ├── ControllerUnfit         the controller file cannot be read, or lacks a gain's key
-│   ├── ControllerChanged       the controller file changed after its diff was shown
-│   ├── SignatureInvalid        a signature of a trusted signer does not match the calibration
-│   └── AuditUnusable           the audit log cannot be written
-├── DataError                   recorded or derived data cannot be used                       exit 4
-│   ├── CalibrationMissing      the calibration file does not exist
-│   ├── CalibrationUnreadable   not a calibration file, of another version, or broken
-│   ├── LogUnreadable           the log cannot be read
-│   │   ├── LogMissing          it does not exist
-│   │   ├── LogForeign          not MCAP, or not a log of a cell
-│   │   ├── LogTruncated        the end is missing: power loss, a killed recorder, an incomplete copy
-│   │   ├── LogCorrupt          a checksum or a length does not match
-│   │   └── LogIncomplete       cell configuration, readback or run metadata are missing from the log
-│   ├── TableUnfit              a CSV file of another controller cannot be imported
-│   ├── HistoryUnreadable       not a history of drivegain, broken, of another version, or not writable
-│   ├── LogsDiffer              logs of different cells, or of different configurations of one
-│   ├── LogRepeated             one recording twice
-│   ├── RolesExchanged          loaded and unloaded runs are mistaken for each other
-│   ├── ModelContradicted       the declared model explains less of the data than it leaves
-│   ├── RunInvalid              the recorder itself marked the run invalid
-│   ├── CyclesLost              SYNC cycles are missing
-│   ├── ClockImplausible        time stamps with another rate than declared, or uneven steps
-│   ├── CurrentSaturated        a limit was active in too large a part of the run
-│   └── PositionImplausible     far outside the joint limits: deg for rad, or a wrong drive train
-├── ConfigurationError          a configuration file is wrong                                 exit 6
-│   ├── ConfigurationMissing    the file does not exist
-│   ├── YamlInvalid             not YAML, a duplicate key, an alias
-│   ├── SchemaMismatch          unknown key, missing key, wrong type
-│   └── ConfigurationInconsistent  valid values that contradict each other
-├── JobHeld                     a job may not go on now; the next one resumes it              exit 14
-│   ├── NotReleased             the interlock does not release the robot                      exit 11
-│   ├── BusTaken                another recording or job of drivegain uses the bus            exit 12
-│   └── TimeBoundReached        the job exceeded its time limit; the axes were stopped        exit 13
-└── OutputFailed                the disk is full, the folder is read-only                     exit 1
-    └── DiskSpaceShort          too little room for a recording, before it or during it
+├── UsageError            exit 2
+├── CalibrationRefused    exit 3    ControllerUnfit, ControllerChanged, SignatureInvalid, AuditUnusable
+├── DataError             exit 4    CalibrationMissing, CalibrationUnreadable, TableUnfit, HistoryUnreadable,
+│   │                               LogsDiffer, LogRepeated, RolesExchanged, ModelContradicted, RunInvalid,
+│   │                               CyclesLost, ClockImplausible, CurrentSaturated, PositionImplausible
+│   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
+├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
+├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
+└── OutputFailed          exit 1    DiskSpaceShort
 
 A kind of failure has a class of its own where a caller catches it, where it has its own exit code, or where its name is
 data: `drivegain fleet` reports the class of every failed cell. Everything else raises the parent, with a message that
@@ -49,6 +21,8 @@ drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
 
@@ -138,7 +112,7 @@ class LogForeign(LogUnreadable):
 
 
 class LogTruncated(LogUnreadable):
-    """The end of the log is missing."""
+    """The end of the log is missing: power loss, a killed recorder, an incomplete copy."""
 
 
 class LogCorrupt(LogUnreadable):
@@ -146,7 +120,7 @@ class LogCorrupt(LogUnreadable):
 
 
 class LogIncomplete(LogUnreadable):
-    """The log lacks something that every log must carry."""
+    """Cell configuration, readback or run metadata are missing from the log."""
 
 
 class TableUnfit(DataError):
@@ -190,7 +164,7 @@ class CurrentSaturated(DataError):
 
 
 class PositionImplausible(DataError):
-    """Positions are far outside the joint limits."""
+    """Positions are far outside the joint limits: degrees for radians, or a wrong drive train."""
 
 
 class ConfigurationError(DaqError):
@@ -243,6 +217,19 @@ class OutputFailed(DaqError):
         )
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Report a refusal of the file system within the block as an output that failed.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputFailed.of(path, error) from error
+
+
 class DiskSpaceShort(OutputFailed):
     """Too little room for a recording: it does not begin, or the axes were stopped and the log was finished."""
 
@@ -266,7 +253,4 @@ EXIT_CODES: tuple[tuple[type[Exception], ExitCode], ...] = (
 
 def exit_code(kind: type[BaseException]) -> ExitCode | None:
     """Exit code of an exception class, or None for a foreign one."""
-    for root, code in EXIT_CODES:
-        if issubclass(kind, root):
-            return code
-    return None
+    return next((code for root, code in EXIT_CODES if issubclass(kind, root)), None)

@@ -34,8 +34,15 @@ def replace_file(
     """
     target = path.resolve()
     model = like or (target if target.exists() else None)
-    temporary = _write_beside(target, content, model)
+    # For the owner alone until it has the rights of the other file: an open descriptor outlives a later chmod.
+    temporary, descriptor = _new_file(target, 0o666 if model is None else 0o600)
     try:
+        with os.fdopen(descriptor, "wb") as stream:
+            if model is not None:
+                _copy_rights(stream.fileno(), model)
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
         if check is not None:
             check(temporary.read_bytes())
         temporary.replace(target)
@@ -164,26 +171,6 @@ def _check(found: os.stat_result, path: Path) -> None:
         raise OSError(errno.EINVAL, "something that is no regular file", str(path))
 
 
-def _write_beside(target: Path, content: bytes, like: Path | None) -> Path:
-    """Write `content`, flushed to the disk, to a new hidden file in the folder of `target`, with the rights of `like`.
-
-    The file is removed if anything raises.
-    """
-    # For the owner alone until it has the rights of the other file: an open descriptor outlives a later chmod.
-    temporary, descriptor = _new_file(target, 0o666 if like is None else 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            if like is not None:
-                _copy_rights(stream.fileno(), like)
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    return temporary
-
-
 def _new_file(target: Path, mode: int) -> tuple[Path, int]:
     """Create a hidden file under a new name (O_EXCL); the umask of the process applies to its mode."""
     attempt = 0
@@ -209,11 +196,7 @@ _KERNEL = ("security.", "trusted.")
 
 
 def _copy_attributes(descriptor: int, like: Path) -> None:
-    """Copy access lists and other extended attributes.
-
-    Raises:
-        OSError: one of them cannot be kept: without its access list a file is open to more people, or to fewer.
-    """
+    """Copy access lists and other extended attributes; without its list a file is open to more people, or to fewer."""
     try:
         wanted, found = os.listxattr(like), os.listxattr(descriptor)
     except OSError as error:

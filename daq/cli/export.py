@@ -154,7 +154,7 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
     """Write the URDF whole or not at all, after reading it back as a robot with these links."""
     import numpy as np
 
-    from daq.cli.terminal import writing
+    from daq.errors import writing
     from daq.files import replace_file
     from ident.physical.programme import urdf_links
 

@@ -119,7 +119,8 @@ def _fit_cases(
     """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status, writing
+    from daq.cli.terminal import check_output, print_view, status
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
     from daq.report.paper_tables import case_tables, page
@@ -211,7 +212,8 @@ def check_report(folder: Path | None) -> None:
     """Create the folder of a report before any long work, and refuse one with other files of the same names."""
     from tempfile import TemporaryFile
 
-    from daq.cli.terminal import check_replaceable, writing
+    from daq.cli.terminal import check_replaceable
+    from daq.errors import writing
     from daq.report.residual_page import MARKS
 
     if folder is None:
@@ -232,7 +234,7 @@ RESIDUAL = Verb(
 
 
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
-    from daq.cli.terminal import writing
+    from daq.errors import writing
     from daq.report.plots import draw_fit
     from daq.workflow.calibration_file import save
 

@@ -39,12 +39,12 @@ def fleet_verb(
     """
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_replaceable, print_view, progress_bar, writing
+    from daq.cli.terminal import check_replaceable, print_view, progress_bar
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
-    from daq.jobs.fleet import fit_fleet
+    from daq.jobs.fleet import fit_fleet, worker_pool
     from daq.jobs.fleet_survey import list_logs
-    from daq.jobs.workers import worker_pool
     from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document, fleet_view
 
     loop = Loop.CLOSED if residual else Loop.OPEN
@@ -56,7 +56,7 @@ def fleet_verb(
     wanted = worker_pool(scheduler, workers)
     found = list_logs(logs)
     cache = None if out is None else open_cache(out, loop)
-    with progress_bar("fitting the fleet") as report_progress, wanted.start_pool() as pool:
+    with progress_bar("fitting the fleet") as report_progress, wanted as pool:
         rows = fit_fleet(found, pool, loop, cache, lambda: datetime.now(UTC), report_progress)
     if csv is not None:
         with writing(csv):

@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, say_written, writing
+from daq.cli.terminal import check_replaceable, say_written
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
+from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError, writing
 from daq.report.text import printable
 
 if TYPE_CHECKING:

@@ -10,10 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from daq.cli.terminal import writing
 from daq.cli.verb import Verb
 from daq.environment import shipped_configurations
-from daq.errors import UsageError
+from daq.errors import UsageError, writing
 
 TEMPLATES = (
     ("cells/demo.yaml", "cells/{name}.yaml"),

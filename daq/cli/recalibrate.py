@@ -108,8 +108,8 @@ def install_units(
 
     The timer does not catch up on a missed date, and the job checks the interlock before every motion.
     """
-    from daq.cli.terminal import writing
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.jobs.context import section_of, target_of
     from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
@@ -183,7 +183,7 @@ def check_schedule(schedule: str) -> None:
 
 def require_own_unit(path: Path, option: str = "") -> None:
     """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
-    from daq.cli.terminal import writing
+    from daq.errors import writing
     from daq.jobs.units import MARK
 
     with writing(path):

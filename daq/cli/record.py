@@ -200,11 +200,12 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_output, progress_bar, writing
+    from daq.cli.terminal import check_output, progress_bar
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.report.plan import plan_document, plan_text
-    from daq.workflow.experiment import RUNS, experiment_of, paths_of
-    from daq.workflow.plan import extra_moves, plan
+    from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
+    from daq.workflow.plan import plan
     from daq.workflow.plan_file import save_plan
     from ident.planning.verdict import verdicts
 

@@ -200,7 +200,8 @@ def demo(
 
     from rich.console import Console
 
-    from daq.cli.terminal import print_view, show_steps, writing
+    from daq.cli.terminal import print_view, show_steps
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.report.proposal import show as show_proposal
     from daq.report.text import json_text

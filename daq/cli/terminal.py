@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
-from daq.errors import OutputFailed, UsageError
+from daq.errors import UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -50,15 +50,6 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )
-
-
-@contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Report a refusal of the file system within the block as an output that failed."""
-    try:
-        yield
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
 
 
 def one_of(remedy: str, **options: object) -> None:

@@ -33,8 +33,9 @@ def validate_verb(
     the gains give (Tables 7, 8); with --beside every calibration side by side (Table 6 too). With unloaded logs among
     the others, the payload mass does not depend on the calibration's robot parameters.
     """
-    from daq.cli.terminal import check_output, print_view, status, writing
+    from daq.cli.terminal import check_output, print_view, status
     from daq.config.cell_file import load_cell
+    from daq.errors import writing
     from daq.files import replace_file
     from daq.report.paper_tables import page
     from daq.report.validation import (
@@ -44,7 +45,7 @@ def validate_verb(
         validation_tables,
         validation_view,
     )
-    from daq.workflow.cross_validation import cross_validate
+    from daq.workflow.validate import cross_validate
 
     page_file = None if out is None else out / "tables.md"
     check_output(page_file, (calibration, *logs), TABLES)

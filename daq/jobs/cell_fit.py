@@ -9,10 +9,12 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
+
+from pydantic import TypeAdapter
 
 from daq.config.yaml_file import MAX_BYTES
 from daq.environment import software
@@ -22,25 +24,16 @@ from daq.errors import (
     ExitCode,
     LogsDiffer,
     LogUnreadable,
-    OutputFailed,
     UsageError,
     exit_code,
+    writing,
 )
 from daq.files import read_regular, replace_file
-from daq.jobs.fleet_survey import (
-    CellLogs,
-    StoredLog,
-    Summary,
-    at_hand,
-    fingerprint,
-    summary_document,
-    summary_from,
-    summary_of,
-)
+from daq.jobs.fleet_survey import CellLogs, StoredLog, at_hand, fingerprint
 from daq.workflow.calibration_file import as_document, decode, encode
 from daq.workflow.fit import calibration_of, close_loop, fit
 from drivers.errors import DriverError
-from ident.calibration import Calibration
+from ident.calibration import Gain
 from ident.errors import IdentificationError
 
 SEED = 0  #: Seed of the loop's significance test, the same as in `drivegain residual`
@@ -60,6 +53,23 @@ class Failure:
     kind: str  #: name of the error's class
     text: str  #: found, expected and to do, as a single fit would say it
     exit_code: int  #: that a single fit would have ended with
+    seconds: float = 0.0  #: that it took to find out
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Summary of one calibration, small enough to be sent."""
+
+    gains: tuple[Gain, ...]  #: one an axis
+    effects: tuple[tuple[str, str], ...]  #: family and axis of each accepted effect
+    error_percent: float  #: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%]
+    held_out: bool  #: whether it is that of a run held out
+    partial: bool  #: it rests on a log that was never finished, or with losses
+
+    @property
+    def worst(self) -> Gain:
+        """The gain that is known least well."""
+        return max(self.gains, key=lambda gain: gain.std_percent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,84 +81,65 @@ class Fitted:
     seconds: float  #: that it took, reading included
 
 
-@dataclass(frozen=True, slots=True)
-class Unfitted:
-    """Result of a worker for a cell that cannot be fitted."""
-
-    failure: Failure  #: why not
-    seconds: float  #: that it took to find out
-
-
 def fit_cell(
     cell: CellLogs, loop: Loop, created: datetime, clock: Callable[[], float] = time.perf_counter
-) -> Fitted | Unfitted:
-    """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs.
-
-    Args:
-        cell: with its logs, which this process can read.
-        loop: whether to look for effects.
-        created: when, for the calibration.
-        clock: for the seconds.
-    """
+) -> Fitted | Failure:
+    """Fit one cell in this process, as `drivegain fit` (or `residual`) would with the same logs."""
     begun_s = clock()
+    every_log = (*cell.fit, *cell.holdout)
     paths: dict[Path, StoredLog] = {}
     with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
         try:
-            for seen in (*cell.fit, *cell.holdout):
-                _check_name(seen.log)
+            for seen in every_log:
+                try:
+                    seen.log.name.encode()  # the calibration holds it
+                except UnicodeEncodeError as error:
+                    raise LogUnreadable(
+                        seen.log.address,
+                        found="bytes in its name that are no UTF-8",
+                        expected="a name that a calibration can hold",
+                        remedy="rename it",
+                    ) from error
                 paths[at_hand(seen.log, Path(folder))] = seen.log
             logs = list(paths)
             fitted = fit(logs[: len(cell.fit)], holdout=logs[len(cell.fit) :])
             if loop is Loop.CLOSED:
                 fitted = close_loop(fitted, SEED)
-            _check_unchanged(cell)
+            for seen in every_log:
+                if fingerprint(seen.log) != seen.fingerprint:
+                    raise LogsDiffer(
+                        seen.log.address,
+                        found="another content than at the survey of the logs",
+                        expected="logs that do not change while they are fitted",
+                        remedy="start it again",
+                    )
             calibration = calibration_of(fitted, created)
-            content = _content(calibration, cell.cell)
+            # Encoded and verified in the worker: that takes a tenth of the time of a fit.
+            content = encode(calibration)
+            if as_document(decode(content, cell.cell)) != as_document(calibration):
+                raise CalibrationUnreadable(
+                    cell.cell,
+                    found="another content on reading back",
+                    expected="what was fitted",
+                    remedy="report it: it is a fault",
+                )
         except (DaqError, DriverError, IdentificationError) as error:
-            return Unfitted(failure_of(error, paths), clock() - begun_s)
-    return Fitted(summary_of(calibration), content, clock() - begun_s)
-
-
-def _check_name(log: StoredLog) -> None:
-    """Check that the name of a log is text, since the calibration holds it."""
-    try:
-        log.name.encode()
-    except UnicodeEncodeError as error:
-        raise LogUnreadable(
-            log.address,
-            found="bytes in its name that are no UTF-8",
-            expected="a name that a calibration can hold",
-            remedy="rename it",
-        ) from error
-
-
-def _check_unchanged(cell: CellLogs) -> None:
-    """Check that no log was replaced while it was read."""
-    for seen in (*cell.fit, *cell.holdout):
-        if fingerprint(seen.log) != seen.fingerprint:
-            raise LogsDiffer(
-                seen.log.address,
-                found="another content than at the survey of the logs",
-                expected="logs that do not change while they are fitted",
-                remedy="start it again",
-            )
-
-
-def _content(calibration: Calibration, name: str) -> bytes:
-    """Content of the file, encoded and verified in the worker: that takes a tenth of the time of a fit."""
-    content = encode(calibration)
-    if as_document(decode(content, name)) != as_document(calibration):
-        raise CalibrationUnreadable(
-            name, found="another content on reading back", expected="what was fitted", remedy="report it: it is a fault"
-        )
-    return content
+            return replace(failure_of(error, paths), seconds=clock() - begun_s)
+    unseen = calibration.holdout_error_percent
+    summary = Summary(
+        gains=calibration.gains,
+        effects=tuple((effect.name, effect.axis) for effect in calibration.effects),
+        error_percent=(unseen or calibration.relative_error_percent).total,
+        held_out=unseen is not None,
+        partial=any(source.partial for source in calibration.sources),
+    )
+    return Fitted(summary, content, clock() - begun_s)
 
 
 def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = None) -> Failure:
     """Convert an error to a row of the table.
 
     Args:
-        error: expected or not.
         paths: temporary copies; the text names the logs instead.
     """
     text = str(error) or type(error).__name__
@@ -159,6 +150,7 @@ def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = No
 
 STATE_VERSION = 1
 FORMAT = "drivegain-fleet-state"
+_SUMMARY = TypeAdapter(Summary)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,11 +174,11 @@ class CalibrationCache:
             UsageError: a file is in the way that must not be replaced.
         """
         file = self.file(cell)
-        for path in (file, _state(file)):
+        for path in (file, file.with_suffix(".json")):
             _check_replaceable(path)
         try:
             # Read without waiting for a pipe, and no more than a calibration can have.
-            state = json.loads(read_regular(_state(file), MAX_BYTES))
+            state = json.loads(read_regular(file.with_suffix(".json"), MAX_BYTES))
             found = hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest()
             if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != (
                 FORMAT,
@@ -194,7 +186,7 @@ class CalibrationCache:
                 found,
             ):
                 return None
-            return summary_from(state["summary"]), float(state["seconds"])
+            return _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None  # unreadable: made anew
 
@@ -210,13 +202,14 @@ class CalibrationCache:
             "inputs_sha256": self._inputs(cell),
             "calibration_sha256": hashlib.sha256(fitted.content).hexdigest(),
             "seconds": fitted.seconds,
-            "summary": summary_document(fitted.summary),
+            "summary": asdict(fitted.summary),
         }
-        for path, content in ((file, fitted.content), (_state(file), json.dumps(state, indent=1).encode())):
-            try:
+        for path, content in (
+            (file, fitted.content),
+            (file.with_suffix(".json"), json.dumps(state, indent=1).encode()),
+        ):
+            with writing(path):
                 replace_file(path, content)
-            except OSError as error:
-                raise OutputFailed.of(path, error) from error
         return file
 
     def _inputs(self, cell: CellLogs) -> str:
@@ -239,12 +232,10 @@ def open_cache(folder: Path, loop: Loop) -> CalibrationCache:
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(str(folder), found="a file", expected="a folder, or none", remedy="choose another name")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
     return CalibrationCache(folder, loop)
 
 
@@ -266,7 +257,3 @@ def _check_replaceable(path: Path) -> None:
         expected="a file that an earlier fleet has left, or none",
         remedy="move it away, or choose another folder",
     )
-
-
-def _state(file: Path) -> Path:
-    return file.with_suffix(".json")

@@ -13,10 +13,10 @@ from daq.config.cell import Cell, MotionPolicy
 from daq.config.controller import Controller
 from daq.config.policy import HistoryPlace
 from daq.config.recalibration import Recalibration
-from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, OutputFailed
+from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
 from daq.jobs.interlock import Runner, check_drives, require_release, run_command
 from daq.jobs.journal import Journal, Level
-from daq.jobs.session import Session, last_good
+from daq.jobs.session import Session
 from daq.ledger.store import HistoryStore
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
@@ -66,9 +66,9 @@ class GainTarget:
 class JobContext:
     """Everything that the steps of a job share."""
 
-    file: Path  #: the cell file, the cell, and its `recalibration`
-    cell: Cell  #: the cell file, the cell, and its `recalibration`
-    section: Recalibration  #: the cell file, the cell, and its `recalibration`
+    file: Path  #: cell file
+    cell: Cell  #: read from it
+    section: Recalibration  #: its `recalibration`
     target: GainTarget  #: controller file that the gains are compared with and written to
     tools: Tools  #: functions that the job calls
     journal: Journal  #: log of the job, labelled with session and step
@@ -76,9 +76,9 @@ class JobContext:
     began_s: float = 0.0  #: start of the job on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
 
-    def within(self, *, session: str | None = None, step: str | None = None) -> JobContext:
-        """The same context, with a journal that names the session or the step."""
-        return replace(self, journal=self.journal.within(session=session, step=step))
+    def within(self, step: str) -> JobContext:
+        """The same context, with a journal that names the step."""
+        return replace(self, journal=replace(self.journal, step=step))
 
 
 def target_of(cell: Cell) -> GainTarget:
@@ -158,12 +158,6 @@ def require_clock(found: tuple[Session, ...], now: datetime) -> None:
         )
 
 
-def due_in(found: tuple[Session, ...], every_h: float, now: datetime) -> timedelta:
-    """Time until the next calibration is due, counted from the start of the last good one; not positive when it is."""
-    good = last_good(found)
-    return timedelta(0) if good is None else good.began + timedelta(hours=every_h) - now
-
-
 def before_motion(context: JobContext) -> None:
     """Check disk space, history, interlock and drives.
 
@@ -172,10 +166,8 @@ def before_motion(context: JobContext) -> None:
         OutputFailed: the session's folder is gone.
     """
     section, tools = context.section, context.tools
-    try:
+    with writing(section.folder):
         free_mb = tools.free(section.folder) / 1e6
-    except OSError as error:
-        raise OutputFailed.of(section.folder, error) from error
     if free_mb < section.min_free_mb:
         raise DiskSpaceShort(
             str(section.folder),

@@ -1,20 +1,139 @@
-"""Fit the cells of a fleet in parallel, and report a row for each."""
+"""Fit the cells of a fleet in parallel, and report a row for each.
+
+The workers are threads of this process, processes of this machine, or the workers of a dask scheduler.
+"""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from daq.errors import UsageError
-from daq.jobs.cell_fit import CalibrationCache, Failure, Fitted, Loop, Unfitted, failure_of, fit_cell
-from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, Summary, UnknownLog, by_cell, survey
-from daq.jobs.workers import WorkerPool
+from daq.errors import ConfigurationMissing, UsageError
+from daq.jobs.cell_fit import CalibrationCache, Failure, Fitted, Loop, Summary, failure_of, fit_cell
+from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
+
+HERE = "127.0.0.1"
+TRIMMING = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
+"""By which dask lets its workers give memory back after every use: a fit would spend a fifth of its time on that."""
+CONNECT_S = 10  #: How long a scheduler may take to answer [s]
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerPool:
+    """Running workers."""
+
+    executor: Executor  #: runs functions
+    workers: int  #: tasks that it does at the same time; no more are ever given to it
+    present: Callable[[], bool]  #: whether any worker is left
+
+
+def worker_pool(scheduler: str, workers: int | None) -> AbstractContextManager[WorkerPool]:
+    """Choose the workers for --scheduler and --workers; they run until the block ends.
+
+    Args:
+        scheduler: threads, processes, or the address of a dask scheduler, tcp://HOST:PORT.
+        workers: None for as many as there are processors, or as the scheduler has threads.
+
+    Raises:
+        UsageError: it is none of these; on entering, no scheduler answers at the address, or it has no workers.
+        ConfigurationMissing: on entering, dask.distributed is not installed.
+    """
+    here = workers or len(os.sched_getaffinity(0))
+    if scheduler == "threads":
+        return _threads(here)
+    if scheduler == "processes":
+        return _processes(here)
+    if "://" not in scheduler:
+        raise UsageError(
+            "--scheduler",
+            found=repr(scheduler),
+            expected="threads, processes, or the address of a dask scheduler",
+            remedy="for instance --scheduler processes, or --scheduler tcp://127.0.0.1:8786",
+        )
+    return _scheduler(scheduler, workers)
+
+
+@contextmanager
+def _threads(workers: int) -> Iterator[WorkerPool]:
+    """Nothing to install. Much of a fit is Python, of which one thread runs at a time.
+
+    At the end, running tasks are waited for and waiting ones are given up.
+    """
+    executor = ThreadPoolExecutor(workers, thread_name_prefix="fleet")
+    try:
+        yield WorkerPool(executor, workers, lambda: True)
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[WorkerPool]:
+    distributed, dask = _distributed(), import_module("dask")
+    # On this machine alone: who reaches a scheduler can run anything on its workers. Its dashboard is left out;
+    # its HTTP server cannot be, and takes a free port: on the usual one it would warn of any other cluster.
+    with (
+        dask.config.set({TRIMMING: None}),
+        distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host=HERE,
+            dashboard_address=None,
+            scheduler_kwargs={"dashboard": False, "dashboard_address": f"{HERE}:0"},
+        ) as cluster,
+        _scheduler(cluster.scheduler_address, workers) as pool,
+    ):
+        yield pool
+
+
+@contextmanager
+def _scheduler(address: str, workers: int | None) -> Iterator[WorkerPool]:
+    """Connect to a scheduler, here or on another machine; it and its workers go on when the block ends."""
+    try:
+        client = _distributed().Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"--scheduler {address}",
+            found=str(error) or type(error).__name__,
+            expected="a dask scheduler that answers",
+            remedy="start `dask scheduler`, and `dask worker ADDRESS` on each machine; or use --scheduler processes",
+        ) from error
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise UsageError(
+                f"--scheduler {address}",
+                found="no workers",
+                expected="one or more",
+                remedy=f"start some: `dask worker {address} --nthreads 1`",
+            )
+        executor = client.get_executor(pure=False)
+        try:
+            yield WorkerPool(executor, workers or threads, lambda: bool(client.nthreads()))
+        finally:
+            executor.shutdown(wait=False)
+
+
+def _distributed() -> Any:
+    """Import the optional extra, which takes a second and has no types where it is used here."""
+    try:
+        return import_module("distributed")
+    except ImportError as error:
+        raise ConfigurationMissing(
+            "--scheduler",
+            found="no package dask.distributed",
+            expected="that of the optional extra `fleet`",
+            remedy="pip install 'drivegain[fleet]', or leave --scheduler out for threads",
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +176,6 @@ def fit_fleet(
 ) -> tuple[FleetRow, ...]:
     """Fit every cell that has logs; the failure of one is in its row.
 
-    Args:
-        logs: of all cells.
-        pool: workers.
-        loop: whether missing effects are added.
-        cache: of calibrations, None for none.
-        now: time of day, for the calibrations.
-        report_progress: of progress, by cells; while heads are read, by logs.
-
     Returns:
         the rows, by cell and configuration; logs of unknown cells come last.
 
@@ -76,21 +187,32 @@ def fit_fleet(
     cells, unknown = _surveyed(logs, pool, report_progress)
     configurations = Counter(cell.cell for cell in cells)
     rows: list[FleetRow] = []
+
+    def row_of(cell: CellLogs, result: Summary | Failure, seconds: float) -> FleetRow:
+        fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
+        several = configurations[cell.cell]
+        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, several)
+
     missing = []
     for cell in cells:
         cached = None if cache is None else cache.cached(cell)
         if cache is None or cached is None:
             missing.append(cell)
         else:
-            row = _row_of(cell, *cached, configurations[cell.cell])
-            rows.append(replace(row, file=cache.file(cell), kept=True))
+            rows.append(replace(row_of(cell, *cached), file=cache.file(cell), kept=True))
     report_progress(len(rows), len(cells), "")
 
-    def submit(cell: CellLogs) -> Future[Fitted | Unfitted]:
+    def submit(cell: CellLogs) -> Future[Fitted | Failure]:
         return pool.executor.submit(fit_cell, cell, loop, now())
 
-    for cell, found in each(submit, missing, pool):
-        rows.append(_row(cell, found, configurations[cell.cell], cache))
+    for cell, made in each(submit, missing, pool):
+        # An exception is a worker that was killed, or an error of ours: the other cells have nothing to do with it.
+        found = failure_of(made) if isinstance(made, BaseException) else made
+        if isinstance(found, Failure):
+            rows.append(row_of(cell, found, found.seconds))
+        else:
+            file = None if cache is None else cache.store(cell, found)
+            rows.append(replace(row_of(cell, found.summary, found.seconds), file=file))
         report_progress(len(rows), len(cells), cell.cell)
     rows.sort(key=lambda row: (row.cell, row.configuration_sha256))
     return (*rows, *(FleetRow(log.log.name, "", (log.log.name,), (), failure_of(log.error), 0.0) for log in unknown))
@@ -102,11 +224,6 @@ def each(
     """Run work in a pool, and yield the results as they finish.
 
     No more is submitted than there are workers, so that neither tasks nor results pile up.
-
-    Args:
-        submit: submits a piece to the pool.
-        work: in pieces.
-        pool: workers.
 
     Yields:
         each piece with its result or its exception.
@@ -125,19 +242,12 @@ def each(
             raise _gone("no workers any more")
         for future in done:
             piece = running.pop(future)
-            outcome = _outcome(future)
+            try:
+                outcome = future.exception() or future.result()
+            except CancelledError as lost:
+                raise _gone("the connection to the scheduler lost") from lost
             running |= {submit(following): following for following in islice(waiting, 1)}
             yield piece, outcome
-
-
-def _outcome(future: Future[Made]) -> Made | BaseException:
-    try:
-        error = future.exception()
-        if error is None:
-            return future.result()
-    except CancelledError as lost:
-        raise _gone("the connection to the scheduler lost") from lost
-    return error
 
 
 def _gone(found: str) -> UsageError:
@@ -169,20 +279,3 @@ def _surveyed(
         surveyed += len(portion)
         report_progress(surveyed, len(logs), "heads of logs")
     return by_cell(seen), sorted(unknown, key=lambda log: log.log.name)
-
-
-def _row(
-    cell: CellLogs, found: Fitted | Unfitted | BaseException, configurations: int, cache: CalibrationCache | None
-) -> FleetRow:
-    if isinstance(found, BaseException):
-        # A worker that was killed, or an error of ours: the other cells have nothing to do with it.
-        return _row_of(cell, failure_of(found), 0.0, configurations)
-    if isinstance(found, Unfitted):
-        return _row_of(cell, found.failure, found.seconds, configurations)
-    row = _row_of(cell, found.summary, found.seconds, configurations)
-    return row if cache is None else replace(row, file=cache.store(cell, found))
-
-
-def _row_of(cell: CellLogs, result: Summary | Failure, seconds: float, configurations: int) -> FleetRow:
-    fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
-    return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations)

@@ -1,4 +1,4 @@
-"""Survey the logs of a fleet: the cell of each log, read from its head alone, and the summary of a calibration."""
+"""Survey the logs of a fleet: the cell of each log, read from its head alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
@@ -19,7 +19,6 @@ from daq.errors import ConfigurationMissing, DaqError, LogMissing, LogUnreadable
 from daq.files import open_regular
 from daq.log.metadata import READBACK
 from daq.log.reader import LogHead, LogReader
-from ident.calibration import Calibration, Gain
 
 ENDING = ".mcap"
 PIECE_BYTES = 2**20
@@ -35,12 +34,7 @@ class StoredLog:
     @property
     def remote(self) -> bool:
         """It is no file of this machine's folders."""
-        return is_address(self.address)
-
-
-def is_address(place: str) -> bool:
-    """Whether a place is an address for fsspec, and not a path."""
-    return "://" in place
+        return "://" in self.address
 
 
 def list_logs(place: str) -> tuple[StoredLog, ...]:
@@ -52,7 +46,20 @@ def list_logs(place: str) -> tuple[StoredLog, ...]:
         LogMissing: there is no such folder, or no log in it.
         ConfigurationMissing: the address needs a package that is not installed.
     """
-    logs = _listed_remote(place) if is_address(place) else _listed_local(Path(place))
+    if "://" in place:  # for fsspec; a path otherwise
+        with _name_errors(place):
+            store, root = _store(place)
+            if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
+                logs = _listed_local(Path(root))  # file://: with links, pipes and devices, which fsspec does not report
+            else:
+                below = root.rstrip("/") + "/"
+                logs = [
+                    StoredLog(store.unstrip_protocol(path), path.removeprefix(below))
+                    for path in store.find(root)
+                    if path.endswith(ENDING)
+                ]
+    else:
+        logs = _listed_local(Path(place))
     if not logs:
         raise LogMissing(
             place, found=f"no file *{ENDING}", expected="a folder with the logs of cells", remedy="check the place"
@@ -74,19 +81,6 @@ def at_hand(log: StoredLog, folder: Path) -> Path:
         store, path = _store(log.address)
         with store.open(path, "rb") as source, copy.open("wb") as target:
             shutil.copyfileobj(source, target, PIECE_BYTES)
-    return copy
-
-
-def beginning(log: StoredLog, size: int, folder: Path) -> Path:
-    """The first bytes of a log in an object store, as a file below `folder`.
-
-    Raises:
-        LogMissing: it cannot be read.
-    """
-    copy = _copy(log, folder)
-    with _name_errors(log.address):
-        store, path = _store(log.address)
-        copy.write_bytes(store.cat_file(path, start=0, end=size))
     return copy
 
 
@@ -113,30 +107,17 @@ def _listed_local(folder: Path) -> list[StoredLog]:
     return [StoredLog(str(path.absolute()), str(path.relative_to(folder))) for path in folder.rglob(f"*{ENDING}")]
 
 
-def _listed_remote(place: str) -> list[StoredLog]:
-    with _name_errors(place):
-        store, root = _store(place)
-        if isinstance(store, import_module("fsspec.implementations.local").LocalFileSystem):
-            return _listed_local(Path(root))  # file://: with links, pipes and devices, which fsspec does not report
-        found = [path for path in store.find(root) if path.endswith(ENDING)]
-    below = root.rstrip("/") + "/"
-    return [StoredLog(store.unstrip_protocol(path), path.removeprefix(below)) for path in found]
-
-
 def _regular(path: Path) -> Path:
     """Check that a log is a regular file before it is opened: a pipe or a device would never end."""
     if path.is_symlink() and not path.exists():
         found = f"a link to {path.readlink()}, which leads nowhere"
-        raise _no_log(path, found, "mount or copy what it leads to, or move the link away")
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode):
+        remedy = "mount or copy what it leads to, or move the link away"
+    elif not stat.S_ISREG(mode := path.stat().st_mode):
         found = "a folder" if stat.S_ISDIR(mode) else "something that is no regular file"
-        raise _no_log(path, found, f"put the log there, or give this a name without {ENDING}")
-    return path
-
-
-def _no_log(path: Path, found: str, remedy: str) -> LogMissing:
-    return LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
+        remedy = f"put the log there, or give this a name without {ENDING}"
+    else:
+        return path
+    raise LogMissing(str(path), found=found, expected="a log: a regular file, or a link to one", remedy=remedy)
 
 
 def _copy(log: StoredLog, folder: Path) -> Path:
@@ -212,7 +193,18 @@ class CellLogs:
 def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
     """Read the heads of some logs; errors take the place of their log."""
     known: dict[str, tuple[str, str]] = {}
-    return tuple(_seen(log, known) for log in logs)
+    found: list[SeenLog | UnknownLog] = []
+    for log in logs:
+        try:
+            mark = fingerprint(log)
+            head = _head(log)
+            cell, digest = _described(log, head, known)
+        except DaqError as error:
+            found.append(UnknownLog(log, error))
+            continue
+        mounting = None if head.run.payload is None else head.run.payload.mounting
+        found.append(SeenLog(log, mark, cell, digest, mounting, head.run.started_wall_ns))
+    return tuple(found)
 
 
 def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
@@ -222,29 +214,16 @@ def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
     load: its error is then measured on moves that no estimate has seen, and all gains can still be found.
     """
     groups: dict[tuple[str, str], list[SeenLog]] = {}
-    for log in seen:
-        groups.setdefault((log.cell, log.configuration_sha256), []).append(log)
-    return tuple(_roles(*key, groups[key]) for key in sorted(groups))
-
-
-def _roles(cell: str, digest: str, logs: list[SeenLog]) -> CellLogs:
     # The order of a session, and by content where clocks agree: a fit's last digits depend on the order.
-    logs = sorted(logs, key=lambda log: (log.started_ns, log.fingerprint, log.log.name))
-    mountings = [log.mounting for log in logs]
-    loaded = [log for log in logs if log.mounting is not None]
-    held = loaded[-1:] if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1 else []
-    return CellLogs(cell, digest, tuple(log for log in logs if log not in held), tuple(held))
-
-
-def _seen(log: StoredLog, known: dict[str, tuple[str, str]]) -> SeenLog | UnknownLog:
-    try:
-        mark = fingerprint(log)
-        head = _head(log)
-        cell, digest = _described(log, head, known)
-    except DaqError as error:
-        return UnknownLog(log, error)
-    mounting = None if head.run.payload is None else head.run.payload.mounting
-    return SeenLog(log, mark, cell, digest, mounting, head.run.started_wall_ns)
+    for log in sorted(seen, key=lambda log: (log.started_ns, log.fingerprint, log.log.name)):
+        groups.setdefault((log.cell, log.configuration_sha256), []).append(log)
+    cells = []
+    for (cell, digest), logs in sorted(groups.items()):
+        mountings = [log.mounting for log in logs]
+        loaded = [log for log in logs if log.mounting is not None]
+        held = loaded[-1:] if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1 else []
+        cells.append(CellLogs(cell, digest, tuple(log for log in logs if log not in held), tuple(held)))
+    return tuple(cells)
 
 
 def _described(log: StoredLog, head: LogHead, known: dict[str, tuple[str, str]]) -> tuple[str, str]:
@@ -263,76 +242,29 @@ def _described(log: StoredLog, head: LogHead, known: dict[str, tuple[str, str]])
 def _head(log: StoredLog) -> LogHead:
     with tempfile.TemporaryDirectory(prefix="drivegain-fleet-") as folder:
         if log.remote:
+            copy = _copy(log, Path(folder))
+            with _name_errors(log.address):
+                store, place = _store(log.address)
+                copy.write_bytes(store.cat_file(place, start=0, end=HEAD_BYTES))
             try:
-                return _unfinished_head(beginning(log, HEAD_BYTES, Path(folder)))
+                return _unfinished_head(copy)
             except LogUnreadable:
                 pass  # a longer head, or an older log: read the whole of it
         path = at_hand(log, Path(folder))
+        reader = LogReader(path)
         try:
-            return _whole_head(path)
+            next(iter(reader), None)
+            head = reader.head
         except LogUnreadable as damage:
             # A log with a damaged end still names its cell; the fit of that cell then reports the damage.
             try:
                 return _unfinished_head(path)
             except LogUnreadable:
                 raise damage from None
-
-
-def _whole_head(path: Path) -> LogHead:
-    reader = LogReader(path)
-    next(iter(reader), None)
-    return reader.head
+        return head
 
 
 def _unfinished_head(path: Path) -> LogHead:
     reader = LogReader(path)
     next(reader.until_damage(), None)
     return reader.head
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """Summary of one calibration, small enough to be sent."""
-
-    gains: tuple[Gain, ...]  #: one an axis
-    effects: tuple[tuple[str, str], ...]  #: family and axis of each accepted effect
-    error_percent: float  #: ‖ρ‖/‖Y‖ in total on the run held out, of the fit where there is none [%]
-    held_out: bool  #: whether it is that of a run held out
-    partial: bool  #: it rests on a log that was never finished, or with losses
-
-    @property
-    def worst(self) -> Gain:
-        """The gain that is known least well."""
-        return max(self.gains, key=lambda gain: gain.std_percent)
-
-
-def summary_of(calibration: Calibration) -> Summary:
-    """Summarise a calibration for the table."""
-    unseen = calibration.holdout_error_percent
-    return Summary(
-        gains=calibration.gains,
-        effects=tuple((effect.name, effect.axis) for effect in calibration.effects),
-        error_percent=(unseen or calibration.relative_error_percent).total,
-        held_out=unseen is not None,
-        partial=any(source.partial for source in calibration.sources),
-    )
-
-
-def summary_document(summary: Summary) -> dict[str, Any]:
-    """Convert a summary to lists, mappings and numbers."""
-    return asdict(summary)
-
-
-def summary_from(document: dict[str, Any]) -> Summary:
-    """Read back the output of `summary_document`.
-
-    Raises:
-        KeyError, TypeError, ValueError: it is something else.
-    """
-    return Summary(
-        gains=tuple(Gain(**gain) for gain in document["gains"]),
-        effects=tuple((str(name), str(axis)) for name, axis in document["effects"]),
-        error_percent=float(document["error_percent"]),
-        held_out=bool(document["held_out"]),
-        partial=bool(document["partial"]),
-    )

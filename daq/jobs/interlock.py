@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-import stat
 import subprocess
 import threading
 import time
@@ -19,6 +18,7 @@ from types import FrameType
 from daq.config.cell import Cell
 from daq.config.recalibration import Command, Interlock, PlannedRun, Recalibration
 from daq.errors import JobHeld, NotReleased, TimeBoundReached
+from daq.files import open_regular
 from daq.workflow.record import network_of
 from drivers.canopen.network import SignalBlocker
 from drivers.errors import DriveFault, StateRefused
@@ -49,11 +49,6 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
 
     It has a session of its own: a Ctrl-C that stops us does not end it half-way unasked, and when it takes too long, or
     we are interrupted, all that it started is ended with it.
-
-    Args:
-        command: program, arguments, and how long it may take.
-        further: arguments behind those.
-        folder: in which it runs.
     """
     try:
         process = subprocess.Popen(
@@ -69,21 +64,19 @@ def run_command(command: Command, further: tuple[str, ...], folder: Path) -> Fin
     with process:
         try:
             said = _said(process, command.timeout_s)
-        except subprocess.TimeoutExpired:
-            _end(process)
-            return Finished(None, f"not ended within {command.timeout_s:g} s")
-        except BaseException:
-            _end(process)
+        except BaseException as error:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            if process.stdout is not None:
+                process.stdout.close()
+            if isinstance(error, subprocess.TimeoutExpired):
+                return Finished(None, f"not ended within {command.timeout_s:g} s")
             raise
     return Finished(process.returncode, said.decode("utf-8", errors="replace").strip()[-MAX_OUTPUT_CHARACTERS:])
 
 
 def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
-    """The end of what a program says until it has ended; the rest of it is read, and not kept.
-
-    Raises:
-        subprocess.TimeoutExpired: it takes longer.
-    """
+    """The end of what a program says until it has ended; the rest of it is read, and not kept."""
     assert process.stdout is not None
     ends_s, said = time.monotonic() + timeout_s, b""
     with selectors.DefaultSelector() as output:
@@ -99,13 +92,6 @@ def _said(process: subprocess.Popen[bytes], timeout_s: float) -> bytes:
     raise subprocess.TimeoutExpired(process.args, timeout_s)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    if process.stdout is not None:
-        process.stdout.close()
-
-
 NOTHING = "none"  #: Argument of the mount command for a run without load
 _LOOK_BYTES = 4096
 
@@ -114,10 +100,7 @@ def require_release(interlock: Interlock, run: Runner, now: Callable[[], datetim
     """Check that the interlock releases the robot; a program that fails and a file that is unreadable do not.
 
     Args:
-        interlock: of the cell.
-        run: runs its command.
         now: wall clock, asked when the file is: the command before it may take its time.
-        folder: in which the command runs.
 
     Raises:
         NotReleased: it does not release the robot.
@@ -151,16 +134,10 @@ def _require_file(file: Path, interlock: Interlock, now: Callable[[], datetime])
     subject = f"interlock file {file}"
     expected = f"{interlock.says!r} in its first line, written within the last {interlock.max_age_s:g} s"
     try:
-        # A FIFO of that name must not keep us waiting for its other end.
-        descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-        try:
+        with open_regular(file) as stream:
             # Of the file that is open: a gateway may put another in its place meanwhile.
-            found, asked = os.fstat(descriptor), now()
-            if not stat.S_ISREG(found.st_mode):
-                raise _held(subject, "no regular file", expected)
-            head = os.read(descriptor, _LOOK_BYTES)
-        finally:
-            os.close(descriptor)
+            found, asked = os.fstat(stream.fileno()), now()
+            head = stream.read(_LOOK_BYTES)
     except OSError as error:
         raise _held(subject, (error.strerror or type(error).__name__).lower(), expected) from error
     says = head.decode("utf-8", errors="replace").partition("\n")[0].strip()
@@ -193,10 +170,6 @@ LEFT_BEHIND = (
 def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
     """Check identity and state of every drive; nothing is changed and nothing moves.
 
-    Args:
-        cell: its file.
-        block_signals: keeps signals away while the network is closed.
-
     Raises:
         DriveFault: one has a fault; to reset it is a person's decision.
         StateRefused: one has power already: another controller drives this robot.
@@ -222,9 +195,6 @@ def time_bound(minutes: float) -> Iterator[SignalBlocker]:
     """Raise TimeBoundReached in the block when its time is up; yields a function that defers it during a stop.
 
     There is no alarm outside the main thread, where Python handles no signals.
-
-    Args:
-        minutes: limit [min].
 
     Raises:
         TimeBoundReached: in the block.

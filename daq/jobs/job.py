@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -11,16 +11,18 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.recalibration import Recalibration
 from daq.errors import ExitCode
+from daq.files import sha256_of
 from daq.jobs import session as sessions
-from daq.jobs.context import JobContext, Tools, before_motion, due_in, require_clock, section_of, target_of
-from daq.jobs.decision import GainHistory, decide_outcome
+from daq.jobs.context import JobContext, Tools, before_motion, require_clock, section_of, target_of
+from daq.jobs.decision import decide_outcome
 from daq.jobs.interlock import time_bound
 from daq.jobs.journal import Journal, Level
 from daq.jobs.recording import basis_of, calibration_of_session, fit_session, record_runs, verified_runs
 from daq.jobs.reporting import Conclusion, audit_entry, report_failure, report_success
-from daq.jobs.session import Outcome, Session
+from daq.jobs.session import Outcome, Session, WatchedGain
 from daq.ledger.audit import AuditAction
 from daq.ledger.ledger import Ledger
+from daq.ledger.watch import alarm_text, watch
 from daq.workflow.safeguards import bus_lock
 from drivers.canopen.network import SignalBlocker
 
@@ -37,15 +39,6 @@ def recalibrate(
 ) -> Conclusion:
     """Recalibrate a cell, or finish the session of an earlier job.
 
-    Args:
-        cell_file: of the cell.
-        cell: read from it.
-        tools: functions that the job calls.
-        journal: receives every event.
-        who: name of the job in audit and logs.
-        block_signals: keeps signals away while the axes are stopped.
-        lock_folder: of the bus's lock, see `daq.workflow.safeguards`.
-
     Raises:
         JobHeld, MotionRefused, ConfigurationError: nothing has moved; in a session, as the next line.
         DaqError, DriverError, IdentificationError: the error that ended the session; the axes were stopped, the
@@ -61,12 +54,18 @@ def recalibrate(
             return early
         began_s = tools.monotonic_s()
         session = _resumed_or_new(section, cell, tools.now(), journal)
-        journal = journal.within(session=session.state.session)
+        journal = replace(journal, session=session.state.session)
         context = JobContext(cell_file, cell, section, target, tools, journal, who, began_s)
         try:
             audit_entry(context, AuditAction.RECALIBRATION_BEGUN, session, {"attempt": session.state.attempt})
             with time_bound(section.max_duration_min) as in_time:
-                session = _run(replace(context, block_signals=_both(block_signals, in_time)), session)
+
+                @contextmanager
+                def block_both() -> Iterator[None]:
+                    with block_signals(), in_time():
+                        yield
+
+                session = _run(replace(context, block_signals=block_both), session)
         except BaseException as error:
             report_failure(context, session.folder, error)
             raise
@@ -99,7 +98,7 @@ def preview(
         made = () if session is None else tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
-            folder = _nearest(section.folder)
+            folder = next((path for path in (section.folder, *section.folder.parents) if path.is_dir()), section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
             before_motion(JobContext(cell_file, cell, section, target, there, journal, who))
     steps = [f"warm up for {section.warm_up_min:g} min"] if left and section.warm_up_min else []
@@ -114,29 +113,30 @@ def preview(
 def _run(context: JobContext, session: Session) -> Session:
     """Take the steps that the session lacks; returns it with its outcome."""
     if len(verified_runs(session).state.runs) < len(context.section.runs):
-        before_motion(context.within(step="preflight"))
+        before_motion(context.within("preflight"))
         session = record_runs(context, session)
-    session, calibration = fit_session(context.within(step="fit"), session)
+    session, calibration = fit_session(context.within("fit"), session)
     target, tools = context.target, context.tools
     with Ledger(context.cell, target.history, context.who) as ledger:
-        history = GainHistory(ledger, target.file, tools.now)
-        history.enter(calibration, session.folder / sessions.CALIBRATION)
-        session = session.update(watched=history.watched())
-        for gain in session.state.watched:
+        ledger.add(calibration, digest=sha256_of(session.folder / sessions.CALIBRATION) or "", at=tools.now())
+        series = watch(ledger.entries(), ledger.acknowledgements())
+        watched = tuple(WatchedGain(axis=one.axis, alarm=alarm_text(one) or "") for one in series)
+        session = session.update(watched=watched)
+        for gain in watched:
             if gain.alarm:
                 # Each slice of a slow drift may be small enough to be written without an operator.
-                watching = context.within(step="watch").journal
+                watching = context.within("watch").journal
                 watching.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
-        return decide_outcome(context.within(step="decide"), session, calibration, history)
+        return decide_outcome(context.within("decide"), session, calibration, ledger)
 
 
 def _not_due(section: Recalibration, cell: Cell, now: datetime) -> Conclusion | None:
     """Conclude early where no calibration is due; also checks the clock, on which every age depends."""
     found = sessions.sessions(section.folder, cell.name)
     require_clock(found, now)
-    left = due_in(found, section.every_h, now)
     good = sessions.last_good(found)
-    if left <= timedelta(0) or good is None:
+    left = timedelta(0) if good is None else good.began + timedelta(hours=section.every_h) - now
+    if good is None or left <= timedelta(0):
         return None
     hours = left.total_seconds() / 3600.0
     remark = f"The calibration of session {good.state.session} is good for another {hours:.1f} h (every_h)."
@@ -148,10 +148,10 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
     session = sessions.resumable_session(found, basis, now, section.resume_within_h)
     if session is None:
         session = sessions.begin(section.folder, basis, now)
-        journal.within(session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
+        replace(journal, session=session.state.session).say(Level.INFO, "session begun", folder=str(session.folder))
         return session
     attempt = session.state.attempt + 1
-    journal.within(session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
+    replace(journal, session=session.state.session).say(Level.NOTICE, "session taken up", attempt=attempt)
     return session.update(
         attempt=attempt,
         attempt_began=now.isoformat(timespec="seconds"),
@@ -160,19 +160,3 @@ def _resumed_or_new(section: Recalibration, cell: Cell, now: datetime, journal: 
         problem="",
         ended=None,
     )
-
-
-def _both(one: SignalBlocker, other: SignalBlocker) -> SignalBlocker:
-    @contextmanager
-    def both() -> Iterator[None]:
-        with ExitStack() as stack:
-            stack.enter_context(one())
-            stack.enter_context(other())
-            yield
-
-    return both
-
-
-def _nearest(folder: Path) -> Path:
-    """The folder, or the nearest parent that exists."""
-    return next((path for path in (folder, *folder.parents) if path.is_dir()), folder)

@@ -13,7 +13,7 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum, IntEnum
 from typing import TextIO
@@ -46,25 +46,18 @@ class Journal:
     session: str = ""  #: of what is said from here on
     step: str = ""  #: of what is said from here on
 
-    def within(self, *, session: str | None = None, step: str | None = None) -> Journal:
-        """The same journal, in a session or a step of it."""
-        return replace(
-            self,
-            session=self.session if session is None else session,
-            step=self.step if step is None else step,
-        )
-
     def say(self, level: Level, event: str, /, **fields: object) -> None:
         """Write one event.
 
         Args:
-            level: how much it matters.
             event: what happened, always in the same words.
             fields: plain JSON; what JSON has no word for is spelt as text.
         """
         at = self.now().isoformat(timespec="milliseconds")
         if self.form is Form.TEXT:
-            details = ", ".join(f"{name} {_text(value)}" for name, value in fields.items())
+            values = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in fields.items()}
+            details = ", ".join(f"{name} {value}" for name, value in values.items())
+            details = "".join(letter if letter.isprintable() else " " for letter in details)
             line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
         else:
             known = {"session": self.session, "step": self.step}
@@ -83,7 +76,6 @@ def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
     """Choose the form for a stream.
 
     Args:
-        stream: standard error.
         environment: of this process; systemd names device and inode of the stream that it reads in JOURNAL_STREAM
             (systemd.exec(5)), so that a stream that was redirected since is recognised.
     """
@@ -94,11 +86,6 @@ def form_of(stream: TextIO, environment: Mapping[str, str]) -> Form:
         if environment.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}":
             return Form.JOURNAL
     return Form.JSON
-
-
-def _text(value: object) -> str:
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    return "".join(letter if letter.isprintable() else " " for letter in text)
 
 
 def _plain(value: object) -> object:

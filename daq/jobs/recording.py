@@ -8,7 +8,6 @@ import uuid
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 from daq.config.cell import Cell
@@ -20,8 +19,8 @@ from daq.errors import (
     ConfigurationError,
     DataError,
     LogUnreadable,
-    OutputFailed,
     RunInvalid,
+    writing,
 )
 from daq.files import sha256_of
 from daq.jobs.context import JobContext
@@ -39,7 +38,6 @@ from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
 from ident.calibration import Calibration
 from ident.errors import IdentificationError
-from ident.model.bodies import Payload
 
 WARM_UP = "warm-up"
 
@@ -72,14 +70,23 @@ def record_runs(context: JobContext, session: Session) -> Session:
     session = verified_runs(session)
     made = {run.name for run in session.state.runs}
     left = [planned for planned in context.section.runs if planned.name not in made]
-    plans = {planned.name: _plan(context.within(step="plan"), session, planned) for planned in left}
+    plans = {planned.name: _plan(context.within("plan"), session, planned) for planned in left}
     warm = not left
     for planned in left:
-        run_context = context.within(step=f"record {planned.name}")
+        run_context = context.within(f"record {planned.name}")
         mount(context.section, planned, context.tools.run)
         run_context.journal.say(Level.INFO, "mounted", payload=planned.payload or "none")
         if not warm:
-            _warm_up(context.within(step=WARM_UP), session, planned, plans[planned.name])
+            # The moves of the run, recorded under the same supervision; the log is dropped.
+            plan, out = plans[planned.name], log_of(session, WARM_UP)
+            passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
+            for number in range(1, passes + 1):
+                said = context.within(WARM_UP).journal
+                said.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
+                out.unlink(missing_ok=True)
+                out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
+                _record(context, planned, plan, out)
+                out.unlink()
             warm = True
         run = _record_valid(run_context, session, planned, plans[planned.name])
         session = session.update(runs=(*session.state.runs, run))
@@ -97,23 +104,9 @@ def _plan(context: JobContext, session: Session, planned: PlannedRun) -> Plan:
         with suppress(ConfigurationError):  # what was damaged is made again
             return load_plan(path, context.cell)
     context.journal.say(Level.INFO, "planning", seed=seed, duration_s=duration_s)
-    try:
+    with writing(path):
         save_plan(context.tools.plan(context.cell, seed=seed, duration_s=duration_s), path)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return load_plan(path, context.cell)  # as a person can read it
-
-
-def _warm_up(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> None:
-    """Repeat the moves of a run until the joints are warm; recorded under the same supervision, the log is dropped."""
-    passes = math.ceil(60.0 * context.section.warm_up_min / plan.duration_s)
-    for number in range(1, passes + 1):
-        context.journal.say(Level.INFO, "warming up", number=number, of=passes, seconds=plan.duration_s)
-        out = log_of(session, WARM_UP)
-        out.unlink(missing_ok=True)
-        out.with_name(out.name + UNFINISHED).unlink(missing_ok=True)
-        _record(context, planned, plan, out)
-        out.unlink()
 
 
 def _record_valid(context: JobContext, session: Session, planned: PlannedRun, plan: Plan) -> RecordedRun:
@@ -153,13 +146,15 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
     def released() -> None:
         require_release(context.section.interlock, context.tools.run, context.tools.now, context.section.working_folder)
 
+    # `section_of` has checked that the cell has it.
+    payload = next((one.payload for one in context.cell.payloads if one.name == planned.payload), None)
     released()
     return context.tools.record(
         context.file,
         context.cell,
         plan,
         out,
-        payload=payload_of(context.cell, planned),
+        payload=payload,
         entered_kg=planned.mass_kg,
         operator=context.who,
         granted_by=f"the policy of cell {context.cell.name} and its interlock, for {context.who}",
@@ -171,22 +166,10 @@ def _record(context: JobContext, planned: PlannedRun, plan: Plan, out: Path) -> 
     )
 
 
-def payload_of(cell: Cell, planned: PlannedRun) -> Payload | None:
-    """Payload of a run; `section_of` has checked that the cell has it."""
-    if planned.payload is None:
-        return None
-    return next(payload.payload for payload in cell.payloads if payload.name == planned.payload)
-
-
 def _set_aside(out: Path, journal: Journal) -> None:
-    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one.
-
-    Raises:
-        UsageError: the log is still being written.
-        OutputFailed: the file system refuses.
-    """
+    """Rename the remnants of an earlier recording of this name: a log that the state does not list, or half of one."""
     part = out.with_name(out.name + UNFINISHED)
-    try:
+    with writing(out):
         if out.exists():
             aside = next(_free_names(out, "aside"))
             out.rename(aside)
@@ -200,8 +183,6 @@ def _set_aside(out: Path, journal: Journal) -> None:
                 aside = part.rename(aside.with_name(aside.name + UNFINISHED))
                 journal.say(Level.NOTICE, "nothing to salvage", found=error.found)
             journal.say(Level.NOTICE, "half a recording kept as partial", log=aside.name)
-    except OSError as error:
-        raise OutputFailed.of(out, error) from error
 
 
 def _free_names(out: Path, kind: str) -> Iterator[Path]:
@@ -238,11 +219,9 @@ def fit_session(context: JobContext, session: Session) -> tuple[Session, Calibra
         raise
     calibration = context.tools.calibration(closed, context.tools.now())
     path, report = session.folder / CALIBRATION, session.folder / REPORT
-    try:
+    with writing(path):
         save_calibration(calibration, path)
         report.mkdir(exist_ok=True)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     context.tools.save_report(closed, changed, calibration, report)
     fit = Fitted(calibration_sha256=sha256_of(path) or "", sentences=summary(closed, changed))
     for sentence in fit.sentences:
@@ -256,14 +235,8 @@ def calibration_of_session(session: Session) -> Calibration | None:
     if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
     try:
-        found = _loaded(path, fitted.calibration_sha256)
+        found = load(path)
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
     own = {run.sha256 for run in session.state.runs}
     return found if {source.sha256 for source in found.sources} == own else None
-
-
-@lru_cache(maxsize=2)
-def _loaded(path: Path, _sha256: str) -> Calibration:
-    """Read a calibration once; its digest identifies the content."""
-    return load(path)

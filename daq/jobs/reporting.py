@@ -14,13 +14,13 @@ from typing import Any
 
 from prometheus_client import CollectorRegistry, Gauge, write_to_textfile
 
-from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code
+from daq.errors import AuditUnusable, DaqError, ExitCode, HistoryUnreadable, OutputFailed, exit_code, writing
 from daq.files import replace_file
 from daq.jobs import session as sessions
 from daq.jobs.context import JobContext
 from daq.jobs.journal import Level
 from daq.jobs.recording import calibration_of_session
-from daq.jobs.session import CALIBRATION, REPORT, JudgedGain, Outcome, Session, SessionState
+from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, SessionState
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.store import HistoryStore
 from drivers.errors import WHILE
@@ -39,9 +39,6 @@ class Conclusion:
     remark: str  #: reason, in one sentence
 
 
-CODES = {Outcome.PROPOSED: ExitCode.PROPOSED}  #: Exit codes of outcomes without an error; the others are OK
-
-
 def report_success(context: JobContext, session: Session) -> Conclusion:
     """Report a session whose state has its outcome.
 
@@ -50,7 +47,8 @@ def report_success(context: JobContext, session: Session) -> Conclusion:
     """
     outcome = session.state.outcome or Outcome.STOPPED
     remark = "" if session.state.decision is None else session.state.decision.remark
-    return _report(context, session, outcome, CODES.get(outcome, ExitCode.OK), remark, "")
+    code = ExitCode.PROPOSED if outcome is Outcome.PROPOSED else ExitCode.OK
+    return _report(context, session, outcome, code, remark, "")
 
 
 def report_failure(context: JobContext, folder: Path, error: BaseException) -> None:
@@ -73,7 +71,7 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
     Raises:
         AuditUnusable, OutputFailed: it could not be written.
     """
-    try:
+    with writing(context.target.history.audit):
         return append(
             context.target.history.audit,
             action,
@@ -82,8 +80,6 @@ def audit_entry(context: JobContext, action: AuditAction, session: Session, deta
             subject=str(session.folder),
             details={"session": session.state.session, "cell": context.cell.name, **details},
         )
-    except OSError as error:
-        raise OutputFailed.of(context.target.history.audit, error) from error
 
 
 def _report(
@@ -95,7 +91,13 @@ def _report(
     )
     unwritten: DaqError | None = None
     try:
-        details = _end_details(state)
+        details: dict[str, object] = {
+            "outcome": outcome.value,
+            "exit_code": int(code),
+            "problem": problem,
+            "logs": {run.name: run.sha256 for run in state.runs},
+            "calibration_sha256": None if state.fitted is None else state.fitted.calibration_sha256,
+        }
         entry = audit_entry(context, AuditAction.RECALIBRATION_ENDED, session, details)
         # Kept here too: a chain does not show by itself that its last lines are missing.
         state = state.with_(audit_sha256=entry.sha256)
@@ -106,15 +108,27 @@ def _report(
     conclusion = Conclusion(outcome, int(code), session, remark)
     level = Level.NOTICE if outcome.good else Level.ERROR
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
-    _write_summary(context, conclusion)
-    _write_metrics(context, conclusion, now)
-    _remove_old(context)
+    with writing(session.folder):
+        replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
+        summary = json.dumps(document(conclusion, context.file), indent=2, ensure_ascii=False) + "\n"
+        replace_file(session.folder / SUMMARY_JSON, summary.encode())
+    found = sessions.sessions(context.section.folder, context.cell.name)
+    if context.section.metrics is not None:
+        duration_s = context.tools.monotonic_s() - context.began_s
+        try:
+            write_metrics(
+                context.section.metrics, context.cell.name, conclusion, now, duration_s, sessions.last_good(found)
+            )
+        except OutputFailed as error:
+            # A monitor reports missing metrics itself; the calibration is done.
+            context.journal.say(Level.ERROR, "metrics could not be written", text=str(error))
+    _remove_old(context, found)
     if unwritten is not None:
         raise unwritten
     return conclusion
 
 
-def _remove_old(context: JobContext) -> None:
+def _remove_old(context: JobContext, found: tuple[Session, ...]) -> None:
     try:
         with HistoryStore(context.target.history.store) as store:
             newest = {event.target: event.digest for event in store.events()}
@@ -123,58 +137,8 @@ def _remove_old(context: JobContext) -> None:
         # The calibrations in force are unknown: keep all sessions.
         context.journal.say(Level.WARNING, "no old session removed", text=str(error))
         return
-    found = sessions.sessions(context.section.folder, context.cell.name)
     for folder in sessions.remove_old(found, context.section.keep_sessions, in_force):
         context.journal.say(Level.INFO, "old session removed", folder=str(folder))
-
-
-def _write_summary(context: JobContext, conclusion: Conclusion) -> None:
-    if conclusion.session is None:
-        return
-    folder = conclusion.session.folder
-    try:
-        replace_file(folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        replace_file(
-            folder / SUMMARY_JSON,
-            (json.dumps(document(conclusion, context.file), indent=2, ensure_ascii=False) + "\n").encode(),
-        )
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
-
-
-def _write_metrics(context: JobContext, conclusion: Conclusion, now: datetime) -> None:
-    if context.section.metrics is None:
-        return
-    good = sessions.last_good(sessions.sessions(context.section.folder, context.cell.name))
-    shown = conclusion.session
-    calibration = None if shown is None else calibration_of_session(shown)
-    if calibration is None and good is not None:
-        shown, calibration = good, calibration_of_session(good)
-    figures = Figures(
-        cell=context.cell.name,
-        outcome=conclusion.outcome,
-        exit_code=conclusion.exit_code,
-        ended=now,
-        duration_s=context.tools.monotonic_s() - context.began_s,
-        last_good=None if good is None else good.began,
-        state=None if shown is None else shown.state,
-        calibration=calibration,
-    )
-    try:
-        write_metrics(figures, context.section.metrics)
-    except OutputFailed as error:
-        # A monitor reports missing metrics itself; the calibration is done.
-        context.journal.say(Level.ERROR, "metrics could not be written", text=str(error))
-
-
-def _end_details(state: SessionState) -> dict[str, object]:
-    return {
-        "outcome": None if state.outcome is None else state.outcome.value,
-        "exit_code": state.exit_code,
-        "problem": state.problem,
-        "logs": {run.name: run.sha256 for run in state.runs},
-        "calibration_sha256": None if state.fitted is None else state.fitted.calibration_sha256,
-    }
 
 
 def document(conclusion: Conclusion, cell_file: Path) -> dict[str, Any]:
@@ -186,9 +150,7 @@ def document(conclusion: Conclusion, cell_file: Path) -> dict[str, Any]:
         "to_do": to_do(conclusion, cell_file),
     }
     if conclusion.session is not None:
-        session = conclusion.session
-        found |= {"folder": str(session.folder), **session.state.model_dump(mode="json")}
-        found["outcome"], found["exit_code"] = conclusion.outcome.value, conclusion.exit_code
+        found |= {"folder": str(conclusion.session.folder), **conclusion.session.state.model_dump(mode="json")}
     return found
 
 
@@ -205,12 +167,23 @@ def text(conclusion: Conclusion, cell_file: Path) -> str:
         state = session.state
         lines += [
             f"Session {state.session} of cell {state.cell}, begun {state.began}, job {state.attempt} of it.",
-            *(_run_line(run.name, run.samples, run.lost_cycles, run.attempts) for run in state.runs),
+            *(
+                f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
+                f"recording{'s' * (run.attempts != 1)}"
+                for run in state.runs
+            ),
         ]
         if state.fitted is not None:
             lines += ["", "Residual:", *(f"  {sentence}" for sentence in state.fitted.sentences)]
         if state.decision is not None:
-            lines += ["", f"Gains: {state.decision.remark}", *map(_gain_line, state.decision.gains)]
+            lines += ["", f"Gains: {state.decision.remark}"]
+            for gain in state.decision.gains:
+                change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
+                drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
+                lines.append(
+                    f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} "
+                    f"{gain.unit} found{change}{drift}{': differs' if gain.differs else ''}"
+                )
         drifts = [gain.alarm for gain in state.watched if gain.alarm]
         if drifts:
             lines += ["", "Drift (`drivegain history` shows it):", *(f"  {alarm}" for alarm in drifts)]
@@ -246,74 +219,46 @@ def to_do(conclusion: Conclusion, cell_file: Path) -> list[str]:
     }.get(outcome, ["nothing"])
 
 
-def _run_line(name: str, samples: int, lost_cycles: int, recordings: int) -> str:
-    return f"  {name}: {samples} samples, {lost_cycles} cycles lost, {recordings} recording{'s' * (recordings != 1)}"
-
-
-def _gain_line(gain: JudgedGain) -> str:
-    change = "" if gain.change_percent is None else f", {gain.change_percent:+.2f} %"
-    drift = "" if gain.drift_sigma is None else f" ({abs(gain.drift_sigma):.1f} σ)"
-    return (
-        f"  {gain.axis}: {gain.old:.5g} in the controller, {gain.new:.5g} ± {gain.new_std:.2g} {gain.unit} "
-        f"found{change}{drift}{': differs' if gain.differs else ''}"
-    )
-
-
 PREFIX = "drivegain_recalibration_"
-_Gauges = Callable[..., Gauge]
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """Figures that the metrics of a job are made of."""
+def write_metrics(
+    folder: Path, cell: str, conclusion: Conclusion, ended: datetime, duration_s: float, good: Session | None
+) -> Path:
+    """Write the metrics for the textfile collector of the Prometheus node exporter; the file is replaced whole.
 
-    cell: str  #: name
-    outcome: Outcome  #: of this job
-    exit_code: int  #: of this job
-    ended: datetime  #: of this job
-    duration_s: float  #: of this job
-    last_good: datetime | None  #: start of the last good session, None where there was none
-    state: SessionState | None  #: of this session if it has a calibration, else of the last good one
-    calibration: Calibration | None  #: of the same session, None where there is none
+    Where the session of this job has no calibration, figures are those of the last good one.
 
-
-def registry_of(figures: Figures) -> CollectorRegistry:
-    """Build the metrics in a registry of their own."""
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    shown = conclusion.session
+    calibration = None if shown is None else calibration_of_session(shown)
+    if calibration is None and good is not None:
+        shown, calibration = good, calibration_of_session(good)
     registry = CollectorRegistry()
 
     def gauge(name: str, text: str, *labels: str) -> Gauge:
         return Gauge(PREFIX + name, text, ("cell", *labels), registry=registry)
 
-    cell = figures.cell
     outcomes = gauge("outcome", "1 for the outcome of the last job, 0 for the others.", "outcome")
     for outcome in Outcome:
-        outcomes.labels(cell, outcome.value).set(float(outcome is figures.outcome))
-    gauge("exit_code", "Of the last job.").labels(cell).set(figures.exit_code)
-    gauge("last_run_timestamp_seconds", "When the last job ended.").labels(cell).set(figures.ended.timestamp())
-    gauge("duration_seconds", "Of the last job.").labels(cell).set(figures.duration_s)
-    if figures.last_good is not None:
+        outcomes.labels(cell, outcome.value).set(float(outcome is conclusion.outcome))
+    gauge("exit_code", "Of the last job.").labels(cell).set(conclusion.exit_code)
+    gauge("last_run_timestamp_seconds", "When the last job ended.").labels(cell).set(ended.timestamp())
+    gauge("duration_seconds", "Of the last job.").labels(cell).set(duration_s)
+    if good is not None:
         last = gauge("last_success_timestamp_seconds", "When the last good calibration was begun.")
-        last.labels(cell).set(figures.last_good.timestamp())
-    if figures.state is not None:
-        _set_session_gauges(gauge, figures.state, cell)
-    if figures.calibration is not None:
-        _set_calibration_gauges(gauge, figures.calibration, cell)
-    return registry
-
-
-def write_metrics(figures: Figures, folder: Path) -> Path:
-    """Write the metrics for the textfile collector of the Prometheus node exporter; the file is replaced whole.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
-    path = folder / f"drivegain_{file_stem(figures.cell)}.prom"
-    try:
-        write_to_textfile(str(path), registry_of(figures))
+        last.labels(cell).set(good.began.timestamp())
+    if shown is not None:
+        _set_session_gauges(gauge, shown.state, cell)
+    if calibration is not None:
+        _set_calibration_gauges(gauge, calibration, cell)
+    path = folder / f"drivegain_{file_stem(cell)}.prom"
+    with writing(path):
+        write_to_textfile(str(path), registry)
         # The collector is another user, and a service's umask may be strict.
         path.chmod(0o644)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return path
 
 
@@ -323,7 +268,7 @@ def file_stem(cell: str) -> str:
     return plain if plain == cell else f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
 
 
-def _set_session_gauges(gauge: _Gauges, state: SessionState, cell: str) -> None:
+def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: str) -> None:
     lost = gauge("lost_cycles", "Cycles that are not in any recording of a run.", "run")
     missing = gauge("missing_answers", "Answers of drives that never came, of all recordings of a run.", "run")
     attempts = gauge("recordings", "Recordings of a run until a valid one.", "run")
@@ -344,7 +289,7 @@ def _set_session_gauges(gauge: _Gauges, state: SessionState, cell: str) -> None:
                 drift.labels(cell, gain.axis).set(gain.drift_sigma)
 
 
-def _set_calibration_gauges(gauge: _Gauges, calibration: Calibration, cell: str) -> None:
+def _set_calibration_gauges(gauge: Callable[..., Gauge], calibration: Calibration, cell: str) -> None:
     value = gauge("gain", "Identified drive gain, in Nm or N per A.", "axis", "unit")
     std = gauge("gain_std", "Its standard deviation, in the same unit.", "axis", "unit")
     for gain in calibration.gains:

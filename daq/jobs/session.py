@@ -10,7 +10,7 @@ import re
 import shutil
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Literal
 from pydantic import ValidationError
 
 from daq.config.yaml_file import StrictModel
-from daq.errors import OutputFailed
+from daq.errors import writing
 from daq.files import read_regular, replace_file
 
 STATE, CALIBRATION, REPORT = "state.json", "calibration.yaml", "report"
@@ -170,11 +170,7 @@ class Session:
         return max(_times(self.state))
 
     def update(self, **changed: object) -> Session:
-        """Change some values of the state, and write it.
-
-        Raises:
-            OutputFailed: see `save`.
-        """
+        """Change some values of the state, and write it as `save`."""
         return save(replace(self, state=self.state.with_(**changed)))
 
 
@@ -210,22 +206,12 @@ def begin(folder: Path, basis: Basis, now: datetime) -> Session:
     """
     stamp = now.astimezone(UTC).strftime(_STAMP)
     names = (stamp, *(f"{stamp}-{number:02d}" for number in range(2, 100)))
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         name = next(name for name in names if not (folder / name).exists())
         (folder / name).mkdir()
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
     at = now.isoformat(timespec="seconds")
-    state = SessionState(
-        session=name,
-        cell=basis.cell,
-        configuration_sha256=basis.configuration_sha256,
-        plans_sha256=basis.plans_sha256,
-        began=at,
-        attempt_began=at,
-    )
-    return save(Session(folder / name, state))
+    return save(Session(folder / name, SessionState(session=name, began=at, attempt_began=at, **asdict(basis))))
 
 
 def save(session: Session) -> Session:
@@ -235,10 +221,8 @@ def save(session: Session) -> Session:
         OutputFailed: the file system refuses.
     """
     path = session.folder / STATE
-    try:
+    with writing(path):
         replace_file(path, (session.state.model_dump_json(indent=2) + "\n").encode())
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
     return session
 
 
@@ -254,12 +238,10 @@ def resumable_session(found: tuple[Session, ...], basis: Basis, now: datetime, w
 
 def last_good(found: tuple[Session, ...]) -> Session | None:
     """Newest session with a valid calibration."""
-    good = [
-        session
-        for session in found
-        if session.finished and session.state.outcome is not None and session.state.outcome.good
-    ]
-    return good[-1] if good else None
+    for session in reversed(found):
+        if session.finished and session.state.outcome is not None and session.state.outcome.good:
+            return session
+    return None
 
 
 def remove_old(found: tuple[Session, ...], keep: int, in_force: Collection[str]) -> tuple[Path, ...]:

@@ -55,7 +55,21 @@ class Installation:
 def units_of(cell: Cell, section: Recalibration, wanted: Installation) -> tuple[Unit, Unit]:
     """The service and its timer."""
     name = unit_name(cell)
-    return Unit(f"{name}.service", _service(cell, section, wanted)), Unit(f"{name}.timer", _timer(cell, wanted))
+    timer = f"""{MARK}
+[Unit]
+Description=drivegain: when cell {_plain(cell.name)} is recalibrated
+
+[Timer]
+OnCalendar={_plain(wanted.schedule)}
+# A date that passed while the computer was off is not made up for when it is switched on: no robot moves because the
+# power came back. The job's interlock would have to release it anyway.
+Persistent=false
+AccuracySec=1min
+
+[Install]
+WantedBy=timers.target
+"""
+    return Unit(f"{name}.service", _service(cell, section, wanted)), Unit(f"{name}.timer", timer)
 
 
 def unit_name(cell: Cell) -> str:
@@ -139,23 +153,6 @@ Environment=OMP_NUM_THREADS=1 PYTHONUNBUFFERED=1
 {hardening}{writable}"""
 
 
-def _timer(cell: Cell, wanted: Installation) -> str:
-    return f"""{MARK}
-[Unit]
-Description=drivegain: when cell {_plain(cell.name)} is recalibrated
-
-[Timer]
-OnCalendar={_plain(wanted.schedule)}
-# A date that passed while the computer was off is not made up for when it is switched on: no robot moves because the
-# power came back. The job's interlock would have to release it anyway.
-Persistent=false
-AccuracySec=1min
-
-[Install]
-WantedBy=timers.target
-"""
-
-
 def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
     """Folders that ProtectHome= and ProtectSystem= would lock; of links, those where the files are."""
     folders = {cell_file.parent, section.folder.parent, section.folder}
@@ -171,11 +168,7 @@ def _writable(cell: Cell, section: Recalibration, cell_file: Path) -> str:
 
 
 def _quoted(part: str, *, dollar: str = "$$") -> str:
-    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them.
-
-    Raises:
-        UsageError: it has a character that no unit can say, and with another one it would be another file.
-    """
+    """An argument as systemd.service(5) reads it: % and $ doubled, in quotes where it needs them."""
     if not part.isprintable():
         raise UsageError(
             f"{part!r}",

@@ -12,9 +12,8 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.jobs.cell_fit import Failure
+from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
-from daq.jobs.fleet_survey import Summary
 from daq.report.gains import with_deviation
 from daq.report.text import inert, inert_row, picked, printable, spelled_bytes
 from ident.calibration import Gain

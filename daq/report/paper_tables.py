@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rich.console import RenderableType
 
 from daq.report.text import plain_table, printable, terminal_text
-from daq.workflow.cross_validation import CrossValidation, Failure
+from daq.workflow.validate import CrossValidation
 from ident.calibration import Calibration, Parameter
 
 NONE = "—"
@@ -161,9 +161,9 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
         columns: list[tuple[str, ...]] = []
         for label in labels:
             mass = run.masses[label]
-            if isinstance(mass, Failure):
+            if isinstance(mass, str):
                 columns.append((NONE,) * 4)
-                notes.append(f"{run.run}, {label}: {mass.reason}")
+                notes.append(f"{run.run}, {label}: {mass}")
                 continue
             percents = (mass.std_percent, mass.std_with_gains_percent, mass.error_percent)
             columns.append((f"{mass.mass_kg:.3f}", *map(percent, percents)))

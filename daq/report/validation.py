@@ -16,9 +16,15 @@ from daq.report import paper_tables
 from daq.report.fit import error_document
 from daq.report.plots import plot_torques
 from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
-from daq.workflow.cross_validation import CrossValidation, Failure, WeighedRun
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import DataUse, Validation, conditioning_of, together
+from daq.workflow.validate import (
+    CrossValidation,
+    DataUse,
+    Validation,
+    WeighedRun,
+    conditioning_of,
+    together,
+)
 from ident.calibration import Calibration
 
 
@@ -143,8 +149,8 @@ def _weighed(run: WeighedRun, found: CrossValidation) -> dict[str, Any]:
         "weighed_kg": run.weighed_kg,
         "with_bare_runs": found.with_bare_runs,
         "masses": {
-            label: {"reason": mass.reason}
-            if isinstance(mass, Failure)
+            label: {"reason": mass}
+            if isinstance(mass, str)
             else picked(mass, "mass_kg", "std_percent", "std_with_gains_percent", "error_percent")
             for label, mass in run.masses.items()
         },

@@ -11,7 +11,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -93,50 +93,22 @@ class CalibrationDocument(StrictModel):
     recording_configuration_sha256: str | None = None  #: Files of earlier versions lack these three
 
 
-def _parameter(entry: ParameterEntry) -> Parameter:
-    return Parameter(entry.name, entry.value, entry.std, entry.unit)
+_CLASSES: dict[type, type] = {
+    CalibrationDocument: Calibration,
+    GainEntry: Gain,
+    ParameterEntry: Parameter,
+    EffectEntry: AcceptedEffect,
+}
 
 
-def _error(entry: RelativeErrorEntry) -> RelativeError:
-    return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
-
-
-def _perhaps(entry: RelativeErrorEntry | None) -> RelativeError | None:
-    return None if entry is None else _error(entry)
-
-
-def calibration_of(entries: CalibrationDocument) -> Calibration:
-    """Convert a checked document."""
-    return Calibration(
-        cell=entries.cell,
-        method=entries.method,
-        gains=tuple(Gain(g.axis, g.value, g.std, g.unit, g.nameplate) for g in entries.gains),
-        parameters=tuple(_parameter(p) for p in entries.parameters),
-        effects=tuple(
-            AcceptedEffect(
-                name=e.name,
-                axis=e.axis,
-                settings=dict(e.settings),
-                coefficients=tuple(_parameter(c) for c in e.coefficients),
-                error_before_percent=e.error_before_percent,
-                error_after_percent=e.error_after_percent,
-                ambiguity=e.ambiguity,
-            )
-            for e in entries.effects
-        ),
-        relative_error_percent=_error(entries.relative_error_percent),
-        holdout_error_percent=_perhaps(entries.holdout_error_percent),
-        condition=entries.condition,
-        rows=entries.rows,
-        filter=dict(entries.filter),
-        sources=entries.sources,
-        configuration_sha256=entries.configuration_sha256,
-        created=entries.created,
-        software=entries.software,
-        session_began_s=entries.session_began_s,
-        nameplate_holdout_error_percent=_perhaps(entries.nameplate_holdout_error_percent),
-        recording_configuration_sha256=entries.recording_configuration_sha256,
-    )
+def _from_entry(entry: object) -> Any:
+    """Convert a checked entry, with all entries in it, to the class of `ident` whose fields it has."""
+    if isinstance(entry, tuple):
+        return tuple(map(_from_entry, entry))
+    if isinstance(entry, RelativeErrorEntry):
+        return RelativeError(tuple(math.nan if value is None else value for value in entry.axes), entry.total)
+    made = _CLASSES.get(type(entry))
+    return entry if made is None else made(**{f.name: _from_entry(getattr(entry, f.name)) for f in fields(made)})
 
 
 VERSION = 1
@@ -168,43 +140,32 @@ _Dumper.add_implicit_resolver(
 )
 
 
-def as_document(calibration: Calibration) -> dict[str, object]:
+def as_document(calibration: Calibration) -> dict[str, Any]:
     """Return the calibration as lists, mappings and numbers: the object of `fit --json` and the body of the file.
 
     Percentages of zero are None.
     """
-    return {
-        "cell": calibration.cell,
-        "method": calibration.method,
-        "gains": [_gain_document(gain) for gain in calibration.gains],
-        "parameters": [_parameter_document(parameter) for parameter in calibration.parameters],
-        "effects": [
-            {
-                "name": effect.name,
-                "axis": effect.axis,
-                "settings": dict(effect.settings),
-                "coefficients": [_parameter_document(coefficient) for coefficient in effect.coefficients],
-                "error_before_percent": effect.error_before_percent,
-                "error_after_percent": effect.error_after_percent,
-                "ambiguity": list(effect.ambiguity),
-            }
-            for effect in calibration.effects
-        ],
-        "relative_error_percent": _error_document(calibration.relative_error_percent),
-        "holdout_error_percent": _error_document(calibration.holdout_error_percent),
-        "condition": calibration.condition,
-        "rows": calibration.rows,
-        "filter": {
-            name: list(value) if isinstance(value, list) else value for name, value in calibration.filter.items()
-        },
-        "sources": [_source_document(source) for source in calibration.sources],
-        "configuration_sha256": calibration.configuration_sha256,
-        "created": calibration.created,
-        "software": calibration.software,
-        "session_began_s": calibration.session_began_s,
-        "nameplate_holdout_error_percent": _error_document(calibration.nameplate_holdout_error_percent),
-        "recording_configuration_sha256": calibration.recording_configuration_sha256,
-    }
+    return {field.name: _as_entry(getattr(calibration, field.name)) for field in fields(calibration)}
+
+
+def _as_entry(value: Any) -> Any:
+    match value:
+        case list() | tuple():
+            return [_as_entry(item) for item in value]
+        case dict():
+            return {key: _as_entry(item) for key, item in value.items()}
+        case RelativeError():
+            # NaN marks an axis that did not move; the reader refuses any other number that is not finite.
+            return {"axes": [None if math.isnan(axis) else axis for axis in value.axes], "total": value.total}
+        case Gain():
+            change_percent = _percent(value.value - value.nameplate, value.nameplate)
+            std_percent = _percent(value.std, abs(value.value))
+            entry = GainEntry.model_construct(**asdict(value), std_percent=std_percent, change_percent=change_percent)
+            return entry.model_dump()
+        case Parameter():
+            std_percent = _percent(value.std, abs(value.value))
+            return ParameterEntry.model_construct(**asdict(value), std_percent=std_percent).model_dump()
+    return {f.name: _as_entry(getattr(value, f.name)) for f in fields(value)} if is_dataclass(value) else value
 
 
 def save(calibration: Calibration, path: Path) -> None:
@@ -271,7 +232,15 @@ def decode(content: bytes, name: str) -> Calibration:
     """Decode a file's content; `name` is its name in messages. Raises as `load`."""
     try:
         document = parse_yaml(content, name)
-        _check_version(document.tree, name)
+        # Before the schema: in a later version every key may be unknown, and only the version explains it.
+        version = document.tree.get("version") if isinstance(document.tree, dict) else None
+        if version != VERSION:
+            raise CalibrationUnreadable(
+                name,
+                found="no calibration" if version is None else f"version {version}",
+                expected=f"a calibration of version {VERSION}",
+                remedy="give the file that `drivegain fit` wrote, or fit the logs again with this drivegain",
+            )
         entries = read_model(document, CalibrationDocument)
     except (YamlInvalid, SchemaMismatch) as error:
         raise CalibrationUnreadable(
@@ -280,7 +249,8 @@ def decode(content: bytes, name: str) -> Calibration:
             expected=error.expected,
             remedy="give the file as `drivegain fit` wrote it, or fit the logs again",
         ) from error
-    edited = _edited_sections(document.tree)
+    found = _digests({key: value for key, value in document.tree.items() if key not in _ENVELOPE})
+    edited = sorted(key for key in found.keys() | entries.digests.keys() if found.get(key) != entries.digests.get(key))
     if edited:
         raise CalibrationRefused(
             name,
@@ -288,25 +258,8 @@ def decode(content: bytes, name: str) -> Calibration:
             expected="the content that was fitted",
             remedy="a calibration is evidence: fit the logs again instead of correcting it",
         )
-    return calibration_of(entries)
-
-
-def _check_version(tree: object, name: str) -> None:
-    # Before the schema: in a later version every key may be unknown, and only the version explains it.
-    version = tree.get("version") if isinstance(tree, dict) else None
-    if version != VERSION:
-        raise CalibrationUnreadable(
-            name,
-            found="no calibration" if version is None else f"version {version}",
-            expected=f"a calibration of version {VERSION}",
-            remedy="give the file that `drivegain fit` wrote, or fit the logs again with this drivegain",
-        )
-
-
-def _edited_sections(tree: Mapping[str, Any]) -> tuple[str, ...]:
-    found = _digests({key: value for key, value in tree.items() if key not in _ENVELOPE})
-    noted = tree["digests"]
-    return tuple(sorted(key for key in found.keys() | noted.keys() if found.get(key) != noted.get(key)))
+    calibration: Calibration = _from_entry(entries)
+    return calibration
 
 
 def _digests(body: Mapping[str, object]) -> dict[str, str]:
@@ -320,42 +273,3 @@ def _digests(body: Mapping[str, object]) -> dict[str, str]:
 def _percent(part: float, whole: float) -> float | None:
     ratio = 100.0 * part / whole if whole else math.inf
     return ratio if math.isfinite(ratio) else None
-
-
-def _gain_document(gain: Gain) -> dict[str, object]:
-    return {
-        "axis": gain.axis,
-        "value": gain.value,
-        "std": gain.std,
-        "std_percent": _percent(gain.std, abs(gain.value)),
-        "unit": gain.unit,
-        "nameplate": gain.nameplate,
-        "change_percent": _percent(gain.value - gain.nameplate, gain.nameplate),
-    }
-
-
-def _parameter_document(parameter: Parameter) -> dict[str, object]:
-    return {
-        "name": parameter.name,
-        "value": parameter.value,
-        "std": parameter.std,
-        "std_percent": _percent(parameter.std, abs(parameter.value)),
-        "unit": parameter.unit,
-    }
-
-
-def _source_document(source: Source) -> dict[str, object]:
-    document = asdict(source)
-    # Lists, as YAML returns them.
-    return {**document, "recording": None if source.recording is None else _listed(document["recording"])}
-
-
-def _listed(document: dict[str, object]) -> dict[str, object]:
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in document.items()}
-
-
-def _error_document(error: RelativeError | None) -> dict[str, object] | None:
-    if error is None:
-        return None
-    # NaN marks an axis that did not move; the reader refuses any other number that is not finite.
-    return {"axes": [None if math.isnan(value) else value for value in error.axes], "total": error.total}

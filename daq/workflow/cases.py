@@ -51,11 +51,11 @@ class ReducedLogs:
     """Logs of one cell, read once; what is known of a payload is chosen afterwards."""
 
     cell: Cell  #: as the logs describe it, or as given
-    logs: tuple[Path, ...]  #: of the fit, and those that it has not seen
-    holdout: tuple[Path, ...]  #: of the fit, and those that it has not seen
-    sources: tuple[Source, ...]  #: the same, with digests and roles
-    used: Reduction  #: their rows, reduced
-    unseen: Reduction  #: their rows, reduced
+    logs: tuple[Path, ...]  #: of the fit
+    holdout: tuple[Path, ...]  #: those that it must not see
+    sources: tuple[Source, ...]  #: all of them, with digests and roles
+    used: Reduction  #: rows of `logs`, reduced
+    unseen: Reduction  #: rows of `holdout`, reduced
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +68,7 @@ class CaseFit:
 
 
 def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell | None = None) -> ReducedLogs:
-    """Read and reduce.
-
-    Args:
-        logs: of the fit.
-        holdout: logs that the fit must not see.
-        cell: another description of the cell than the one in the logs.
+    """Read and reduce logs; the fit must not see those held out, and `cell` replaces the description in the logs.
 
     Raises:
         DataError, ConfigurationError, IdentificationError: a log cannot be used, or not with the others.
@@ -92,14 +87,7 @@ def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell |
 def fit_case(
     logs: ReducedLogs, method: Method, known: Known, *, gains_fixed: bool = False, ratio: float | None = None
 ) -> CaseFit:
-    """One fit of logs that were read.
-
-    Args:
-        logs: with a weighed payload where the gains are free.
-        method: estimator.
-        known: of the payloads.
-        gains_fixed: hold the gains at their nameplate values.
-        ratio: r_σ of the essential parameters; None keeps all base parameters.
+    """One fit of logs that were read; with a ratio r_σ, of its essential parameters alone.
 
     Raises:
         ConfigurationInconsistent: CAD values are asked for, and the cell has none.
@@ -125,11 +113,7 @@ def fit_case(
 
 
 def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
-    """The same fit with its essential parameters alone (§4.2); the others are zero, and certain.
-
-    Args:
-        fitted: without effects.
-        ratio: r_σ.
+    """The same fit with its essential parameters alone (§4.2, by the ratio r_σ); the others are zero, and certain.
 
     Raises:
         IdentificationError: the estimator refuses.
@@ -146,9 +130,7 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
     """Reduce a payload to the knowledge of a case.
 
     Args:
-        payload: as the log has it.
         cell: whose payload of that name and mounting says what its drawing says.
-        known: how much.
 
     Raises:
         ConfigurationInconsistent: the drawing is asked for, and the cell says no more than the mass.
@@ -170,12 +152,7 @@ def payload_as(payload: Payload, cell: Cell, known: Known) -> Payload:
 
 
 def calibration_of_case(case: CaseFit, created: datetime) -> Calibration:
-    """Make the calibration; the known payload parameters are in it without deviation.
-
-    Args:
-        case: fitted.
-        created: when, with its time zone.
-    """
+    """Make the calibration; the known payload parameters are in it without deviation."""
     calibration = calibration_of(case.fitted, created)
     removed = set() if case.essential is None else {removal.name for removal in case.essential.removed}
     given = tuple(

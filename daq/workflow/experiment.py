@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import cycle, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.motion.move import Trapezoid, synchronised
 from ident.data.conditioning import decimator
-from ident.model.kinematics import Motion
+from ident.model.kinematics import Motion, poses
 from ident.model.robot import JointKind, Robot
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.excitation import (
@@ -29,6 +29,7 @@ from ident.planning.excitation import (
     side_of_cube,
     visible,
 )
+from ident.planning.verdict import ExtraMoves
 
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""
@@ -61,23 +62,21 @@ class CheckedScene:
 
 
 def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
-    """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart.
-
-    Args:
-        cell: with or without declared clearance.
-        robot: of the cell.
-        mass_kg: of the payload that will be mounted, for the guess of its size.
-    """
+    """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart."""
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
     capsules = declared.capsules or guessed_capsules(robot)
     last = robot.joint_count - 1
     if not any(capsule.link == last for capsule in capsules):
-        capsules = (*capsules, guessed_payload(robot, mass_kg))
+        # Around a steel body of that mass on the last link, from a side in front of the joint to three of them.
+        side, axis = side_of_cube(mass_kg), robot.joints[-1].axis
+        capsules = (*capsules, Capsule("payload", last, _point(side * axis), _point(2.0 * side * axis), side))
+    links = [capsule.link for capsule in capsules]
+    parents = [robot.joints[link].parent if link != BASE else None for link in links]
     candidates = tuple(
         (first, second)
         for second in range(len(capsules))
         for first in range(second)
-        if not _neighbours(robot, capsules[first].link, capsules[second].link)
+        if links[first] not in (links[second], parents[second]) and parents[first] != links[second]
     )
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
     everything = Scene(capsules, candidates, declared.obstacles, declared.workspace, confined, declared.minimum_m)
@@ -88,7 +87,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     together = tuple(
         (capsules[a].name, capsules[b].name) for (a, b), kept in zip(candidates, apart, strict=True) if not kept
     )
-    scene = Scene(capsules, pairs, declared.obstacles, declared.workspace, confined, declared.minimum_m)
+    scene = replace(everything, pairs=pairs)
     return CheckedScene(Checker(robot, scene), not declared.capsules, together)
 
 
@@ -110,18 +109,6 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
     return tuple(capsules)
 
 
-def guessed_payload(robot: Robot, mass_kg: float) -> Capsule:
-    """Around a steel body of that mass on the last link, from a side in front of the joint to three of them."""
-    side = side_of_cube(mass_kg)
-    axis = robot.joints[-1].axis
-    return Capsule("payload", robot.joint_count - 1, _point(side * axis), _point(2.0 * side * axis), side)
-
-
-def _neighbours(robot: Robot, first: int, second: int) -> bool:
-    parents = [robot.joints[link].parent if link != BASE else None for link in (first, second)]
-    return first == second or parents[0] == second or parents[1] == first
-
-
 def _point(vector: FloatArray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
@@ -133,6 +120,7 @@ NOISE_SHARE = 0.006
 """Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms
 current of a lively plan, which is what a good fit leaves (docs/evidence/estimators.md)."""
 LAG_ONE = 0.67  #: Correlation of the residual from row to row, as measured on real recordings
+RATE_HZ = 1000.0  #: Sampling rate that the rows are predicted for
 RUNS: tuple[int | None, ...] = (None, 0)  #: What is mounted while the moves are made: nothing, then the payload
 
 
@@ -149,12 +137,7 @@ class Experiment:
     remarks: tuple[str, ...]  #: what was assumed, in words
 
     def excitation(self, paths: Sequence[Trapezoid], thinning: int = 1) -> tuple[Excitation, tuple[slice, ...]]:
-        """Rows of several moves, one after the other, and which of them belong to which move.
-
-        Args:
-            paths: the moves.
-            thinning: takes every so manieth row only.
-        """
+        """Rows of several moves, one after the other, and which of them belong to which move."""
         period = self.row_s * thinning
         times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
         parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
@@ -189,13 +172,20 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest, nameplate gains.
 
     Args:
-        cell: with a payload.
         payload: name of it, None for the first.
 
     Raises:
         ConfigurationInconsistent: the cell declares no payload, or none of that name.
     """
-    mounted = _payload(cell, payload)
+    found = [declared for declared in cell.payloads if payload in (None, declared.name)]
+    if not found:
+        raise ConfigurationInconsistent(
+            f"payloads of cell {cell.name!r}",
+            found=", ".join(declared.name for declared in cell.payloads) or "none",
+            expected="a weighed payload" if payload is None else repr(payload),
+            remedy="gains show only beside a known mass: weigh a body and declare it under `payloads`",
+        )
+    mounted = found[0]
     model = model_of(cell)
     expected = nominal_payload(model.robot, mounted.drawn)
     velocity = np.array([axis.limits.velocity for axis in cell.axes])
@@ -221,21 +211,13 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
         "to row",
         *scene.remarks,
     )
-    period, edge = _rows(cell)
-    return Experiment(cell, Design(expectation, visible(model, fast_motion)), scene, mounted, period, edge, remarks)
-
-
-def _payload(cell: Cell, name: str | None) -> WeighedPayload:
-    found = [payload for payload in cell.payloads if name in (None, payload.name)]
-    if not found:
-        names = ", ".join(payload.name for payload in cell.payloads) or "none"
-        raise ConfigurationInconsistent(
-            f"payloads of cell {cell.name!r}",
-            found=names,
-            expected="a weighed payload" if name is None else repr(name),
-            remedy="gains show only beside a known mass: weigh a body and declare it under `payloads`",
-        )
-    return found[0]
+    design = Design(expectation, visible(model, fast_motion))
+    # A row counts when its filter window is so far from a standstill that enough of its weight is outside.
+    filter_ = decimator(RATE_HZ, cell.conditioning.decimation_cutoff_hz)
+    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
+    inside = int(np.searchsorted(weight, cell.conditioning.standstill_share))
+    period, edge = filter_.factor / RATE_HZ, max(filter_.half - inside, 0) / RATE_HZ
+    return Experiment(cell, design, scene, mounted, period, edge, remarks)
 
 
 def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> Motion:
@@ -248,16 +230,6 @@ def _fast_motion(cell: Cell, velocity: FloatArray, acceleration: FloatArray) -> 
         path = synchronised(start, end, velocity, acceleration)
         parts.append(path.at(np.linspace(0.02, 0.98, 24) * path.duration_s))
     return Motion(*(np.concatenate([part[kind] for part in parts]) for kind in range(3)))
-
-
-def _rows(cell: Cell) -> tuple[float, float]:
-    """Time between rows, and how far from a standstill a row's filter window must be for it to count [s]."""
-    conditioning = cell.conditioning
-    rate_hz = 1000.0
-    filter_ = decimator(rate_hz, conditioning.decimation_cutoff_hz)
-    weight = np.cumsum(np.abs(filter_.taps)) / np.abs(filter_.taps).sum()
-    inside = int(np.searchsorted(weight, conditioning.standstill_share))
-    return filter_.factor / rate_hz, max(filter_.half - inside, 0) / rate_hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,3 +258,70 @@ def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
 def duration_of(cell: Cell, moves: Sequence[PlannedMove]) -> float:
     """From the first target to the end of the last dwell [s]."""
     return float(sum(path.duration_s for path in paths_of(cell, moves)) + sum(move.dwell_s for move in moves))
+
+
+SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
+EXTRA_POSTURES = 300
+POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
+SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
+STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
+
+
+def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
+    """Some five seconds of each kind, within limits and clear of everything; the same every time.
+
+    For every axis: fast with the arm stretched, fast with it folded (as the last link is seen from that axis), slow
+    with it stretched, and fast together with a neighbour; and of all axes together.
+    """
+    cell, checker = experiment.cell, experiment.scene.checker
+    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
+    velocity = np.array([axis.limits.velocity for axis in cell.axes])
+    acceleration = np.array([axis.limits.acceleration for axis in cell.axes])
+    margin = POSITION_MARGIN * (upper - lower)
+    low, high = lower + margin, upper - margin
+    sampled = np.random.default_rng(0).uniform(low, high, (EXTRA_POSTURES, len(low)))
+    clear = sampled[checker.margins(sampled) > 0.0]
+    found: list[ExtraMoves] = []
+
+    def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
+        """There and back in the first few postures in which that is clear."""
+        paths: list[Trapezoid] = []
+        for posture in postures:
+            for stroke in STROKES:
+                inwards = 0.5 * (1.0 - stroke) * (high - low)
+                start, end = posture.copy(), posture.copy()
+                start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
+                if checker.obstruction(start, end) is None:
+                    there = synchronised(start, end, velocity * speed, acceleration)
+                    paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
+                    break
+            if len(paths) >= 6:
+                break
+        chosen: list[Trapezoid] = []
+        seconds = 0.0
+        for path in cycle(paths):
+            chosen.append(path)
+            seconds += path.duration_s
+            if seconds >= SECONDS:
+                break
+        if chosen:
+            found.append(ExtraMoves(words, seconds, experiment.excitation(chosen)[0]))
+
+    names = cell.axis_names
+    robot = experiment.design.expectation.model.robot
+    at = poses(robot, clear)
+    for axis, name in enumerate(names):
+        # Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m].
+        way = at.origin_m[-1] - at.origin_m[axis + 1]
+        if robot.joints[axis].kind is not JointKind.PRISMATIC:
+            way = np.cross(at.rotation[axis + 1] @ robot.joints[axis].axis, way)
+        lever = np.linalg.norm(way, axis=1)
+        stretched, folded = clear[np.argsort(-lever, kind="stable")], clear[np.argsort(lever, kind="stable")]
+        swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
+        swing(f"fast moves of {name} with the arm folded", folded, [axis])
+        swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW)
+        other = axis + 1 if axis + 1 < len(names) else axis - 1
+        if other >= 0:
+            swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
+    swing("fast moves of all axes", clear, list(range(len(names))))
+    return tuple(found)

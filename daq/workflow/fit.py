@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,14 +18,12 @@ from daq.errors import ConfigurationError, LogRepeated, LogsDiffer, ModelContrad
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.report.effect_names import placed_name
-from daq.workflow.experiment import LAG_ONE, experiment_of
-from daq.workflow.plan import extra_moves
+from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
 from ident.calibration import AcceptedEffect, Calibration, Parameter, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.loop import Evidence, Step, find_effects, gather
-from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.signals import session_began_s
 from ident.errors import IdentificationError, PayloadUnseen
@@ -83,11 +82,10 @@ class Reading:
     def __init__(self, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> None:
         self._given = cell
         self._lossy = lossy
-        self._first: tuple[Path, Run] | None = None
         self._seen: dict[str, Path] = {}
         self.sources: list[Source] = []
         run, self.cell = load_run(logs[0], cell, lossy)
-        self._first = (logs[0], run)
+        self._first = {logs[0]: run}
 
     def runs(self, logs: Sequence[Path], role: str) -> Iterator[Run]:
         """One run after the other; the first log is not read twice.
@@ -97,9 +95,8 @@ class Reading:
             LogRepeated: a recording was given twice: it would count twice, or be held out of nothing.
         """
         for log in logs:
-            if self._first is not None and self._first[0] == log:
-                run, cell = self._first[1], self.cell
-                self._first = None
+            if log in self._first:
+                run, cell = self._first.pop(log), self.cell
             else:
                 run, cell = load_run(log, self._given, self._lossy)
             if cell.digest != self.cell.digest:
@@ -119,14 +116,9 @@ class Reading:
                     remedy="name other logs",
                 )
             self._seen[content] = log
-            self.sources.append(_source(run, role))
+            name, mass_kg = (None, None) if run.payload is None else (run.payload.name, run.payload.known.get("m"))
+            self.sources.append(Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording))
             yield run
-
-
-def _source(run: Run, role: str) -> Source:
-    mounted = run.payload
-    name, mass_kg = (None, None) if mounted is None else (mounted.name, mounted.known.get("m"))
-    return Source(run.name, run.digest, role, run.partial, name, mass_kg, run.recording)
 
 
 BOOTSTRAP_SEED = 0
@@ -184,44 +176,44 @@ def fit(
     Raises:
         DataError, ConfigurationError, IdentificationError: see daq/errors.py and ident/errors.py.
     """
+
+    def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
+        reading = Reading(used, cell, lossy)
+        declared = reading.cell
+        nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
+        result = identify(
+            model_of(declared),
+            reading.runs(used, "fit"),
+            declared.conditioning,
+            holdout=reading.runs(unseen, "holdout"),
+            method=method,
+            fixed_gains=nameplate if gains_fixed else None,
+        )
+        if not gains_fixed:
+            check_signs(result.estimate, nameplate)
+        check_explained(result.training_error, declared.axis_names)
+        paper = None if gains_fixed else tls(result.system)
+        return Fit(declared, tuple(used), tuple(unseen), tuple(reading.sources), result, (), paper, lossy)
+
     try:
-        return _fit(logs, holdout, method, gains_fixed, cell, lossy)
+        return attempt(logs, holdout, method or (Method.WLS if gains_fixed else Method.ML))
     except PayloadUnseen as error:
-        raise PayloadUnseen(error.std_percent, error.runs, _contradicting_run(logs, cell, lossy)) from error
-
-
-def _fit(
-    logs: Sequence[Path],
-    holdout: Sequence[Path],
-    method: Method | None,
-    gains_fixed: bool,
-    cell: Cell | None,
-    lossy: LossyLogs,
-) -> Fit:
-    reading = Reading(logs, cell, lossy)
-    declared = reading.cell
-    nameplate = np.array([axis.nameplate_gain for axis in declared.axes])
-    result = identify(
-        model_of(declared),
-        reading.runs(logs, "fit"),
-        declared.conditioning,
-        holdout=reading.runs(holdout, "holdout"),
-        method=method or (Method.WLS if gains_fixed else Method.ML),
-        fixed_gains=nameplate if gains_fixed else None,
-    )
-    if not gains_fixed:
-        check_signs(result.estimate, nameplate)
-    check_explained(result.training_error, declared.axis_names)
-    paper = None if gains_fixed else tls(result.system)
-    return Fit(declared, tuple(logs), tuple(holdout), tuple(reading.sources), result, (), paper, lossy)
+        contradicting = ""
+        for log in logs:
+            try:
+                rest = attempt([other for other in logs if other != log], (), Method.ML).estimate
+            except IdentificationError:
+                continue
+            std = 100.0 * float(np.max(rest.gains_std / np.abs(rest.gains)))
+            contradicting = (
+                f"without {log} they do (σ at most {std:.1f} %): was the payload of that run declared as it was?"
+            )
+            break
+        raise PayloadUnseen(error.std_percent, error.runs, contradicting) from error
 
 
 def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: None) -> Comparison:
     """Every estimator on the logs of a fit, which are read again for each filter.
-
-    Args:
-        fitted: with free gains.
-        progress: receives a line for each step.
 
     Raises:
         UsageError: its gains were held fixed.
@@ -240,19 +232,6 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
         found.conditioning,
         progress,
     )
-
-
-def _contradicting_run(logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs) -> str:
-    """Which log contradicts the others about the payload: without it they agree."""
-    for log in logs:
-        try:
-            rest = _fit([other for other in logs if other != log], (), Method.ML, False, cell, lossy)
-        except IdentificationError:
-            continue
-        gains = rest.identification.estimate
-        std = float(np.max(gains.gains_std / np.abs(gains.gains)))
-        return f"without {log} they do (σ at most {100.0 * std:.1f} %): was the payload of that run declared as it was?"
-    return ""
 
 
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
@@ -320,6 +299,7 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         created: when, with its time zone.
     """
     cell = fitted.cell
+    kept = fitted.steps[-1].after.effects if fitted.steps else ()
     found = identified_calibration(
         fitted.final,
         cell.axis_names,
@@ -329,7 +309,7 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
     )
     return replace(
         found,
-        effects=_effects(fitted, found.parameters),
+        effects=tuple(_accepted(fitted, placed, found.parameters) for placed in kept),
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         created=created.isoformat(timespec="seconds"),
@@ -365,25 +345,32 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     return RelativeError(axes, of_squares(size, left).total)
 
 
-def _effects(fitted: Fit, parameters: tuple[Parameter, ...]) -> tuple[AcceptedEffect, ...]:
-    kept = fitted.steps[-1].after.effects if fitted.steps else ()
-    return tuple(_accepted(fitted, placed, parameters) for placed in kept)
-
-
 def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
-    before, step, finding = _joined(fitted, placed)
-    names = {column.name for column in placed.columns}
-    error_before, error_after = (_holdout_error(error, placed) for error in (before, step.after.holdout_error))
-    if error_before is None or error_after is None:
+    # The last turn that added it: an idle effect may have gone and come back.
+    for number, step in reversed(list(enumerate(fitted.steps))):
+        before = fitted.steps[number - 1].after if number else None
+        had = before.effects if before else ()
+        finding = step.accepted
+        if finding is not None and placed in step.after.effects and placed not in had:
+            break
+    else:
+        raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
+    everywhere = placed.effect.side is Side.ALL_MOTORS
+    errors = []
+    for error in ((before or fitted.identification).holdout_error, step.after.holdout_error):
+        percent = np.nan if error is None else error.total if everywhere else error.axes[placed.axis]
+        errors.append(percent)
+    if not np.isfinite(errors).all():
         # Without a run that was held out, the moves that were left out in turn must do.
-        error_before, error_after = finding.error_before_percent, finding.error_after_percent
+        errors = [finding.error_before_percent, finding.error_after_percent]
+    names = {column.name for column in placed.columns}
     return AcceptedEffect(
         name=placed.effect.name,
         axis=axis_of(placed, fitted.cell),
         settings={name: float(value) for name, value in placed.effect.settings.items()},
         coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
-        error_before_percent=error_before,
-        error_after_percent=error_after,
+        error_before_percent=errors[0],
+        error_after_percent=errors[1],
         ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in finding.ambiguity),
     )
 
@@ -393,51 +380,36 @@ def axis_of(placed: PlacedEffect, cell: Cell) -> str:
     return ALL_AXES if placed.effect.side is Side.ALL_MOTORS else cell.axes[placed.axis].name
 
 
-def _joined(fitted: Fit, placed: PlacedEffect) -> tuple[RelativeError | None, Step, Finding]:
-    """Return the last turn that added an effect, with the hold-out error before it.
-
-    An idle effect may have gone and come back.
-    """
-    for number, step in reversed(list(enumerate(fitted.steps))):
-        before = fitted.steps[number - 1].after if number else None
-        had = before.effects if before else ()
-        if step.accepted is not None and placed in step.after.effects and placed not in had:
-            return (before or fitted.identification).holdout_error, step, step.accepted
-    raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
-
-
-def _holdout_error(error: RelativeError | None, placed: PlacedEffect) -> float | None:
-    """On the runs held out [%]: of the axis, or in total for what acts on all motors; None where they say nothing."""
-    if error is None:
-        return None
-    figure = error.total if placed.effect.side is Side.ALL_MOTORS else error.axes[placed.axis]
-    return figure if np.isfinite(figure) else None
-
-
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
-    """Judge every gain of a fit with free gains; the logs are read again.
+    """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
 
     The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
     scaled from the prediction as the fit's deviation is: moves determine the ratio, not the size of the noise.
-
-    Args:
-        fitted: effects, if it has any, are left out of the judgement.
     """
     found = fitted.identification
     estimate, system = found.estimate, found.system
+    independent, first = list(system.base.independent), len(system.columns)
     standard = np.zeros(len(found.model.columns))
-    standard[list(system.base.independent)] = estimate.parameters[: len(system.base.independent)]
+    standard[independent] = estimate.parameters[: len(independent)]
+    payloads = []
+    for payload, indices in zip(system.payloads, system.payload_columns, strict=True):
+        parameters = payload.known_parameters
+        parameters[list(indices)] = estimate.parameters[first : first + len(indices)]
+        first += len(indices)
+        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
     # ml's noise is that of the current references, the others' that of the joint torques.
     noise = estimate.axis_noise / (1.0 if estimate.method is Method.ML else np.abs(estimate.gains))
     expectation = Expectation(
         model=found.model,
         gains=estimate.gains,
         parameters=standard,
-        payloads=_payloads(found),
+        payloads=tuple(payloads),
         noise_a=effective_noise(noise, LAG_ONE),
     )
-    design = Design(expectation, system.base)
-    judged = verdicts(design, list(_excitations(fitted)), _extras(fitted))
+    extra: tuple[ExtraMoves, ...] = ()
+    with suppress(ConfigurationError):  # the cell does not say enough to plan moves in it
+        extra = extra_moves(experiment_of(fitted.cell))
+    judged = verdicts(Design(expectation, system.base), list(_excitations(fitted)), extra)
     true = 100.0 * fitted.estimate.gains_std / np.abs(fitted.estimate.gains)
     return tuple(_scaled(gain, float(std)) for gain, std in zip(judged, true, strict=True))
 
@@ -449,16 +421,6 @@ def needed_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     return () if good else gain_verdicts(fitted)
 
 
-def _payloads(found: Identification) -> tuple[ExpectedPayload, ...]:
-    first, payloads = len(found.system.columns), []
-    for payload, indices in zip(found.system.payloads, found.system.payload_columns, strict=True):
-        parameters = payload.known_parameters
-        parameters[list(indices)] = found.estimate.parameters[first : first + len(indices)]
-        first += len(indices)
-        payloads.append(ExpectedPayload(frozenset(payload.known) & frozenset(LINK_PARAMETERS), parameters))
-    return tuple(payloads)
-
-
 def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ...]]]:
     found = fitted.identification
     mountings = [payload.mounting for payload in found.system.payloads]
@@ -467,14 +429,6 @@ def _excitations(fitted: Fit) -> Iterator[tuple[Excitation, tuple[int | None, ..
         data = differentiate(run, found.model.drive_train, found.conditioning)
         mounted = None if run.payload is None else mountings.index(run.payload.mounting)
         yield recorded(found.model.drive_train, data, found.conditioning), (mounted,)
-
-
-def _extras(fitted: Fit) -> tuple[ExtraMoves, ...]:
-    """None where the cell does not say enough to plan moves in it."""
-    try:
-        return extra_moves(experiment_of(fitted.cell))
-    except ConfigurationError:
-        return ()
 
 
 def _scaled(gain: GainVerdict, std_percent: float) -> GainVerdict:

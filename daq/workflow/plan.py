@@ -1,10 +1,16 @@
-"""A plan: point-to-point moves that show every gain, chosen for the experiment that they are made in (paper §2.3)."""
+"""A plan: point-to-point moves that show every gain, chosen for the experiment that they are made in (paper §2.3).
+
+The search exchanges moves and judges them by the worst gain's predicted standard deviation
+(ident/planning/excitation.py). The information of a plan is the sum over its moves. A changed target touches two moves,
+so a proposal costs two small sums and one factorisation; the regressors of a whole round of proposals are made at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import cycle
+from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +18,10 @@ from numpy.typing import NDArray
 from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
-from daq.workflow.experiment import Experiment, PlannedMove, duration_of, experiment_of
-from daq.workflow.plan_search import Search
-from drivers.motion.move import Trapezoid, synchronised
-from ident.model.kinematics import poses
-from ident.model.robot import JointKind
-from ident.planning.verdict import ExtraMoves
+from daq.workflow.experiment import POSITION_MARGIN, Experiment, PlannedMove, duration_of, experiment_of, path_of
+from drivers.motion.move import Trapezoid
+
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +41,232 @@ class Plan:
     units: tuple[JointUnit, ...]  #: in which people read the targets, one a joint
 
 
-def units_of(cell: Cell) -> tuple[JointUnit, ...]:
-    """Units of its joints."""
-    return tuple(axis.unit for axis in cell.axes)
+DWELL_S = 0.1
+NEAR = 0.15  #: Standard deviation of a near target, as a share of the joint's range
+ROUND = 8  #: Proposals whose regressors are made at once
+THINNING = 2  #: Every second row is enough to compare proposals by
+SHARPNESS = 8.0
+"""The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
+MIN_MOVES = 5
+MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
+MAX_RETREATS = 30
+MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
+PLACES = 3  #: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
+
+
+class Kind(Enum):
+    """Kind of a proposal."""
+
+    ANEW = "another target"
+    NEAR = "a target moved in some of the axes"
+    SWING = "one axis to the other end of its range, the others as they were"
+    SPEED = "another speed and acceleration"
+    INSERT = "one more move"
+    SHIFT = "a move taken out here and put in there"
+
+
+KINDS = tuple(Kind)
+CHANCES = (0.2, 0.25, 0.2, 0.15, 0.1, 0.1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Draft:
+    """Moves with the ways between them and the information of each way."""
+
+    moves: tuple[PlannedMove, ...]  #: the first only says where the run starts
+    paths: tuple[Trapezoid, ...]  #: of moves[1:]
+    informations: tuple[FloatArray, ...]  #: of moves[1:]
+
+
+class Search:
+    """Random moves, and their exchange."""
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        rng: np.random.Generator,
+        duration_s: float,
+        speed: float,
+        largest_condition: float,
+    ) -> None:
+        self._experiment = experiment
+        self._cell = experiment.cell
+        self._rng = rng
+        self._duration_s = duration_s
+        self._speed = speed
+        self._largest_condition = largest_condition
+        limits = np.array([axis.limits.position for axis in self._cell.axes])
+        margin = POSITION_MARGIN * (limits[:, 1] - limits[:, 0])
+        self._low, self._high = limits[:, 0] + margin, limits[:, 1] - margin
+
+    def random_moves(self) -> Draft:
+        """Clear random moves that fill the duration.
+
+        Raises:
+            UsageError: it has no room for five moves, or no clear way is found.
+        """
+        most: list[PlannedMove] = []
+        for _ in range(MAX_STARTS):
+            moves, paths = self._filled()
+            if len(moves) >= MIN_MOVES:
+                return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
+            most = max(most, moves, key=len)
+        found = f"room for {len(most)} moves"
+        raise _unfit(self._cell, self._duration_s, found, "at least 5, better 30", "allow a longer run")
+
+    def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
+        moves, paths = [self._clear_start()], list[Trapezoid]()
+        left, retreats = self._duration_s - DWELL_S, 0
+        while True:
+            move = self._clear_move(np.array(moves[-1].target_rad))
+            if move is not None:
+                path = path_of(self._cell, np.array(moves[-1].target_rad), move)
+                left -= path.duration_s + move.dwell_s
+                if left < 0.0:
+                    return moves, paths
+                moves.append(move)
+                paths.append(path)
+                continue
+            # A corner that the random targets before it led into.
+            retreats += 1
+            if retreats > MAX_RETREATS:
+                raise self._blocked("way")
+            if paths:
+                left += paths.pop().duration_s + moves.pop().dwell_s
+            else:
+                moves = [self._clear_start()]
+
+    def improve(self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]) -> Draft:
+        """Exchange moves; an exchange stays when it lowers the deviations and the run gets no longer than allowed."""
+        best, worst = self._judge(draft, np.inf)
+        done = 0
+        while done < tries:
+            count = min(ROUND, tries - done)
+            chosen = draft
+            # One a round: proposals that were made from the same moves do not go together.
+            for candidate in self._drafts(draft, [self._proposal(draft.moves) for _ in range(count)]):
+                value, found = self._judge(candidate, best)
+                if value < best:
+                    chosen, best, worst = candidate, value, found
+            draft = chosen
+            done += count
+            progress(done, worst)
+        return draft
+
+    def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
+        """Cost of the search, and the deviations [%]: nearly the worst, raised where W is too badly conditioned."""
+        information = np.sum(draft.informations, axis=0)
+        found = self._experiment.design.std_percent(information)
+        # Unseen gains are as bad as each other; the norm of inf would hide the rest.
+        bounded = np.minimum(found, 1e6)
+        worst = np.max(bounded)
+        value = float(worst * np.sum((bounded / worst) ** SHARPNESS) ** (1.0 / SHARPNESS))
+        if value < to_beat:  # the condition can only raise it
+            value *= max(1.0, self._experiment.design.condition(information) / self._largest_condition) ** 2
+        return value, found
+
+    def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
+        rng, low, high = self._rng, self._low, self._high
+        kind = KINDS[int(rng.choice(len(KINDS), p=CHANCES))]
+        index, other = (int(number) for number in rng.integers(len(moves), size=2))
+        before, old, after = moves[:index], moves[index], moves[index + 1 :]
+        random = self._random_move()
+        match kind:
+            case Kind.ANEW:
+                changed: tuple[PlannedMove, ...] = (*before, random, *after)
+            case Kind.NEAR:
+                step = rng.normal(0.0, NEAR, len(low)) * (high - low) * (rng.random(len(low)) < 0.5)
+                near = self._written(np.clip(np.array(old.target_rad) + step, low, high))
+                changed = (*before, replace(old, target_rad=near), *after)
+            case Kind.SWING:
+                axis = int(rng.integers(len(low)))
+                inwards = 0.25 * float(rng.random()) * (high[axis] - low[axis])
+                target = np.array(old.target_rad)
+                below = moves[max(index - 1, 0)].target_rad[axis] < 0.5 * (low[axis] + high[axis])
+                target[axis] = high[axis] - inwards if below else low[axis] + inwards
+                changed = (*before, replace(old, target_rad=self._written(target)), *after)
+            case Kind.SPEED:
+                speedy = replace(old, velocity=random.velocity, acceleration=random.acceleration)
+                changed = (*before, speedy, *after)
+            case Kind.INSERT:
+                changed = (*before, random, old, *after)
+            case Kind.SHIFT:
+                rest = (*before, *after)
+                changed = (*rest[:other], old, *rest[other:])
+        return changed
+
+    def _drafts(self, draft: Draft, proposals: Sequence[tuple[PlannedMove, ...]]) -> list[Draft]:
+        """The proposals that are short enough and whose new ways are clear, with their information."""
+        known = {
+            _way(pair): (path, information)
+            for pair, path, information in zip(pairwise(draft.moves), draft.paths, draft.informations, strict=True)
+        }
+        fresh: dict[_Way, Trapezoid] = {}
+        kept = []
+        for moves in proposals:
+            ways = [_way(pair) for pair in pairwise(moves)]
+            new = {way: path_of(self._cell, np.array(way[0]), way[1]) for way in ways if way not in known}
+            lengths = [new[way].duration_s if way in new else known[way][0].duration_s for way in ways]
+            # The time is quick to check, the clearance is not.
+            if sum(lengths) + sum(move.dwell_s for move in moves) > self._duration_s:
+                continue
+            obstruction = self._experiment.scene.checker.obstruction
+            if all(obstruction(path.start, path.end) is None for way, path in new.items() if way not in fresh):
+                kept.append((moves, ways))
+                fresh |= new
+        informations = self._experiment.informations(list(fresh.values()), THINNING)
+        known |= {
+            way: (path, information) for (way, path), information in zip(fresh.items(), informations, strict=True)
+        }
+        return [
+            Draft(moves, tuple(known[way][0] for way in ways), tuple(known[way][1] for way in ways))
+            for moves, ways in kept
+        ]
+
+    def _clear_start(self) -> PlannedMove:
+        for _ in range(MAX_TRIES):
+            move = self._random_move()
+            if self._experiment.scene.checker.margins(np.array(move.target_rad)[None])[0] > 0.0:
+                return move
+        raise self._blocked("posture")
+
+    def _clear_move(self, start: FloatArray) -> PlannedMove | None:
+        for _ in range(MAX_TRIES):
+            move = self._random_move()
+            if self._experiment.scene.checker.obstruction(start, np.array(move.target_rad)) is None:
+                return move
+        return None
+
+    def _random_move(self) -> PlannedMove:
+        # Slow and fast moves both: friction is distinguished from inertia by moves of different speed and acceleration.
+        return PlannedMove(
+            target_rad=self._written(self._rng.uniform(self._low, self._high)),
+            velocity=round(self._speed * float(self._rng.uniform(0.35, 1.0)), PLACES),
+            acceleration=round(self._speed * float(self._rng.uniform(0.4, 1.0)), PLACES),
+            dwell_s=DWELL_S,
+        )
+
+    def _written(self, target: FloatArray) -> tuple[float, ...]:
+        """As the plan file will say it: what is judged is what is made."""
+        units = [axis.unit.si for axis in self._cell.axes]
+        return tuple(round(float(value) / si, PLACES) * si for value, si in zip(target, units, strict=True))
+
+    def _blocked(self, what: str) -> UsageError:
+        found = f"no clear {what} among hundreds of random ones"
+        remedy = "correct `workspace` and `clearance` in the cell file, or the joint limits"
+        return _unfit(self._cell, self._duration_s, found, "room to move in", remedy)
+
+
+def _unfit(cell: Cell, duration_s: float, found: str, expected: str, remedy: str) -> UsageError:
+    subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
+    return UsageError(subject, found=found, expected=expected, remedy=remedy)
+
+
+_Way = tuple[tuple[float, ...], PlannedMove]
+
+
+def _way(pair: tuple[PlannedMove, PlannedMove]) -> _Way:
+    return pair[0].target_rad, pair[1]
 
 
 def plan(
@@ -81,22 +308,13 @@ def plan(
     information = np.sum(experiment.informations(draft.paths), axis=0)
     predicted, found = experiment.design.std_percent(information), experiment.design.condition(information)
     worst = int(np.argmax(predicted))
-    subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     remedy = "allow a longer run, more exchanges, wider joint limits or higher speed"
     if found > largest_condition:
-        raise UsageError(
-            subject,
-            found=f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges",
-            expected=f"at most {largest_condition:.0f}",
-            remedy=remedy,
-        )
+        words = f"condition {found:.0f} of the weighted observation matrix after {exchanges} exchanges"
+        raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy)
     if predicted[worst] > largest_std_percent:
-        raise UsageError(
-            subject,
-            found=f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}",
-            expected=f"at most {largest_std_percent:g} %",
-            remedy=remedy,
-        )
+        words = f"{predicted[worst]:.1f} % predicted for the gain of {cell.axes[worst].name}"
+        raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy)
     return Plan(
         cell=cell.name,
         seed=seed,
@@ -104,7 +322,7 @@ def plan(
         predicted_std_percent=tuple(predicted.tolist()),
         duration_s=duration_of(cell, draft.moves),
         moves=draft.moves,
-        units=units_of(cell),
+        units=tuple(axis.unit for axis in cell.axes),
     )
 
 
@@ -115,93 +333,3 @@ def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
         for move in plan_.moves
     )
     return replace(plan_, duration_s=duration_of(cell, moves), moves=moves)
-
-
-FloatArray = NDArray[np.float64]
-
-SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
-POSTURES = 300
-POSITION_MARGIN = 0.03
-SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
-STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
-
-
-def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
-    """Some five seconds of each kind, within limits and clear of everything; the same every time.
-
-    For every axis: fast with the arm stretched, fast with it folded (as the last link is seen from that axis), slow
-    with it stretched, and fast together with a neighbour; and of all axes together.
-    """
-    lower, upper = np.array([axis.limits.position for axis in experiment.cell.axes]).T
-    margin = POSITION_MARGIN * (upper - lower)
-    low, high = lower + margin, upper - margin
-    sampled = np.random.default_rng(0).uniform(low, high, (POSTURES, len(low)))
-    postures = sampled[experiment.scene.checker.margins(sampled) > 0.0]
-    names = experiment.cell.axis_names
-    found = []
-    for axis, name in enumerate(names):
-        lever = _levers(experiment, postures, axis)
-        stretched, folded = postures[np.argsort(-lever, kind="stable")], postures[np.argsort(lever, kind="stable")]
-        other = axis + 1 if axis + 1 < len(names) else axis - 1
-        kinds: list[tuple[str, FloatArray, tuple[int, ...], float]] = [
-            (f"fast moves of {name} with the arm stretched", stretched, (axis,), 1.0),
-            (f"fast moves of {name} with the arm folded", folded, (axis,), 1.0),
-            (f"slow moves of {name} with the arm stretched", stretched, (axis,), SLOW),
-        ]
-        if other >= 0:
-            kinds.append((f"fast moves of {name} and {names[other]} together", postures, (axis, other), 1.0))
-        found += [_swings(experiment, words, at, axes, speed, (low, high)) for words, at, axes, speed in kinds]
-    found.append(_swings(experiment, "fast moves of all axes", postures, tuple(range(len(names))), 1.0, (low, high)))
-    return tuple(extra for extra in found if extra is not None)
-
-
-def _levers(experiment: Experiment, postures: FloatArray, axis: int) -> FloatArray:
-    """Distance of the last link's frame from the axis; of a prismatic one, from the axis' own frame [m]."""
-    robot = experiment.design.expectation.model.robot
-    at = poses(robot, postures)
-    way = at.origin_m[-1] - at.origin_m[axis + 1]
-    if robot.joints[axis].kind is JointKind.PRISMATIC:
-        return np.asarray(np.linalg.norm(way, axis=1))
-    return np.asarray(np.linalg.norm(np.cross(at.rotation[axis + 1] @ robot.joints[axis].axis, way), axis=1))
-
-
-def _swings(
-    experiment: Experiment,
-    words: str,
-    postures: FloatArray,
-    axes: Sequence[int],
-    speed: float,
-    ends: tuple[FloatArray, FloatArray],
-) -> ExtraMoves | None:
-    """There and back in the first few postures in which that is clear; None when there are none."""
-    velocity = np.array([axis.limits.velocity for axis in experiment.cell.axes]) * speed
-    acceleration = np.array([axis.limits.acceleration for axis in experiment.cell.axes])
-    paths: list[Trapezoid] = []
-    for start, end in _clear_strokes(experiment, postures, axes, ends):
-        there = synchronised(start, end, velocity, acceleration)
-        paths += [there, Trapezoid(end, start, there.duration_s, there.ramp_s)]
-        if len(paths) >= 6:
-            break
-    chosen: list[Trapezoid] = []
-    seconds = 0.0
-    for path in cycle(paths):
-        chosen.append(path)
-        seconds += path.duration_s
-        if seconds >= SECONDS:
-            break
-    return ExtraMoves(words, seconds, experiment.excitation(chosen)[0]) if chosen else None
-
-
-def _clear_strokes(
-    experiment: Experiment, postures: FloatArray, axes: Sequence[int], ends: tuple[FloatArray, FloatArray]
-) -> Iterator[tuple[FloatArray, FloatArray]]:
-    low, high = ends
-    moved = list(axes)
-    for posture in postures:
-        for stroke in STROKES:
-            inwards = 0.5 * (1.0 - stroke) * (high - low)
-            start, end = posture.copy(), posture.copy()
-            start[moved], end[moved] = (low + inwards)[moved], (high - inwards)[moved]
-            if experiment.scene.checker.obstruction(start, end) is None:
-                yield start, end
-                break

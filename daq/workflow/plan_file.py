@@ -14,7 +14,7 @@ from daq.config.yaml_file import StrictModel, parse_yaml, read_bytes, read_model
 from daq.errors import ConfigurationInconsistent
 from daq.files import replace_file
 from daq.workflow.experiment import PlannedMove, duration_of, paths_of, scene_of
-from daq.workflow.plan import Plan, units_of
+from daq.workflow.plan import Plan
 from ident.planning.clearance import Checker
 
 LONGEST_S = 3600.0
@@ -84,28 +84,18 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     """
     model = read_model(parse_yaml(read_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
-        raise ConfigurationInconsistent(
-            str(path),
-            found=f"a plan for cell {model.cell!r}",
-            expected=f"one for {cell.name!r}",
-            remedy="make a plan for this cell: `drivegain plan CELL`",
-        )
+        remedy = "make a plan for this cell: `drivegain plan CELL`"
+        raise _refused(str(path), f"a plan for cell {model.cell!r}", f"one for {cell.name!r}", remedy)
     if len(model.predicted_std_percent) not in (0, len(cell.axes)):
-        raise ConfigurationInconsistent(
-            f"{path}: predicted_std_percent",
-            found=f"{len(model.predicted_std_percent)} numbers",
-            expected=f"{len(cell.axes)}, one a gain",
-            remedy="make the plan anew: `drivegain plan CELL`",
-        )
+        found = f"{len(model.predicted_std_percent)} numbers"
+        remedy = "make the plan anew: `drivegain plan CELL`"
+        raise _refused(f"{path}: predicted_std_percent", found, f"{len(cell.axes)}, one a gain", remedy)
     moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
     duration_s = duration_of(cell, moves)
     if duration_s > LONGEST_S:
-        raise ConfigurationInconsistent(
-            f"{path}: moves",
-            found=f"{duration_s:.0f} s of moves and dwells",
-            expected=f"at most {LONGEST_S:.0f} s",
-            remedy="leave moves out, or raise velocity and acceleration",
-        )
+        found = f"{duration_s:.0f} s of moves and dwells"
+        remedy = "leave moves out, or raise velocity and acceleration"
+        raise _refused(f"{path}: moves", found, f"at most {LONGEST_S:.0f} s", remedy)
     _check_room(path, cell, moves)
     return Plan(
         cell=model.cell,
@@ -114,7 +104,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         predicted_std_percent=model.predicted_std_percent,
         duration_s=duration_s,
         moves=moves,
-        units=units_of(cell),
+        units=tuple(axis.unit for axis in cell.axes),
     )
 
 
@@ -122,33 +112,27 @@ def _key(units: tuple[JointUnit, ...]) -> str:
     return "target_deg" if all(unit == DEGREE for unit in units) else "target"
 
 
+def _refused(where: str, found: str, expected: str, remedy: str = "correct the move") -> ConfigurationInconsistent:
+    return ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
+
+
 def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
     key = "target_deg" if move.target is None else "target"
     values = move.target_deg or move.target or ()
     where = f"{path}: moves[{number}].{key}"
-    expected_key = _key(units_of(cell))
+    expected_key = _key(tuple(axis.unit for axis in cell.axes))
     if key != expected_key:
         units = ", ".join(f"{axis.name} {axis.unit.name}" for axis in cell.axes)
-        raise ConfigurationInconsistent(
-            where, found=key, expected=f"{expected_key} ({units})", remedy="correct the move"
-        )
+        raise _refused(where, key, f"{expected_key} ({units})")
     if len(values) != len(cell.axes):
-        raise ConfigurationInconsistent(
-            where,
-            found=f"{len(values)} positions",
-            expected=f"{len(cell.axes)}, one a joint",
-            remedy="correct the move",
-        )
+        raise _refused(where, f"{len(values)} positions", f"{len(cell.axes)}, one a joint")
     target = tuple(value * axis.unit.si for value, axis in zip(values, cell.axes, strict=True))
     for axis, position in zip(cell.axes, target, strict=True):
         lower, upper = axis.limits.position
         if not lower <= position <= upper:
-            raise ConfigurationInconsistent(
-                f"{where}, {axis.name}",
-                found=axis.unit.spell(position),
-                expected=f"{axis.unit.spell(lower)} to {axis.unit.spell(upper)}, the joint's limits",
-                remedy="correct the move, or the limits if they are wrong",
-            )
+            expected = f"{axis.unit.spell(lower)} to {axis.unit.spell(upper)}, the joint's limits"
+            remedy = "correct the move, or the limits if they are wrong"
+            raise _refused(f"{where}, {axis.name}", axis.unit.spell(position), expected, remedy)
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
 
 
@@ -164,9 +148,9 @@ def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
         found = checker.obstruction(np.asarray(way.start), np.asarray(way.end))
         if found is not None:
             where = ", ".join(axis.unit.spell(p) for axis, p in zip(cell.axes, found.position, strict=True))
-            raise ConfigurationInconsistent(
+            raise _refused(
                 f"{path}: moves[{number}], on the way there",
-                found=f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})",
-                expected=f"at least {1000 * cell.clearance.minimum_m:.0f} mm",
-                remedy="correct the move, or `workspace` and `clearance` in the cell file",
+                f"{1000 * found.distance_m:.0f} mm between {found.first} and {found.second} at ({where})",
+                f"at least {1000 * cell.clearance.minimum_m:.0f} mm",
+                "correct the move, or `workspace` and `clearance` in the cell file",
             )

@@ -93,10 +93,6 @@ class Recorded:
 def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> CanopenNetwork:
     """The amplifiers of a cell; use it as a context manager.
 
-    Args:
-        cell: its file.
-        block_signals: keeps signals away while the axes are stopped.
-
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
@@ -127,19 +123,13 @@ def record(
     """Make a plan's moves and log every sample.
 
     Args:
-        cell_file: of the cell; it goes into the log with all it refers to.
-        cell: what it says.
-        plan: the moves.
+        cell_file: goes into the log with all it refers to.
         out: log to write; must not exist.
         payload: what is mounted, None without load.
         operator: person or job responsible for the recording.
         granted_by: who allows the motion; None refuses it.
-        run_id: unique.
-        speed: share of its planned speed that the plan's moves have been given (`daq.workflow.plan.slowed`), for the
-        log.
+        speed: share of its planned speed that the moves have been given (`daq.workflow.plan.slowed`), for the log.
         entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
-        clocks: wall and monotonic time.
-        free: room on the disk of a folder.
         block_signals: keeps signals away while the axes are stopped.
         progress: receives the number of finished moves and of all.
         before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it
@@ -234,12 +224,6 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
 
     Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
     confirm; if it were only closed, that would be lost.
-
-    Args:
-        samples: of `drivers.motion.execute.execute`.
-        log: open.
-        room: for it.
-        check_every: samples, between two looks at the room.
 
     Raises:
         DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.

@@ -19,7 +19,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
 
 from daq.config.cell import Bus, Cell, WeighedPayload
-from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError
+from daq.errors import BusTaken, DiskSpaceShort, OutputFailed, UsageError, writing
 from daq.files import hold_lock
 from daq.log.message import joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
@@ -82,15 +82,14 @@ def _address(bus: Bus) -> str:
     except (OSError, UnicodeError):
         return bus.host.lower()
     # Servers of names answer in changing order; and whether a hub is reached by IPv4 or IPv6, it is one.
-    address = min((_unmapped(str(where[0])) for *_, where in found), key=lambda one: (one.version, str(one)))
+    addresses: list[IPv4Address | IPv6Address] = []
+    for *_, where in found:
+        address = ip_address(str(where[0]))
+        # One of IPv4 within IPv6 (::ffff:10.0.0.7) is that of IPv4.
+        addresses.append((address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address)
+    address = min(addresses, key=lambda one: (one.version, str(one)))
     # Who connects to the unspecified address comes to this machine, as by a loopback address.
     return "localhost" if address.is_loopback or address.is_unspecified else str(address)
-
-
-def _unmapped(written: str) -> IPv4Address | IPv6Address:
-    """An address; of one of IPv4 within IPv6 (::ffff:10.0.0.7) that of IPv4."""
-    address = ip_address(written)
-    return (address.ipv4_mapped or address) if isinstance(address, IPv6Address) else address
 
 
 def _shared_folder() -> Path:
@@ -117,14 +116,7 @@ def free_bytes(folder: Path) -> int:
 
 
 def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float, attached: Mapping[str, bytes]) -> int:
-    """Size of a log at most: as if nothing could be compressed [bytes].
-
-    Args:
-        names: of the axes.
-        rate_hz: samples a second.
-        duration_s: of the run [s].
-        attached: files at its start, by name.
-    """
+    """Size of a log at most: as if nothing could be compressed [bytes]."""
     state = joint_state_bytes(joint_state_prefix(names), 0, [0.0] * len(names))
     of_samples = rate_hz * (sample_dtype(len(names)).itemsize + INDEX_BYTES)
     of_states = 1e9 / JOINT_STATE_NS * (MESSAGE_HEAD_BYTES + len(state) + INDEX_BYTES)
@@ -133,12 +125,7 @@ def largest_log_bytes(names: tuple[str, ...], rate_hz: float, duration_s: float,
 
 
 class DiskRoom:
-    """The room for one log.
-
-    Args:
-        log: to be written.
-        free: free bytes of a folder's disk.
-    """
+    """The room for one log."""
 
     def __init__(self, log: Path, free: FreeBytes = free_bytes) -> None:
         self._log = log
@@ -151,15 +138,11 @@ class DiskRoom:
             DiskSpaceShort: there is less than that, and a reserve.
             OutputFailed: there is no such folder.
         """
-        free = self._ask()
-        if free < needed_bytes + RESERVE_BYTES:
-            raise DiskSpaceShort(
-                str(self._log.parent),
-                found=f"{_megabytes(free)} free",
-                expected=f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in "
-                "reserve",
-                remedy="nothing has moved; free space, name a folder on another disk, or plan a shorter run",
-            )
+        self._require(
+            needed_bytes + RESERVE_BYTES,
+            f"{_megabytes(needed_bytes)} for the log of this plan and {_megabytes(RESERVE_BYTES)} in reserve",
+            "nothing has moved; free space, name a folder on another disk, or plan a shorter run",
+        )
 
     def check(self) -> None:
         """Ask while the log grows.
@@ -168,21 +151,18 @@ class DiskRoom:
             DiskSpaceShort: the reserve is all that is left.
             OutputFailed: the folder has gone.
         """
-        free = self._ask()
-        if free < RESERVE_BYTES:
-            raise DiskSpaceShort(
-                str(self._log),
-                found=f"{_megabytes(free)} left on its disk",
-                expected=f"{_megabytes(RESERVE_BYTES)} in reserve",
-                remedy="the axes were sent a stop; the log up to there is finished and marked invalid: free space and "
-                "record again",
-            )
+        self._require(
+            RESERVE_BYTES,
+            f"{_megabytes(RESERVE_BYTES)} in reserve",
+            "the axes were sent a stop; the log up to there is finished and marked invalid: free space, record again",
+        )
 
-    def _ask(self) -> int:
-        try:
-            return self._free(self._log.parent)
-        except OSError as error:
-            raise OutputFailed.of(self._log.parent, error) from error
+    def _require(self, least_bytes: int, expected: str, remedy: str) -> None:
+        with writing(self._log.parent):
+            free = self._free(self._log.parent)
+        if free < least_bytes:
+            found = f"{_megabytes(free)} left on its disk"
+            raise DiskSpaceShort(str(self._log), found=found, expected=expected, remedy=remedy)
 
 
 def _megabytes(number: int) -> str:
@@ -191,10 +171,6 @@ def _megabytes(number: int) -> str:
 
 def check_currents(cell: Cell, readings: Sequence[ScaleReading]) -> tuple[str, ...]:
     """Hold each drive's torque constant against the cell's nameplate gain, g = N·Gt·Kt (paper eq. 4).
-
-    Args:
-        cell: with nameplate gains and drive train.
-        readings: of its drives, in the order of the axes (drivers.scale.read_scale).
 
     Returns:
         What people must know of the recorded currents: no reference, what could not be checked, what fits badly.
@@ -231,11 +207,6 @@ def agree(one_kg: float, other_kg: float, within_kg: float) -> bool:
 
 def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | None) -> None:
     """Refuse a mass from the scale that is not the cell file's, before anything moves.
-
-    Args:
-        cell: with the tolerance.
-        payload: that is mounted, with the mass of the cell file.
-        entered_kg: from the scale; None where none was entered.
 
     Raises:
         UsageError: it differs by more than the payload's `mass_tolerance_kg`, or nothing is mounted.

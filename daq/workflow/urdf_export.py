@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
-from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell
-from daq.errors import ConfigurationMissing, SchemaMismatch
+from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
+from daq.writeback.formats.xml_document import Element, parse
 from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.model.bodies import Body
@@ -74,9 +74,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     Args:
         calibration: its gains, payloads and effects take no part; an axis with an accepted effect of friction may have
             any sign of fv and fs, because they are only a part of its friction.
-        model: the declared model of its robot.
         limits: ranges in which the torques are compared, as of `ident.physical.regrouping.random_motion`, shape (4, n).
-        urdf: for the prior.
 
     Raises:
         ModelError: the calibration is of another robot.
@@ -110,51 +108,39 @@ def cell_limits(cell: Cell) -> FloatArray:
 
 MAX_BYTES = 16 * 2**20  #: No URDF is larger; meshes are files of their own
 MAX_DEPTH = 64  #: Elements in elements; a URDF has five or so, and readers that recurse end at some depth
-_TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=>/]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*(/?)>")
-
-
-@dataclass(slots=True)
-class Element:
-    """One element at or below the level of links and joints."""
-
-    name: str  #: of its tag
-    attributes: dict[str, str]  #: as given
-    start: int  #: offsets of '<', behind the start tag, and behind the whole element
-    tag_end: int  #: offsets of '<', behind the start tag, and behind the whole element
-    empty: bool  #: written as <name/>
-    end: int = -1  #: offsets of '<', behind the start tag, and behind the whole element
-    children: list[Element] = field(default_factory=list)  #: one level further down
+_TAG = re.compile(rb"<[^\s/>]+(?:\s+[^\s=>/]+\s*=\s*(?:\"[^\"]*\"|'[^']*'))*\s*/?>")
 
 
 @dataclass(frozen=True, slots=True)
 class Markup:
     """The elements of a URDF."""
 
-    file: str  #: what messages call it
+    file: str  #: name in messages
+    content: bytes  #: of the file
     root: Element  #: <robot>
-    head_comments: tuple[tuple[int, int], ...]  #: start and end of comments before it
     links: Mapping[str, Element]  #: by their names
     joints: Mapping[str, Element]  #: by their names
-    fixed: Mapping[str, tuple[str, ...]]  #: links that fixed joints hold to a link, by its name
+    fixed: Mapping[str, Sequence[str]]  #: links that fixed joints hold to a link, by its name
 
-    def joint(self, name: str) -> Element:
-        """The joint of this name.
+    @property
+    def newline(self) -> bytes:
+        """Line end of the file."""
+        return b"\r\n" if b"\r\n" in self.content else b"\n"
 
-        Raises:
-            SchemaMismatch: there is none.
-        """
-        return self._named(self.joints, "joint", name)
-
-    def link(self, name: str) -> Element:
-        """The link of this name.
+    def find(self, kind: str, name: str) -> Element:
+        """Return the link or joint of this name.
 
         Raises:
             SchemaMismatch: there is none.
         """
-        return self._named(self.links, "link", name)
+        elements = self.links if kind == "link" else self.joints
+        if name not in elements:
+            known = ", ".join(sorted(elements)) or "none"
+            raise refused(self.file, f"no {kind} {name!r} (there are {known})", "the robot of the calibration")
+        return elements[name]
 
     def only(self, element: Element, name: str) -> Element | None:
-        """The child of this name, None without one.
+        """Return the child of this name, None without one.
 
         Raises:
             SchemaMismatch: there are several; readers differ in which of them counts.
@@ -165,19 +151,31 @@ class Markup:
             raise refused(self.file, f"{len(found)} <{name}> in {what}", "at most one", "remove the wrong one")
         return found[0] if found else None
 
-    def child_of(self, joint: str) -> str:
-        """Name of the link that a joint moves.
+    def tag_end(self, element: Element) -> int:
+        """Return the offset behind an element's start tag.
 
         Raises:
-            SchemaMismatch: it names none.
+            SchemaMismatch: the tag cannot be read.
         """
-        return _end(self.file, self.joint(joint), "child")
+        tag = _TAG.match(self.content, element.start)
+        if tag is None:
+            found = f"a tag <{element.name}> that cannot be read at byte {element.start}"
+            raise refused(self.file, found, "plain XML")
+        return tag.end()
 
-    def _named(self, elements: Mapping[str, Element], kind: str, name: str) -> Element:
-        if name not in elements:
-            known = ", ".join(sorted(elements)) or "none"
-            raise refused(self.file, f"no {kind} {name!r} (there are {known})", "the robot of the calibration")
-        return elements[name]
+    def end(self, element: Element) -> int:
+        """Return the offset behind a whole element."""
+        tag_end = self.tag_end(element)
+        return tag_end if self.is_empty(element) else self.content.index(b">", element.end) + 1
+
+    def is_empty(self, element: Element) -> bool:
+        """Whether an element is written as <name/>."""
+        return self.content.startswith(b"/>", self.tag_end(element) - 2)
+
+    def indentation(self, at: int) -> bytes:
+        """Return the space before an offset in its line; empty where something else is before it."""
+        line = self.content[self.content.rfind(b"\n", 0, at) + 1 : at]
+        return line if not line.strip() else b""
 
 
 def parse_markup(content: bytes, file: str) -> Markup:
@@ -191,24 +189,33 @@ def parse_markup(content: bytes, file: str) -> Markup:
         raise refused(file, f"{len(content)} bytes", f"at most {MAX_BYTES}")
     try:
         content.decode("utf-8")
+        around, encoding = parse(content, file)
     except UnicodeDecodeError as error:
         raise refused(file, str(error), "UTF-8", "save it as UTF-8") from error
-    reader = _Reader(content, file)
-    try:
-        reader.parse()
-    except expat.ExpatError as error:
-        raise refused(file, str(error), "well-formed XML", "correct the file") from error
-    root = reader.root
-    if root is None or root.name != "robot":
-        raise refused(file, "no <robot>" if root is None else f"<{root.name}>", "a URDF, <robot> around all")
-    links = _by_name(file, root, "link")
-    joints = _by_name(file, root, "joint")
-    fixed: dict[str, tuple[str, ...]] = {}
-    for joint in joints.values():
+    except ControllerUnfit as error:
+        expected = "well-formed XML without a document type: a URDF needs no entities"
+        raise refused(file, error.found, expected, "correct the file") from error
+    if encoding.lower() not in {"utf-8", "us-ascii", "ascii"}:
+        raise refused(file, f"encoding {encoding!r}", "UTF-8", "save it as UTF-8")
+    (root,) = level = around.children
+    if root.name != "robot":
+        raise refused(file, f"<{root.name}>", "a URDF, <robot> around all")
+    for _ in range(MAX_DEPTH):
+        level = [child for element in level for child in element.children]
+    if level:
+        raise refused(file, f"more than {MAX_DEPTH} elements in each other", "a URDF")
+    named: dict[str, dict[str, Element]] = {"link": {}, "joint": {}}
+    for element in root.children:
+        if element.name in named:
+            name = element.attributes.get("name", "")
+            if name in named[element.name]:
+                raise refused(file, f"two of <{element.name} name={name!r}>", "a name for each")
+            named[element.name][name] = element
+    fixed: dict[str, list[str]] = {}
+    for joint in named["joint"].values():
         if joint.attributes.get("type") == "fixed":
-            parent = _end(file, joint, "parent")
-            fixed[parent] = (*fixed.get(parent, ()), _end(file, joint, "child"))
-    return Markup(file, root, tuple(reader.comments), links, joints, fixed)
+            fixed.setdefault(_link_of(file, joint, "parent"), []).append(_link_of(file, joint, "child"))
+    return Markup(file, content, root, named["link"], named["joint"], fixed)
 
 
 def refused(file: str, found: str, expected: str, remedy: str = "give another URDF") -> SchemaMismatch:
@@ -216,72 +223,10 @@ def refused(file: str, found: str, expected: str, remedy: str = "give another UR
     return SchemaMismatch(file, found=found, expected=expected, remedy=remedy)
 
 
-class _Reader:
-    """Offsets from expat; entities are refused where they could be defined, so none is ever expanded."""
-
-    def __init__(self, content: bytes, file: str) -> None:
-        self.content = content
-        self.file = file
-        self.root: Element | None = None
-        self.comments: list[tuple[int, int]] = []
-        self._open: list[Element] = []
-        self._parser = expat.ParserCreate()
-        self._parser.XmlDeclHandler = self._declaration
-        self._parser.StartDoctypeDeclHandler = self._document_type
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._stop
-        self._parser.CommentHandler = self._comment
-
-    def parse(self) -> None:
-        """Read all of it."""
-        self._parser.Parse(self.content, True)
-
-    def _declaration(self, _version: str, encoding: str | None, _standalone: int) -> None:
-        if encoding is not None and encoding.lower() not in {"utf-8", "us-ascii", "ascii"}:
-            raise refused(self.file, f"encoding {encoding!r}", "UTF-8", "save it as UTF-8")
-
-    def _document_type(self, name: str, *_: object) -> None:
-        raise refused(self.file, f"a document type declaration {name!r}", "none: a URDF needs no entities")
-
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if len(self._open) >= MAX_DEPTH:
-            raise refused(self.file, f"more than {MAX_DEPTH} elements in each other", "a URDF")
-        start = self._parser.CurrentByteIndex
-        tag = _TAG.match(self.content, start)
-        if tag is None:
-            raise refused(self.file, f"a tag <{name}> that cannot be read at byte {start}", "plain XML")
-        element = Element(name, attributes, start, tag.end(), empty=tag.group(1) == b"/")
-        if self._open:
-            self._open[-1].children.append(element)
-        else:
-            self.root = element
-        self._open.append(element)
-
-    def _stop(self, _name: str) -> None:
-        element = self._open.pop()
-        element.end = element.tag_end if element.empty else self.content.index(b">", self._parser.CurrentByteIndex) + 1
-
-    def _comment(self, _text: str) -> None:
-        if self.root is None:
-            start = self._parser.CurrentByteIndex
-            self.comments.append((start, self.content.index(b"-->", start) + 3))
-
-
-def _by_name(file: str, root: Element, kind: str) -> dict[str, Element]:
-    found: dict[str, Element] = {}
-    for element in root.children:
-        if element.name == kind:
-            name = element.attributes.get("name", "")
-            if name in found:
-                raise refused(file, f"two of <{kind} name={name!r}>", "a name for each")
-            found[name] = element
-    return found
-
-
-def _end(file: str, joint: Element, which: str) -> str:
-    named = [child.attributes.get("link") for child in joint.children if child.name == which]
+def _link_of(file: str, joint: Element, end: str) -> str:
+    named = [child.attributes.get("link") for child in joint.children if child.name == end]
     if len(named) != 1 or named[0] is None:
-        raise refused(file, f"joint {joint.attributes.get('name')!r} without one <{which} link=...>", "one")
+        raise refused(file, f"joint {joint.attributes.get('name')!r} without one <{end} link=...>", "one")
     return named[0]
 
 
@@ -317,8 +262,6 @@ def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], pr
     elements and attributes are the same bytes as before.
 
     Args:
-        content: the user's file.
-        name: what to call it in messages.
         joints: of every moving joint, by its name.
         provenance: for the comment at the head; one of an earlier export is replaced.
 
@@ -327,23 +270,20 @@ def update_urdf(content: bytes, name: str, joints: Mapping[str, JointUpdate], pr
             joints or links, or two inertias in one.
     """
     markup = parse_markup(content, name)
-    newline = b"\r\n" if b"\r\n" in content else b"\n"
-    edits: list[tuple[int, int, bytes]] = []
+    edits = [_header(markup, provenance)]
     links: dict[str, str] = {}
     merged: list[str] = []
     for joint, update in joints.items():
-        element = markup.joint(joint)
-        link = markup.child_of(joint)
-        links[joint] = link
-        inertial = "\n".join(_inertial(update.body)).encode().replace(b"\n", newline)
-        edits.append(_put(content, markup.link(link), markup.only(markup.link(link), "inertial"), inertial, newline))
-        edits.append(_dynamics(content, element, markup.only(element, "dynamics"), update, newline))
-        for other in _held_by(link, markup.fixed):
-            old = markup.only(markup.link(other), "inertial")
+        element = markup.find("joint", joint)
+        links[joint] = _link_of(name, element, "child")
+        link = markup.find("link", links[joint])
+        edits.append(_put(markup, link, markup.only(link, "inertial"), _inertial(update.body)))
+        edits.append(_dynamics(markup, element, update))
+        for other in _held_by(links[joint], markup.fixed):
+            old = markup.only(markup.find("link", other), "inertial")
             if old is not None:
                 merged.append(other)
-                edits.append((old.start, old.end, _MERGED))
-    edits.append(_header(content, markup.root, markup.head_comments, provenance, newline))
+                edits.append((old.start, markup.end(old), _MERGED))
     out = content
     for start, end, replacement in sorted(edits, reverse=True):
         out = out[:start] + replacement + out[end:]
@@ -356,66 +296,59 @@ def _held_by(link: str, fixed: Mapping[str, Sequence[str]]) -> Iterator[str]:
         yield from _held_by(child, fixed)
 
 
-def _inertial(body: Body) -> tuple[str, ...]:
+_Edit = tuple[int, int, bytes]  #: Start and end of what is replaced, and what replaces it
+
+
+def _inertial(body: Body) -> list[str]:
     x, y, z = (repr(float(value)) for value in body.centre_m)
     values = " ".join(
         f'i{"xyz"[row]}{"xyz"[column]}="{float(body.inertia_kg_m2[row, column])!r}"'
         for row, column in zip(*np.triu_indices(3), strict=True)
     )
-    return (
+    return [
         "<inertial>",
         f'  <origin xyz="{x} {y} {z}" rpy="0 0 0"/>',
         f'  <mass value="{body.mass_kg!r}"/>',
         f"  <inertia {values}/>",
         "</inertial>",
-    )
+    ]
 
 
-def _put(content: bytes, parent: Element, old: Element | None, new: bytes, newline: bytes) -> tuple[int, int, bytes]:
-    """Edit that puts an element in the place of the old one, or first into its parent."""
+def _put(markup: Markup, parent: Element, old: Element | None, lines: list[str]) -> _Edit:
+    """Put an element in the place of the old one, or first into its parent."""
+    new = [line.encode() for line in lines]
     if old is not None:
-        return old.start, old.end, new.replace(newline, newline + _indentation(content, old.start))
-    inner = newline + _indentation(content, parent.start) + b"  "
-    text = inner + new.replace(newline, inner)
-    if not parent.empty:
-        return parent.tag_end, parent.tag_end, text
-    close = newline + _indentation(content, parent.start) + b"</" + parent.name.encode() + b">"
-    slash = content.rindex(b"/", parent.start, parent.tag_end)
-    return slash, parent.tag_end, b">" + text + close
+        return old.start, markup.end(old), (markup.newline + markup.indentation(old.start)).join(new)
+    indentation = markup.indentation(parent.start)
+    inner = markup.newline + indentation + b"  "
+    text = inner + inner.join(new)
+    tag_end = markup.tag_end(parent)
+    if not markup.is_empty(parent):
+        return tag_end, tag_end, text
+    close = markup.newline + indentation + b"</" + parent.name.encode() + b">"
+    return markup.content.rindex(b"/", parent.start, tag_end), tag_end, b">" + text + close
 
 
-def _dynamics(
-    content: bytes, joint: Element, old: Element | None, update: JointUpdate, newline: bytes
-) -> tuple[int, int, bytes]:
-    values = {"damping": repr(update.damping), "friction": repr(update.friction)}
+def _dynamics(markup: Markup, joint: Element, update: JointUpdate) -> _Edit:
+    values = {key: f'{key}="{value!r}"' for key, value in (("damping", update.damping), ("friction", update.friction))}
+    old = markup.only(joint, "dynamics")
     if old is None:
-        text = "<dynamics " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
-        return _put(content, joint, None, text.encode(), newline)
-    tag = content[old.start : old.tag_end]
-    for key, value in values.items():
-        written = f'{key}="{value}"'.encode()
+        return _put(markup, joint, None, [f"<dynamics {' '.join(values.values())}/>"])
+    tag_end = markup.tag_end(old)
+    tag = markup.content[old.start : tag_end]
+    for key, written in values.items():
         given = re.search(rb"(?<=\s)" + key.encode() + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", tag)
         first = len(b"<dynamics")
-        tag = tag[:first] + b" " + written + tag[first:] if given is None else _spliced(tag, given, written)
-    return old.start, old.tag_end, tag
+        start, end = (first, first) if given is None else given.span()
+        tag = tag[:start] + (b" " if given is None else b"") + written.encode() + tag[end:]
+    return old.start, tag_end, tag
 
 
-def _spliced(text: bytes, at: re.Match[bytes], new: bytes) -> bytes:
-    return text[: at.start()] + new + text[at.end() :]
-
-
-def _header(
-    content: bytes, root: Element, comments: Sequence[tuple[int, int]], provenance: str, newline: bytes
-) -> tuple[int, int, bytes]:
+def _header(markup: Markup, provenance: str) -> _Edit:
     # Two hyphens would end the comment's text (XML 1.0, 2.5).
     said = re.sub("-(?=-)|-$", "~", "".join(c if c.isprintable() else " " for c in provenance))
     comment = f"<!-- format: {FORMAT}. {said} -->".encode()
-    for start, end in comments:
-        if f"format: {FORMAT}".encode() in content[start:end]:
-            return start, end, comment
-    return root.start, root.start, comment + newline
-
-
-def _indentation(content: bytes, at: int) -> bytes:
-    line = content[content.rfind(b"\n", 0, at) + 1 : at]
-    return line if not line.strip() else b""
+    for earlier in re.finditer(rb"(?s)<!--.*?-->", markup.content[: markup.root.start]):
+        if f"format: {FORMAT}".encode() in earlier[0]:
+            return *earlier.span(), comment
+    return markup.root.start, markup.root.start, comment + markup.newline

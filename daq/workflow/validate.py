@@ -1,11 +1,16 @@
-"""A calibration put to the test: what it predicts of a run, beside what was measured, under the filter of the fit."""
+"""A calibration put to the test: what it predicts of a run, beside what was measured, under the filter of the fit.
+
+Several calibrations are compared on runs that they may never have seen (paper §4.3, Tables 5 to 8).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +22,15 @@ from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
+from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.rows import row_filter, row_masks
-from ident.errors import DataUnfit
+from ident.errors import DataUnfit, IdentificationError
 from ident.estimators.estimate import RelativeError, relative_error
+from ident.estimators.least_squares import wls
+from ident.estimators.payload_estimate import as_one_body, joined, payload_beside_bare_runs, payload_on_known_robot
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-from ident.prediction import measured_torque, predict_torque
+from ident.prediction import measured_torque, predict_torque, standard_parameters
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -44,7 +52,7 @@ class Validation:
         log: where the run was read.
         run: its name.
         digest: of the log (sha256, hex).
-        acquaintance: whether the fit has seen it.
+        data_use: whether the fit has seen it.
         same_configuration: the log carries the cell configuration that the calibration was made with.
         partial: the log was salvaged from a recording that never finished.
         time_s: of each row, since the start of the run, shape (r,).
@@ -91,13 +99,10 @@ def validate(calibration: Calibration, logs: Sequence[Path], cell: Cell | None =
     """
     conditioning = conditioning_of(calibration)
     validations: list[Validation] = []
-    known: tuple[str, Model] | None = None
     for log in logs:
         run, described = load_run(log, cell)
         check_cell(calibration, log, described)
-        if known is None or known[0] != described.digest:
-            known = (described.digest, model_of(described))
-        validations.append(predicted(calibration, conditioning, known[1], log, run, described.digest))
+        validations.append(predicted(calibration, conditioning, model_of(described), log, run, described.digest))
     return tuple(validations)
 
 
@@ -117,23 +122,17 @@ def conditioning_of(calibration: Calibration) -> Conditioning:
         CalibrationUnreadable: they are not all there.
     """
     expected = Conditioning().document()
-    found = calibration.filter
-    numbers = {name: value for name, value in found.items() if not isinstance(value, list)}
-    speeds = found.get("standstill_rad_s")
-    if not isinstance(speeds, list) or numbers.keys() | {"standstill_rad_s"} != expected.keys():
+    found: dict[str, Any] = dict(calibration.filter)
+    lists = [name for name, value in found.items() if isinstance(value, list)]
+    if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
         raise CalibrationUnreadable(
             f"calibration of cell {calibration.cell!r}, filter",
             found=", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing",
             expected=f"a list standstill_rad_s and numbers {', '.join(sorted(expected.keys() - {'standstill_rad_s'}))}",
             remedy="fit the logs again with this drivegain",
         )
-    return Conditioning(
-        position_cutoff_hz=numbers["position_cutoff_hz"],
-        position_order=round(numbers["position_order"]),
-        decimation_cutoff_hz=numbers["decimation_cutoff_hz"],
-        standstill_rad_s=tuple(speeds),
-        standstill_share=numbers["standstill_share"],
-    )
+    order, speeds = round(found.pop("position_order")), tuple(found.pop("standstill_rad_s"))
+    return Conditioning(**found, position_order=order, standstill_rad_s=speeds)
 
 
 def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
@@ -153,12 +152,7 @@ def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
 
 
 def unpredictable(calibration: Calibration, payload: Payload | None) -> str:
-    """Why a calibration says nothing of a run with this payload; empty where it does.
-
-    Args:
-        calibration: whose payload parameters are named by their mounting.
-        payload: as the log has it, None without load.
-    """
+    """Why a calibration says nothing of a run with this payload; empty where it does."""
     if payload is None or set(payload.known) == set(LINK_PARAMETERS):
         return ""
     if "m" not in payload.known:
@@ -173,18 +167,23 @@ def predicted(
 ) -> Validation:
     """One run under one calibration.
 
-    Args:
-        calibration: with gains and parameters.
-        conditioning: `conditioning_of` the calibration.
-        model: of the log's cell.
-        log: where the run was read.
-        run: of that log.
-        configuration_sha256: of the cell that the log carries.
-
     Raises:
         IdentificationError: the calibration cannot speak of this run.
     """
-    run = replace(run, payload=_left_to_the_log(calibration, run))
+    payload = run.payload
+    if payload is not None:
+        # What the calibration itself says of it, given or identified, is not taken from the log.
+        own = _of_mounting(calibration, payload)
+        mass, weighed = own.get("m"), payload.known.get("m")
+        if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
+            raise DataUnfit(
+                run.name,
+                f"carries {weighed:g} kg on mounting {payload.mounting!r}; the calibration has {mass.value:g} kg: "
+                "give each way of mounting a name of its own",
+            )
+        left = {name: value for name, value in payload.known.items() if name not in own}
+        run = replace(run, payload=replace(payload, known=left))
+    roles = {source.role for source in calibration.sources if source.sha256 == run.digest}
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model.drive_train, data, conditioning)
@@ -194,7 +193,7 @@ def predicted(
         log=log,
         run=run.name,
         digest=run.digest,
-        data_use=_data_use(calibration, run.digest),
+        data_use=DataUse.FIT if "fit" in roles else DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW,
         same_configuration=configuration_sha256 == calibration.configuration_sha256,
         partial=run.partial,
         time_s=data.time_s[filter_.centres(len(data.time_s))] - data.time_s[0],
@@ -204,28 +203,170 @@ def predicted(
     )
 
 
-def _left_to_the_log(calibration: Calibration, run: Run) -> Payload | None:
-    """The run's payload without what the calibration itself says of it, given or identified."""
-    if run.payload is None:
-        return None
-    own = _of_mounting(calibration, run.payload)
-    mass, weighed = own.get("m"), run.payload.known.get("m")
-    if mass is not None and mass.std == 0.0 and weighed is not None and weighed != mass.value:
-        raise DataUnfit(
-            run.name,
-            f"carries {weighed:g} kg on mounting {run.payload.mounting!r}; the calibration has {mass.value:g} kg: "
-            "give each way of mounting a name of its own",
-        )
-    return replace(run.payload, known={name: value for name, value in run.payload.known.items() if name not in own})
-
-
 def _of_mounting(calibration: Calibration, payload: Payload) -> dict[str, Parameter]:
     split = ((*parameter.name.partition(":"), parameter) for parameter in calibration.parameters)
     return {name: parameter for name, _, mounting, parameter in split if mounting == payload.mounting}
 
 
-def _data_use(calibration: Calibration, digest: str) -> DataUse:
-    roles = {source.role for source in calibration.sources if source.sha256 == digest}
-    if "fit" in roles:
-        return DataUse.FIT
-    return DataUse.HOLDOUT if "holdout" in roles else DataUse.NEW
+MANUFACTURER = "manufacturer"  #: Label of the nameplate gains
+
+
+@dataclass(frozen=True, slots=True)
+class Mass:
+    """A payload's mass found with one set of gains."""
+
+    mass_kg: float  #: found [kg]
+    std_percent: float  #: σ from the scatter of the moves, the gains taken as exact [% of the mass]
+    std_with_gains_percent: float  #: the same with the σ of the gains
+    error_percent: float | None  #: |found − weighed|/weighed [%], None where it was not weighed
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedRun:
+    """One run under every calibration."""
+
+    log: Path  #: where it was read
+    run: str  #: its name
+    #: Of its weighted observation matrix, None where the run alone does not show the base parameters.
+    condition: float | None
+    #: ‖ρ‖/‖Y‖ by label of the calibration; calibrations that cannot predict the run are not in it.
+    errors: dict[str, RelativeError]
+    left_out: str  #: why some of them cannot, empty where all can
+    seen_by: tuple[str, ...]  #: labels of calibrations whose fit has seen it
+
+
+@dataclass(frozen=True, slots=True)
+class WeighedRun:
+    """One loaded run, and the mass of its payload by label of the gains."""
+
+    log: Path
+    run: str
+    payload: Payload
+    weighed_kg: float | None
+    masses: dict[str, Mass | str]  #: or why there is none
+
+
+@dataclass(frozen=True, slots=True)
+class CrossValidation:
+    """All figures of the tables of §4.3."""
+
+    axes: tuple[str, ...]  #: their names
+    calibrations: dict[str, Calibration]  #: by label
+    runs: tuple[CheckedRun, ...]  #: in the order of the logs
+    weighed: tuple[WeighedRun, ...]  #: those with a payload
+    with_bare_runs: bool  #: the payloads were found together with the robot, from runs without load
+    validations: tuple[Validation, ...]  #: of the first calibration, for the runs that it can predict
+
+
+def cross_validate(
+    calibrations: Mapping[str, Calibration], logs: Sequence[Path], cell: Cell | None = None
+) -> CrossValidation:
+    """Test calibrations on logs; each log is read once.
+
+    Args:
+        calibrations: by label, made under one filter; the first one is what is being validated.
+        logs: of their cell, without load or with any payload.
+        cell: another description of the cell than the one that the logs carry.
+
+    Raises:
+        DataError, ConfigurationError: a log cannot be used.
+        LogsDiffer: a log is of another cell, or a calibration was made under another filter.
+        IdentificationError: a calibration contradicts the cell or a run.
+    """
+    first = next(iter(calibrations))
+    conditioning = conditioning_of(calibrations[first])
+    for label, calibration in calibrations.items():
+        if conditioning_of(calibration) != conditioning:
+            raise LogsDiffer(
+                f"calibration {label}",
+                found=f"the filter {calibration.filter}",
+                expected=f"that of {first}: {calibrations[first].filter}",
+                remedy="a relative error can be compared under one filter only: fit both with one cell file",
+            )
+    runs, bare, loaded, validations = [], [], [], []
+    for log in logs:
+        run, described = load_run(log, cell)
+        model = model_of(described)
+        found: dict[str, Validation] = {}
+        reasons: dict[str, list[str]] = {}
+        for label, calibration in calibrations.items():
+            check_cell(calibration, log, described)
+            reason = unpredictable(calibration, run.payload)
+            if reason:
+                reasons.setdefault(reason, []).append(label)
+            else:
+                found[label] = predicted(calibration, conditioning, model, log, run, described.digest)
+        if first in found:
+            validations.append(found[first])
+        reduction: Reduction | str
+        condition = None
+        try:
+            reduction = reduce_runs(model, (run,), conditioning)
+        except IdentificationError as error:
+            reduction = str(error)
+        else:
+            whole = as_one_body(reduction)
+            with suppress(IdentificationError):
+                condition = wls(whole.system(whole.base(), ()), _gains(calibrations[first])).condition
+        if run.payload is not None:
+            # From the log, else from the cell, since a body weighs the same anywhere.
+            of_cell = (body.mass_kg for body in described.payloads if body.name == run.payload.name)
+            kg = run.payload.known.get("m", next(of_cell, None))
+            loaded.append((log, run.payload, kg, reduction))
+        elif isinstance(reduction, Reduction):
+            bare.append(reduction)
+        runs.append(
+            CheckedRun(
+                log=log,
+                run=run.name,
+                condition=condition,
+                errors={label: validation.error for label, validation in found.items()},
+                left_out="; ".join(
+                    reason if len(labels) == len(calibrations) else f"{reason} ({', '.join(labels)})"
+                    for reason, labels in reasons.items()
+                ),
+                seen_by=tuple(label for label, v in found.items() if v.data_use is DataUse.FIT),
+            )
+        )
+    together_bare = joined(bare) if bare else None
+    weighed = [
+        WeighedRun(log, log.stem, payload, kg, _masses(calibrations, together_bare, reduction, kg))
+        for log, payload, kg, reduction in loaded
+    ]
+    axes = tuple(gain.axis for gain in calibrations[first].gains)
+    return CrossValidation(axes, dict(calibrations), tuple(runs), tuple(weighed), bool(bare), tuple(validations))
+
+
+def _masses(
+    calibrations: Mapping[str, Calibration], bare: Reduction | None, loaded: Reduction | str, kg: float | None
+) -> dict[str, Mass | str]:
+    nameplate = np.array([gain.nameplate for gain in next(iter(calibrations.values())).gains])
+    sets = {label: (_gains(c), np.array([gain.std for gain in c.gains])) for label, c in calibrations.items()}
+    if bare is not None and not any(np.array_equal(gains, nameplate) for gains, _ in sets.values()):
+        sets = {MANUFACTURER: (nameplate, np.zeros(len(nameplate))), **sets}
+    masses: dict[str, Mass | str] = {}
+    for label, (gains, std) in sets.items():
+        if isinstance(loaded, str):
+            masses[label] = loaded
+            continue
+        try:
+            if bare is not None:
+                found = payload_beside_bare_runs(bare, loaded, gains)
+            else:
+                robot = standard_parameters(calibrations[label], loaded.model)
+                found = payload_on_known_robot(robot, loaded, gains)
+        except IdentificationError as error:
+            masses[label] = str(error)
+            continue
+        mass = found.mass_kg
+        masses[label] = Mass(
+            mass_kg=mass,
+            std_percent=100.0 * found.mass_std_kg / abs(mass),
+            std_with_gains_percent=100.0 * found.mass_std_with_gains_kg(std) / abs(mass),
+            error_percent=None if kg is None else 100.0 * abs(mass - kg) / kg,
+        )
+    return masses
+
+
+def _gains(calibration: Calibration) -> FloatArray:
+    return np.array([gain.value for gain in calibration.gains])

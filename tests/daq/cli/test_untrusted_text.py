@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from daq.jobs.cell_fit import Failure
+from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow
-from daq.jobs.fleet_survey import Summary
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, watch
 from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document

@@ -30,11 +30,9 @@ from daq.cli import main
 from daq.config.cell_file import bundle
 from daq.errors import ConfigurationMissing, DaqError, ExitCode, LogMissing, OutputFailed, UsageError
 from daq.jobs import fleet as fleet_module
-from daq.jobs import workers as workers_module
-from daq.jobs.cell_fit import Failure, Fitted, Loop, Unfitted, fit_cell, open_cache
-from daq.jobs.fleet import FleetRow, each, fit_fleet
+from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
+from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
-from daq.jobs.workers import Processes, Scheduler, Threads, WorkerPool, worker_pool
 from daq.workflow.calibration_file import as_document, load
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
@@ -87,7 +85,7 @@ def _files(out: Path) -> dict[str, dict[str, Any]]:
 
 
 def _fitted(logs: Path, out: Path | None, loop: Loop = Loop.OPEN) -> tuple[FleetRow, ...]:
-    with Threads(2).start_pool() as pool:
+    with worker_pool("threads", 2) as pool:
         shelf = None if out is None else open_cache(out, loop)
         return fit_fleet(list_logs(str(logs)), pool, loop, shelf, lambda: CREATED)
 
@@ -311,15 +309,14 @@ import os, signal, sys
 from datetime import UTC, datetime
 from importlib import import_module
 from daq.jobs.cell_fit import Loop, open_cache
-from daq.jobs.fleet import fit_fleet
+from daq.jobs.fleet import fit_fleet, worker_pool
 from daq.jobs.fleet_survey import list_logs
-from daq.jobs.workers import Threads
 
 def report(done, total, remark):
     if remark.startswith("cell-") and done == int(sys.argv[3]):
         os.kill(os.getpid(), signal.SIGKILL)
 
-with Threads(2).start_pool() as pool:
+with worker_pool("threads", 2) as pool:
     cache = open_cache(__import__("pathlib").Path(sys.argv[2]), Loop.OPEN)
     fit_fleet(list_logs(sys.argv[1]), pool, Loop.OPEN, cache, lambda: datetime.now(UTC), report)
 """
@@ -364,7 +361,7 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         # A fault of a copy is reported under the name of its original.
         whole = store.cat_file("/hall/cell-002/bare.mcap")
         store.pipe("/hall/cell-002/bare.mcap", whole[:-100])
-        with Threads(1).start_pool() as pool:
+        with worker_pool("threads", 1) as pool:
             rows = fit_fleet(list_logs("memory://hall"), pool, Loop.OPEN, None, lambda: CREATED)
         (failed,) = (row.result for row in rows if isinstance(row.result, Failure))
         assert failed.text.startswith("memory:///hall/cell-002/bare.mcap")
@@ -436,15 +433,15 @@ def test_what_is_not_installed_is_named_with_the_line_that_installs_it(monkeypat
     def absent(name: str) -> Any:
         raise ImportError(name)
 
-    monkeypatch.setattr(workers_module, "import_module", absent)
-    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), Processes(1).start_pool():
+    monkeypatch.setattr(fleet_module, "import_module", absent)
+    with pytest.raises(ConfigurationMissing, match=r"pip install 'drivegain\[fleet\]'"), worker_pool("processes", 1):
         pass
     with pytest.raises(ConfigurationMissing, match="nonsense"):
         list_logs("nonsense://bucket/logs")
 
 
 def test_processes_of_this_machine_listen_to_no_one_else() -> None:
-    with Processes(1).start_pool() as pool:
+    with worker_pool("processes", 1) as pool:
         assert pool.executor.submit(len, "abc").result() == 3
         assert pool.present()
         psutil = import_module("psutil")  # distributed brings it
@@ -461,20 +458,24 @@ def test_processes_of_this_machine_listen_to_no_one_else() -> None:
 
 
 def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers_module, "CONNECT_S", 0.2)
+    monkeypatch.setattr(fleet_module, "CONNECT_S", 0.2)
     # Port 9, discard: nothing answers there.
     with (
         pytest.raises(UsageError, match="a dask scheduler that answers"),
-        Scheduler("tcp://127.0.0.1:9", 1).start_pool(),
+        worker_pool("tcp://127.0.0.1:9", 1),
     ):
         pass
 
 
-def test_the_words_of_scheduler() -> None:
-    assert worker_pool("threads", 3) == Threads(3)
-    assert worker_pool("processes", 2) == Processes(2)
-    assert worker_pool("tcp://10.0.0.1:8786", None) == Scheduler("tcp://10.0.0.1:8786", None)
-    assert worker_pool("threads", None).workers
+def test_the_words_of_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, str | int, int | None]] = []
+    monkeypatch.setattr(fleet_module, "_processes", lambda workers: asked.append(("processes", workers, None)))
+    monkeypatch.setattr(fleet_module, "_scheduler", lambda *given: asked.append(("scheduler", *given)))
+    with worker_pool("threads", 3) as pool, worker_pool("threads", None) as as_many_as_processors:
+        assert (pool.workers, as_many_as_processors.workers) == (3, len(os.sched_getaffinity(0)))
+    worker_pool("processes", 2)
+    worker_pool("tcp://10.0.0.1:8786", None)
+    assert asked == [("processes", 2, None), ("scheduler", "tcp://10.0.0.1:8786", None)]
     with pytest.raises(UsageError):
         worker_pool("process", None)
 
@@ -490,7 +491,7 @@ def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) ->
 
 def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
-    def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Unfitted:
+    def sometimes(cell: CellLogs, loop: Loop, created: datetime) -> Fitted | Failure:
         if cell.cell == "cell-002":
             raise MemoryError
         return fit_cell(cell, loop, created)
@@ -536,7 +537,7 @@ def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
     shutil.copy(few / "cell-002" / "bare.mcap", few / "cell-003" / "loaded.mcap")
     shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "held-out.mcap")
     kinds = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
-    assert [made.failure.kind if isinstance(made, Unfitted) else "" for made in kinds] == [
+    assert [made.kind if isinstance(made, Failure) else "" for made in kinds] == [
         "LogRepeated",
         "",
         "LogsDiffer",
@@ -544,8 +545,8 @@ def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
     whole = cells[1]
     stale = replace(whole, fit=(replace(whole.fit[0], fingerprint="0" * 64), *whole.fit[1:]))
     made = fit_cell(stale, Loop.OPEN, CREATED)
-    assert isinstance(made, Unfitted)
-    assert "another content" in made.failure.text
+    assert isinstance(made, Failure)
+    assert "another content" in made.text
 
 
 class _Gone(Executor):

@@ -16,7 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from daq.errors import OutputFailed
 from daq.jobs.journal import Form, Journal, Level, form_of
-from daq.jobs.reporting import Figures, write_metrics
+from daq.jobs.reporting import Conclusion, write_metrics
 from daq.jobs.session import Outcome
 
 AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)
@@ -71,13 +71,13 @@ def test_the_journal_is_known_by_the_stream_that_systemd_names(tmp_path: Path) -
         assert form_of(stream, {}) is Form.JSON
 
 
-def figures(outcome: Outcome) -> Figures:
-    return Figures('the "cell"\\', outcome, 11, AT, 12.5, None, None, None)
+def written(outcome: Outcome, folder: Path) -> Path:
+    return write_metrics(folder, 'the "cell"\\', Conclusion(outcome, 11, None, ""), AT, 12.5, None)
 
 
 def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: Path) -> None:
     (tmp_path / "drivegain_the_cell__e183a8.prom").write_text("half of a fi")
-    path = write_metrics(figures(Outcome.STOPPED), tmp_path)
+    path = written(Outcome.STOPPED, tmp_path)
     assert path.name == "drivegain_the_cell__e183a8.prom"
     assert path.stat().st_mode & 0o777 == 0o644
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
@@ -91,4 +91,4 @@ def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: P
 
 def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     with pytest.raises(OutputFailed, match="no such file"):
-        write_metrics(figures(Outcome.APPLIED), tmp_path / "none")
+        written(Outcome.APPLIED, tmp_path / "none")

@@ -22,16 +22,18 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.config.policy import HistoryPlace
-from daq.jobs.decision import GainHistory
+from daq.files import sha256_of
 from daq.jobs.session import Basis, begin
 from daq.jobs.session import save as save_session
 from daq.ledger.audit import AuditAction, AuditEntry, append, read
 from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, drives_of, logs_of, recorded_at
+from daq.ledger.judgement import known_of
 from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
 from daq.workflow.calibration_file import save
+from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode as read_controller
 from daq.writeback.formats.scalar import rewrite_gain
 from daq.writeback.request import GainChange
@@ -301,13 +303,14 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
     controller = declared.controller_path
     assert controller is not None
     with Ledger(declared, _place(cell), "job") as ledger:
-        past = GainHistory(ledger, controller, lambda: BEGIN)
+        digest = ""
         if own is not None:
             file = cell.parent / "own.yaml"
             save(own, file)
-            past.enter(own, file)
+            digest = sha256_of(file) or ""
+            ledger.add(own, digest=digest, at=BEGIN)
         changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
-        return dict(past.known(changes).dispersions)
+        return dict(known_of(ledger, str(resolve_links(controller)), digest, changes).dispersions)
 
 
 def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:

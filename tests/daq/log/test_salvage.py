@@ -248,7 +248,7 @@ def test_nothing_of_it_reaches_a_controller() -> None:
     edit, now = Edit(subject="", before=b"", after=b""), datetime(2025, 1, 2, tzinfo=UTC)
     assert not check_gates(GateContext(Request(good, now), edit))
     assert [refusal.gate for refusal in check_gates(GateContext(Request(again, now), edit))] == [Gate.PARTIAL]
-    assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]  # type: ignore[attr-defined]
+    assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]
 
 
 def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
