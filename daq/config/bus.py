@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
+from typing import TYPE_CHECKING
 
 from daq.config.cell import Bus, Cell, Pacing
 from daq.errors import ConfigurationInconsistent
-from drivers.canopen.bus import BusAddress
-from drivers.canopen.network import HEARTBEAT_MS
-from drivers.canopen.pdo import SETPOINT_PDOS, STATUSWORD, pack
+from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
-from drivers.stream.split_bus import BusPart, CellAddress, SplitAddress
+
+if TYPE_CHECKING:  # a cell is also read without a bus, and python-can takes a tenth of a second
+    from drivers.canopen.bus import BusAddress
+    from drivers.stream.split_bus import BusPart, CellAddress
 
 LARGEST_MEAN = 0.80
 """Largest mean load, as a share of the bus. The rest is for repeated frames, SDO, EMCY and other nodes; above it frames
@@ -133,6 +135,8 @@ def cell_address(cell: Cell) -> CellAddress:
     Raises:
         ConfigurationInconsistent: the cell only imports recordings.
     """
+    from drivers.stream.split_bus import SplitAddress  # noqa: PLC0415 - see above
+
     parts = bus_parts(cell)
     return parts[0].address if len(parts) == 1 else SplitAddress(parts)
 
@@ -143,6 +147,8 @@ def bus_parts(cell: Cell) -> tuple[BusPart, ...]:
     Raises:
         ConfigurationInconsistent: as `cell_address`.
     """
+    from drivers.stream.split_bus import BusPart  # noqa: PLC0415 - see above
+
     if not cell.buses:
         raise _no_bus(cell, "no bus")
     return tuple(
@@ -207,6 +213,8 @@ def drive_axes(cell: Cell) -> tuple[Axis, ...]:
 
 
 def _address(bus: Bus) -> BusAddress:
+    from drivers.canopen.bus import BusAddress  # noqa: PLC0415 - see above
+
     return BusAddress(bus.interface, bus.channel, bus.bitrate_bit_s, bus.host, bus.port)
 
 

@@ -15,7 +15,6 @@ from rich.text import Text
 from daq.config.bus import bus_loads, frame_bits
 from daq.config.cell import Pacing
 from daq.report.text import plain_table, printable
-from drivers.canopen.link import nmt_name
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
 
@@ -66,6 +65,8 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
         found: nodes on the bus.
         bus: name of the bus.
     """
+    from drivers.canopen.link import nmt_name  # noqa: PLC0415 - a fit has a note from here, and needs no bus
+
     homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
     axes = {axis.node_id: axis for axis in cell.axes if axis.node_id is not None and axis.bus == bus}
     nodes = {node.node_id: node for node in found}
@@ -145,6 +146,8 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
         ampere: amperes per raw unit of each axis' current, None where unknown.
         events: texts of recent events, oldest first.
     """
+    from drivers.canopen.link import nmt_name  # noqa: PLC0415 - a fit has a note from here, and needs no bus
+
     axes = []
     for declared, axis, position, ampere_per_unit in zip(
         cell.axes, reading.axes, joint_positions(cell, reading), ampere, strict=True

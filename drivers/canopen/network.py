@@ -14,7 +14,7 @@ import can
 
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.link import HEARTBEAT, Link, NmtCommand, NmtState, command_name
-from drivers.canopen.pdo import CONTROLWORD, STATUSWORD
+from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD
 from drivers.canopen.scan import FoundNode, answering, free_ids, read_identity, require, scan
 from drivers.canopen.sdo import Clock, SdoPolicy
 from drivers.canopen.setup import AxisSetup
@@ -27,7 +27,6 @@ from drivers.stream.sample import Sample
 from drivers.stream.split_bus import CellAddress, open_cell_bus
 
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
-HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 STANDSTILL_COUNTS = 1024  #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 
 

@@ -10,11 +10,15 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
-from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import Axis, ObjectEntry
 
+if TYPE_CHECKING:  # the layout of the frames is computed also where there is no bus
+    from drivers.canopen.sdo import ObjectAccess
+
+HEARTBEAT_MS = 100  #: Period of the heartbeats of every node, and of the recorder
 PDO_BYTES = 8
 PDOS = 4  #: PDOs of the predefined connection set, in each direction
 NOT_VALID = 1 << 31

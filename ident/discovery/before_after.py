@@ -23,8 +23,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 from numpy.typing import NDArray
-from scipy import special
 
 from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
 from ident.discovery.loop import Evidence, Step
@@ -183,7 +183,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     moves, count = before.shifts.shape
     shifts = after.shifts - before.shifts
     change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
-    limit = float(-special.ndtri(FALSE_ALARM / (2 * count)))
+    limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),
         removed=tuple(placed for placed in before.effects if placed not in after.effects),

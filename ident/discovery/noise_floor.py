@@ -23,8 +23,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 from numpy.typing import NDArray
-from scipy import special
 
 from ident.data.conditioning import Conditioning, Decimator
 from ident.data.dataset import Dataset
@@ -75,7 +75,7 @@ def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) 
     variance, freedom = np.array(dwells).T
     if freedom.sum() < MIN_FREEDOM:
         return None
-    likely = variance * freedom / special.chdtri(freedom, 0.5)
+    likely = variance * freedom / scipy.special.chdtri(freedom, 0.5)
     order = np.argsort(likely)
     share = np.cumsum(freedom[order]) / freedom.sum()
     middle = likely[order][int(np.searchsorted(share, 0.5))]

@@ -19,8 +19,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 from numpy.typing import NDArray
-from scipy import special
 
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.effects.dictionary import EFFECTS
@@ -135,7 +135,7 @@ def is_better(one: Finding, other: Finding) -> bool:
     """Whether one finding explains more than another by a paired comparison over folds."""
     gain = other.fold_errors - one.fold_errors
     error = float(np.std(gain, ddof=1)) * float(np.sqrt(len(gain)))
-    return float(gain.sum()) > float(special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
+    return float(gain.sum()) > float(scipy.special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
 
 
 def refine_setting(
@@ -235,7 +235,7 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
     """−log p of χ² statistics, finite however large they are."""
-    return np.asarray(-np.log(np.maximum(special.chdtrc(freedom, wald), np.finfo(np.float64).tiny)))
+    return np.asarray(-np.log(np.maximum(scipy.special.chdtrc(freedom, wald), np.finfo(np.float64).tiny)))
 
 
 def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
