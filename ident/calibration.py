@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ident.arrays import FloatArray
 from ident.data.run import Recording
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError
@@ -132,7 +130,7 @@ class Calibration:
 def calibration_of(
     found: Identification,
     axes: Sequence[str],
-    nameplate: Sequence[float] | NDArray[np.float64],
+    nameplate: Sequence[float] | FloatArray,
     *,
     units: Sequence[str] = (),
     robot: str = "robot",

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
@@ -14,8 +14,6 @@ from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:

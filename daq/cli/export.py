@@ -13,7 +13,7 @@ from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFaile
 if TYPE_CHECKING:
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
     from ident.calibration import Calibration
-    from ident.data.run import FloatArray
+    from ident.arrays import FloatArray
     from ident.model.model import Model
 
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +125,7 @@ class Decimator:
         inside = samples - 2 * self.half
         return 0 if inside < 1 else (inside - 1) // self.factor + 1
 
-    def centres(self, samples: int) -> NDArray[np.int64]:
+    def centres(self, samples: int) -> IntArray:
         """Index of the sample at the centre of each output's window."""
         return self.half + self.factor * np.arange(self.rows(samples))
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
 from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the speed that a joint exceeds in a twentieth of a run."""
@@ -54,7 +51,7 @@ class Dataset:
     moving: BoolArray
     motor_moving: BoolArray
     valid: BoolArray
-    move: NDArray[np.int64]
+    move: IntArray
     payload: Payload | None
     started_s: float | None = None
 
@@ -161,12 +158,12 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     )
 
 
-def _moves(moving: BoolArray) -> NDArray[np.int64]:
+def _moves(moving: BoolArray) -> IntArray:
     starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
     return np.cumsum(starts, dtype=np.int64)
 
 
-def _parted(move: NDArray[np.int64], longest: int) -> NDArray[np.int64]:
+def _parted(move: IntArray, longest: int) -> IntArray:
     """Cut long moves: standard errors and folds rest on many moves, and continuous motion would be a single one."""
     starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
     since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))

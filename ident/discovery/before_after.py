@@ -24,8 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
 from ident.discovery.loop import Evidence, Step
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
@@ -33,8 +33,6 @@ from ident.effects.effect import PlacedEffect
 from ident.equations.linearisation import Folds, cut, left_out_shifts, linearise
 from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate, RelativeError
-
-FloatArray = NDArray[np.float64]
 
 FALSE_ALARM = 0.05  #: Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)
 

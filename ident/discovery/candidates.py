@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect
@@ -25,8 +25,6 @@ from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 ColumnCache = dict[tuple[Effect, int], FloatArray]
 
 MOVES_WANTED = 60

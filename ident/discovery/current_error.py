@@ -19,17 +19,14 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray, IntArray
 from ident.discovery.loop import Evidence, with_effects
 from ident.equations.linearisation import Folds
 from ident.equations.observation import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.maximum_likelihood import ml
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

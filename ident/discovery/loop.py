@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
@@ -35,8 +35,6 @@ from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong

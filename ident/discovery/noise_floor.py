@@ -24,14 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning, Decimator
 from ident.data.dataset import Dataset
 from ident.equations.rows import row_filter
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MIN_DWELLS = 8
 MIN_FREEDOM = 20.0  #: σ is then known to 20 %

@@ -20,13 +20,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 
-FloatArray = NDArray[np.float64]
 Place = tuple[str, int, tuple[int, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal

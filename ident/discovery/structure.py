@@ -10,15 +10,13 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.discovery.candidates import SearchProblem
 from ident.discovery.search import Finding, Gates, is_better, rank_families
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
-
-FloatArray = NDArray[np.float64]
 
 VARIABLES = (
     (Abscissa.VELOCITY, (0, 1)),

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
 
 DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
 FALSE_ALARM = 0.01  #: Share of recalibrations without any change in which `decide` finds one

@@ -27,11 +27,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ident.arrays import FloatArray
 from ident.drift.change import DISPERSION
-
-FloatArray = NDArray[np.float64]
 
 FEWEST = 4  #: Calibrations of the first line that is tested; through fewer it is hardly more than one difference
 _RECENT = 3  #: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent

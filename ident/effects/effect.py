@@ -14,14 +14,10 @@ from enum import Enum
 from functools import cache
 from typing import Annotated, Self, get_args, get_type_hints
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ident.arrays import FloatArray
 from ident.effects.signals import Abscissa, Signals
 from ident.errors import EffectRefused
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
 
 
 class Side(Enum):

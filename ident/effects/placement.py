@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.effect import Effect, Side
@@ -14,8 +14,6 @@ from ident.effects.signals import Signals
 from ident.equations.rows import decimate_rows
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
 
 
 def effect_torque(

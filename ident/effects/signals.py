@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.dataset import Dataset
 from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.kinematics import Motion
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 CHUNK_SAMPLES = 4096

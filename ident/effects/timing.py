@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.effects.effect import Effect, Property, Side
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

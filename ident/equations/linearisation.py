@@ -12,15 +12,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from ident.arrays import FloatArray, IntArray
 from ident.equations.observation import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MIN_MOVES = 8  #: With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each
 

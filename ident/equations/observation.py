@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.equations.rows import Rows, rows_of
@@ -19,10 +19,6 @@ from ident.equations.triangles import Triangles, triangle
 from ident.model.base import BaseParameters
 from ident.model.bodies import Payload
 from ident.model.model import Column, DriveTrain, Model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -23,10 +23,6 @@ from ident.errors import DataUnfit
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, Model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 MAX_CLUSTERS = 256
 """Moves of very long data are joined with their neighbours: 256 clusters say as much of a scatter as 3000."""

@@ -6,16 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset
 from ident.errors import DataUnfit
 from ident.model.model import DriveTrain, Model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 

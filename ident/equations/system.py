@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.equations.triangles import Triangles, triangle
 from ident.errors import DataUnfit, RankDeficient
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
 from ident.model.model import Column, DriveTrain
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray, IntArray
 
 BLOCK_ROWS = 1024  #: Rows folded in at once: 80 columns of them stay in a core's own cache
 
@@ -29,7 +28,7 @@ class Triangles:
     """R of the QR factorisation of each axis' equations; ‖R x‖ is the norm of their residual for any x."""
 
     factors: tuple[FloatArray, ...]  #: one for each axis, shape (≤c, c)
-    rows: NDArray[np.int64]  #: number of equations of each axis, shape (n,)
+    rows: IntArray  #: number of equations of each axis, shape (n,)
 
     def stacked(self, weight: FloatArray) -> FloatArray:
         """All axes below each other, each scaled by its weight."""

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
@@ -17,8 +17,6 @@ from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
 """Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray
 from ident.equations.observation import Observation
 from ident.equations.system import System
 from ident.estimators.method import Method
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
@@ -19,8 +19,6 @@ from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Column, Model
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_STD = 0.1
 """Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""

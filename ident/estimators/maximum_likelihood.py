@@ -13,8 +13,8 @@ change when a current is given in another unit or the columns are scaled.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.system import System, require_known_payload, require_rows
 from ident.equations.triangles import Triangles, solve
@@ -22,8 +22,6 @@ from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.method import Method
-
-FloatArray = NDArray[np.float64]
 
 MAX_ITERATIONS = 100
 STEP_TOLERANCE = 1e-7  #: Relative step of the gains; their standard deviations are some 1e-3

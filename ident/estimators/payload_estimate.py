@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.reduction import Cluster, Reduction, place_of
 from ident.equations.system import System, require_distinct
@@ -17,8 +17,6 @@ from ident.estimators.least_squares import ls, wls
 from ident.estimators.maximum_likelihood import noise_of
 from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

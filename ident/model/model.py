@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.kinematics import Motion
 from ident.model.regressor import fill_rigid
 from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""

@@ -22,12 +22,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
 
 BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
 

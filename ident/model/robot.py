@@ -13,12 +13,10 @@ from math import cos, inf, isfinite, sin, sqrt
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import Body
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 

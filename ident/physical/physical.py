@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray, IntArray
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import pseudo_inertia
 from ident.model.model import Model
 from ident.physical.programme import MARGIN, InertiaPrior, NotPhysical, Programme, relative_to_prior
-
-FloatArray = NDArray[np.float64]
 
 EXACT = 1e-6  #: Share of the torque below which a consistent set counts as predicting the identified torque
 SLACK = 0.1
@@ -180,7 +178,7 @@ def _shares(model: Model, joints: tuple[int, ...], motors: list[int]) -> FloatAr
     return np.array(shares)
 
 
-def _link_columns(model: Model) -> NDArray[np.int64]:
+def _link_columns(model: Model) -> IntArray:
     return 14 * np.arange(model.robot.joint_count)[:, None] + np.arange(10)
 
 

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray, IntArray
 from ident.errors import IdentificationError
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
 from ident.model.robot import read_urdf
-
-FloatArray = NDArray[np.float64]
 
 MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 _ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search
@@ -44,8 +42,8 @@ class Programme:
     """Data of both programmes for c standard parameters, n links and b base parameters."""
 
     factors: FloatArray  #: L of each link's prior, shape (n, 4, 4)
-    link_columns: NDArray[np.int64]  #: indices of each link's ten parameters, shape (n, 10)
-    scalars: NDArray[np.int64]  #: indices of the other parameters, shape (s,)
+    link_columns: IntArray  #: indices of each link's ten parameters, shape (n, 10)
+    scalars: IntArray  #: indices of the other parameters, shape (s,)
     scales: FloatArray  #: value of each of these that makes the whole torque, shape (s,)
     grouping: FloatArray  #: base parameters = grouping @ standard parameters, shape (b, c)
     triangle: FloatArray  #: a torque of relative size ‖triangle @ base‖, shape (b, b)
@@ -169,7 +167,7 @@ def _solve(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[A
     raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {message}".strip())
 
 
-def _linear_map(factor: FloatArray, columns: NDArray[np.int64], count: int) -> FloatArray:
+def _linear_map(factor: FloatArray, columns: IntArray, count: int) -> FloatArray:
     """Standard parameters per entry of Q (row by row), shape (c, 16)."""
     out = np.zeros((count, 16))
     for entry in range(16):

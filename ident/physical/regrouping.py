@@ -6,15 +6,13 @@ import re
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.base import BaseParameters
 from ident.model.kinematics import Motion
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 _SAME = 1e-4  #: Tolerance of a weight: names carry six decimals, and filtered data determine a few digits less
 _TERM = re.compile(r" ([+-]) ([0-9.e+-]+)\*(\S+)")

@@ -14,12 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.model.kinematics import poses
 from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
 
 BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004

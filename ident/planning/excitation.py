@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.equations.rows import row_filter, row_masks
@@ -28,8 +29,6 @@ from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import Robot, read_urdf
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 UNSEEN = 1e-9  #: Share of a column that counts as nothing when the others are projected out of it

@@ -14,12 +14,10 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.model.kinematics import Motion
 from ident.planning.excitation import Design, Excitation
-
-FloatArray = NDArray[np.float64]
 
 GOOD_PERCENT = 1.0  #: Largest standard deviation of a good gain: drives are sold with gains known to some percent
 UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the better source
