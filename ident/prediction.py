@@ -8,8 +8,7 @@ from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import Effect, PlacedEffect, check_settings
-from ident.effects.placement import at_joints
+from ident.effects.effect import Effect, PlacedEffect, at_joints, check_settings
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload

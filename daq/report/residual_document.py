@@ -10,8 +10,7 @@ from daq.report.residual import summary, time_skew
 from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
-from ident.discovery.before_after import Account, BeforeAfter, Errors, GainChange
-from ident.discovery.current_error import LeftOutRuns
+from ident.discovery.before_after import Account, BeforeAfter, Errors, GainChange, LeftOutRuns
 from ident.discovery.loop import Step
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect

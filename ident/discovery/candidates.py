@@ -16,12 +16,10 @@ from scipy import linalg
 from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect
-from ident.effects.placement import at_joints, effect_torque, is_placeable
+from ident.effects.effect import Effect, at_joints, effect_torque, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, cut, linearise
-from ident.equations.observation import Observation
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.data.dataset import Dataset
-from ident.equations.observation import Observation
+from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.kinematics import Motion

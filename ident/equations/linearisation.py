@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import FloatArray, IntArray
-from ident.equations.observation import Observation
+from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 

@@ -17,8 +17,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, rows_of
-from ident.equations.system import System
-from ident.equations.triangles import Triangles, qr_update, triangle
+from ident.equations.system import System, Triangles, qr_update, triangle
 from ident.errors import DataUnfit
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
-from ident.equations.observation import Observation
+from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.estimators.method import Method
 from ident.model.model import Column

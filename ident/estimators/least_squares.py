@@ -7,8 +7,7 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.equations.system import System, require_known_payload
-from ident.equations.triangles import Triangles, solve
+from ident.equations.system import System, Triangles, require_known_payload, solve
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
-from ident.equations.system import System, require_known_payload, require_rows
-from ident.equations.triangles import Triangles, solve
+from ident.equations.system import System, Triangles, require_known_payload, require_rows, solve
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, tls, wls

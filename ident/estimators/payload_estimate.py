@@ -10,8 +10,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.reduction import Cluster, Reduction, place_of
-from ident.equations.system import System, require_distinct
-from ident.equations.triangles import solve, triangle
+from ident.equations.system import System, require_distinct, solve, triangle
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimators.least_squares import ls, wls
 from ident.estimators.maximum_likelihood import noise_of
