@@ -137,6 +137,8 @@ def calibration_of(
 ) -> Calibration:
     """Calibration that an identification amounts to, without effects and without the logs that it came from.
 
+    Its sources name the payloads with their masses and no file.
+
     Args:
         found: by `ident.identify`.
         axes: name of each axis.
@@ -173,7 +175,10 @@ def calibration_of(
         condition=estimate.condition,
         rows=estimate.rows,
         filter=found.conditioning.document(),
-        sources=(),
+        sources=tuple(
+            Source(", ".join(found.system.runs), "", "fit", payload=payload.name, mass_kg=payload.known.get("m"))
+            for payload in found.system.payloads
+        ),
         configuration_sha256="",
         created="",
         software="",

@@ -14,6 +14,8 @@ from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 
+SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
+
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
     """Predict the joint torque of a motion: W χ + W_uL χ_uL + W_kL χ_kL (paper eq. 17) and the effects.
@@ -24,11 +26,11 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         data: the motion, and what is mounted.
 
     Returns:
-        joint torque [Nm; N for a prismatic joint] at full rate, shape (k, n).
+        joint torque [Nm; N for a prismatic joint] at full rate, shape (n_samples, n_axes).
 
     Raises:
         ModelError: the calibration is of another robot.
-        DataUnfit: it does not know how the run's payload is mounted.
+        DataUnfit: it does not know how the run's payload is mounted, or knows the payload with another mass.
         EffectRefused: it holds an effect that does not exist.
     """
     gains = _gains(calibration, model)
@@ -50,19 +52,19 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     Arguments and errors are those of `predict_torque`.
 
     Returns:
-        current references [A] at full rate, shape (k, n).
+        current references [A] at full rate, shape (n_samples, n_axes).
     """
     torque = predict_torque(calibration, model, data)
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
 def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
-    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), both of shape (k, n).
+    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), shape (n_samples, n_axes) each.
 
     Raises:
         ModelError: the calibration has another number of gains.
     """
-    return np.asarray((_gains(calibration, model) * current_a) @ model.drive_train.direction)
+    return np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
@@ -144,6 +146,15 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
             if mounting == payload.mounting:
                 identified[name] = parameter.value
     _check_mounting(payload, identified, mountings, data.name)
+    masses_kg = {source.mass_kg for source in calibration.sources if source.payload == payload.name}
+    mass_kg, fitted_kg = payload.known.get("m"), next(iter(masses_kg - {None}), None)
+    # What was identified beside one mass, first moments and inertia, is not that of a body of another mass.
+    if identified and mass_kg is not None and fitted_kg and not abs(mass_kg / fitted_kg - 1.0) <= SAME_MASS:
+        raise DataUnfit(
+            data.name,
+            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the fit: the calibration "
+            f"holds the rest of its inertia on mounting {payload.mounting!r}; give another body another mounting",
+        )
     return payload_parameters(payload, identified)
 
 

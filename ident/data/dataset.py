@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,6 +71,14 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     Raises:
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
     """
+    run = replace(
+        run,
+        time_s=np.asarray(run.time_s, dtype=np.float64),
+        position_rad=np.asarray(run.position_rad, dtype=np.float64),
+        current_a=np.asarray(run.current_a, dtype=np.float64),
+        move=None if run.move is None else np.asarray(run.move, dtype=np.int64),
+        valid=None if run.valid is None else np.asarray(run.valid, dtype=np.bool_),
+    )
     _check(run, drive_train, conditioning)
     rate = run.rate_hz
     raw = np.ascontiguousarray(run.position_rad.T, dtype=np.float64)
@@ -136,19 +144,36 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     """Make a dataset of a motion that was not recorded, for `ident.prediction`.
 
     Args:
-        motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each.
+        motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each; lists will do.
         rate_hz: sampling rate.
         payload: what is mounted, None without load.
+
+    Raises:
+        DataUnfit: the shapes differ, or a number is not finite.
     """
-    shape = motion.position_rad.shape
+    states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    position, velocity, acceleration = (np.asarray(state, dtype=np.float64) for state in states)
+    shape = position.shape
+    if position.ndim != 2 or not shape == velocity.shape == acceleration.shape:
+        raise DataUnfit(
+            "planned motion",
+            f"position, velocity and acceleration have the shapes {shape}, {velocity.shape} and {acceleration.shape}; "
+            "expected (n_samples, n_axes) each",
+        )
+    bad = np.argwhere(~np.isfinite(position + velocity + acceleration))
+    if len(bad):
+        raise DataUnfit(
+            "planned motion",
+            f"{len(bad)} values are not finite, the first in sample {bad[0][0]}, axis {bad[0][1] + 1}; give numbers",
+        )
     everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
         name="planned motion",
         rate_hz=rate_hz,
         time_s=np.arange(shape[0]) / rate_hz,
-        position_rad=motion.position_rad,
-        velocity_rad_s=motion.velocity_rad_s,
-        acceleration_rad_s2=motion.acceleration_rad_s2,
+        position_rad=position,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
         current_a=np.zeros(shape),
         moving=everywhere,
         motor_moving=everywhere,

@@ -12,7 +12,7 @@ from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
+from ident.errors import DataUnfit, ModelError, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
@@ -78,8 +78,13 @@ def identify(
         fixed_gains: known gains, shape (n,).
 
     Raises:
+        ModelError: the fixed gains are not one for each motor.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
+    if fixed_gains is not None:
+        fixed_gains = np.asarray(fixed_gains, dtype=np.float64)
+        if fixed_gains.shape != (model.robot.joint_count,):
+            raise ModelError(f"fixed_gains has shape {fixed_gains.shape}; expected ({model.robot.joint_count},)")
     reduction = reduce_runs(model, runs, conditioning)
     system = reduction.system(reduction.base(), reduction.payload_columns())
     require_distinct(system, gains=fixed_gains is None)

@@ -22,13 +22,14 @@ class DriveTrain:
     """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
 
     Attributes:
-        ratio: R, shape (n, n), invertible; row i belongs to motor i.
+        ratio: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do.
     """
 
     ratio: FloatArray
 
     def __post_init__(self) -> None:
-        ratio = self.ratio
+        ratio = np.asarray(self.ratio, dtype=np.float64)
+        object.__setattr__(self, "ratio", ratio)
         if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
             raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}")
         condition = float(np.linalg.cond(ratio))
@@ -81,6 +82,14 @@ class Model:
     robot: Robot
     drive_train: DriveTrain
 
+    def __post_init__(self) -> None:
+        motors, joints = len(self.drive_train.ratio), self.robot.joint_count
+        if motors != joints:
+            raise ModelError(
+                f"the drive train has shape {self.drive_train.ratio.shape}, expected {(joints, joints)}: the robot has "
+                f"{joints} joints; give one motor for each"
+            )
+
     @property
     def columns(self) -> tuple[Column, ...]:
         """Names and units of the standard parameters."""
@@ -131,12 +140,19 @@ class Model:
 
         Returns:
             shape (n, c, k) [Nm or N per unit], time last.
+
+        Raises:
+            ModelError: the motion is not one of n joints.
         """
-        position, velocity, acceleration = (
-            np.ascontiguousarray(samples.T)
-            for samples in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
-        )
-        count, samples = position.shape
+        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        position, velocity, acceleration = (np.ascontiguousarray(np.transpose(state)) for state in states)
+        count, samples = self.robot.joint_count, position.shape[-1]
+        if not position.shape == velocity.shape == acceleration.shape == (count, samples):
+            found = ", ".join(str(np.shape(state)) for state in states)
+            raise ModelError(
+                f"position, velocity and acceleration have the shapes {found}; expected (n_samples, {count}) each: a "
+                "row a sample, a column a joint"
+            )
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
