@@ -141,19 +141,7 @@ def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
     rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
     number = np.zeros(len(bare.runs), dtype=np.int64)
     number[list(order)] = np.arange(len(order))
-    return replace(
-        bare,
-        current=bare.current[:, rows],
-        robot=bare.robot[:, :, rows],
-        flange=bare.flange[:, :, rows],
-        use=bare.use[:, rows],
-        motor_use=bare.motor_use[:, rows],
-        time_s=bare.time_s[rows],
-        run=number[bare.run[rows]],
-        move=bare.move[rows],
-        mounting=bare.mounting[rows],
-        runs=tuple(bare.runs[run] for run in order),
-    )
+    return replace(bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order))
 
 
 FALSE_ALARM = 0.05  #: Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)
@@ -283,7 +271,10 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
             gains_fixed=estimate.gains_fixed,
         )
     )
-    held = evidence.holdout
+    held, count = evidence.holdout, len(estimate.gains)
+    shifts = np.zeros((folds.problem.moves, count))
+    if not estimate.gains_fixed:
+        shifts = (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]
     return Assessment(
         effects=evidence.effects,
         errors=Errors(
@@ -294,7 +285,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         ),
         gains=estimate.gains,
         gains_std=estimate.gains_std,
-        shifts=_gain_shifts(folds, estimate),
+        shifts=shifts,
     )
 
 
@@ -328,11 +319,3 @@ def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> C
     use = observation.motor_use
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
     return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)
-
-
-def _gain_shifts(folds: Folds, estimate: Estimate) -> FloatArray:
-    """Shift d_c of the gains when each move is left out, shape (m, n)."""
-    count = len(estimate.gains)
-    if estimate.gains_fixed:
-        return np.zeros((folds.problem.moves, count))
-    return (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]

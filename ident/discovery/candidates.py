@@ -224,7 +224,9 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
             made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w, folds.move_hessian
         )
         gram = move_gram.sum(axis=0)
-        if np.any(np.diag(gram) <= REDUNDANT_SHARE * squares[chosen]) or np.linalg.cond(_normalised(gram)) > 1e10:
+        root = np.sqrt(np.maximum(np.diag(gram), 0.0))
+        left = np.all(np.diag(gram) > REDUNDANT_SHARE * squares[chosen])
+        if not left or np.linalg.cond(gram / np.outer(root, root)) > 1e10:
             trials.append(None)
             continue
         score = move_score[:, chosen].sum(axis=0)
@@ -323,8 +325,3 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
         made.part_score[k, i] += score
         made.part_held[k, i] += folds.residual[rows] @ inside
     return made
-
-
-def _normalised(gram: FloatArray) -> FloatArray:
-    root = np.sqrt(np.diag(gram))
-    return np.asarray(gram / np.outer(root, root))

@@ -158,7 +158,10 @@ def refine_setting(
         grid = sorted(member.settings[name] for member in family if member.with_settings({name: value}) == effect)
         place = grid.index(value) if value in grid else 0
         if 0 < place < len(grid) - 1 and grid[0] > 0:
-            lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
+            lower, upper = grid[place - 1], grid[place + 1]
+            if name in DECLARED:
+                below, above = DECLARED[name]
+                lower, upper = (lower, min(upper, below)) if value < below else (max(lower, above), upper)
             return _golden_section(search_problem, effect, axis, name, lower, upper)
     return effect
 
@@ -191,11 +194,15 @@ def _judge(
         and explained >= gates.explained
         and error_fall >= gates.error_fall
     )
+    # σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986).
+    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
+    floor_a = search_problem.floors_a[motor]
+    excess = 0.0 if floor_a is None else own - float(np.sum(rows)) * (floor_a / problem.noise[motor]) ** 2
     return Finding(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
-        deviations=_deviations(trial),
+        deviations=np.sqrt(np.sum(spread**2, axis=0)),
         probability=float(probability[best]),
         folds_better=folds_better,
         explained=explained,
@@ -204,23 +211,9 @@ def _judge(
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
         passed=bool(passed),
-        share_of_excess=_share_of_excess(search_problem, motor, float(trial.fallen[motor]), own),
+        share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
     )
-
-
-def _deviations(trial: Trial) -> FloatArray:
-    """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986)."""
-    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
-    return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
-
-
-def _share_of_excess(search_problem: SearchProblem, motor: int, fallen: float, own: float) -> float | None:
-    floor_a, problem = search_problem.floors_a[motor], search_problem.folds.problem
-    if floor_a is None:
-        return None
-    excess = own - float(np.sum(problem.motor == motor)) * (floor_a / problem.noise[motor]) ** 2
-    return None if excess <= 0.0 else min(fallen / excess, 1.0)
 
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
@@ -273,14 +266,6 @@ def _ambiguity_set(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedE
         and not is_better(finding, other)
         and not is_better(other, finding)
     )
-
-
-def _one_side(name: str, value: float, lower: float, upper: float) -> tuple[float, float]:
-    """Part of a bracket on the value's side of DECLARED."""
-    if name not in DECLARED:
-        return lower, upper
-    below, above = DECLARED[name]
-    return (lower, min(upper, below)) if value < below else (max(lower, above), upper)
 
 
 def _golden_section(

@@ -43,18 +43,6 @@ class Linearisation:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
 
-    def ordered(self, order: IntArray) -> Linearisation:
-        """Reorder the rows."""
-        return replace(
-            self,
-            jacobian=self.jacobian[order],
-            residual=self.residual[order],
-            current=self.current[order],
-            motor=self.motor[order],
-            cluster=self.cluster[order],
-            source=self.source[order],
-        )
-
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
         """Joint torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra).
 
@@ -236,7 +224,9 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     count = min(count, moves)
     fold_of = whole % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
-    problem = problem.ordered(np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster])))
+    order = np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster]))
+    of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
+    problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     blocks = tuple(slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))

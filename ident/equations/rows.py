@@ -13,10 +13,8 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset
-from ident.equations.system import System, Triangles, triangle, unknowns
+from ident.equations.system import Equations, System, Triangles, triangle
 from ident.errors import DataUnfit
-from ident.model.base import BaseParameters
-from ident.model.bodies import Payload
 from ident.model.model import Column, DriveTrain, Model
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
@@ -120,12 +118,9 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
 
 
 @dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
-    drive_train: DriveTrain  #: R
-    columns: tuple[Column, ...]  #: name and unit of the b columns of W: base parameters, then effects
-    base: BaseParameters  #: how the base parameters were regrouped
     current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
     robot: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
     flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
@@ -135,21 +130,7 @@ class Observation:
     run: IntArray  #: index of each row's run, shape (r,)
     move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
     mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
-    payloads: tuple[Payload, ...]  #: one for each mounting
-    #: For each mounting, its unknown parameters that these data see, as indices of LINK_PARAMETERS.
-    payload_columns: tuple[tuple[int, ...], ...]
-    runs: tuple[str, ...]  #: names of the runs
     conditioning: Conditioning  #: the filters these rows went through
-
-    @property
-    def joint_count(self) -> int:
-        """n."""
-        return int(self.current.shape[0])
-
-    @property
-    def unknowns(self) -> tuple[Column, ...]:
-        """χ, then χ_uL of each mounting: everything linear that is estimated beside the gains."""
-        return unknowns(self.columns, self.payloads, self.payload_columns)
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
@@ -166,26 +147,21 @@ class Observation:
             weights[index] = payload.known_parameters
         return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
 
-    def motor_torque(self) -> tuple[FloatArray, FloatArray]:
-        """The model's torque as each motor must give it, T τ (DriveTrain): linear part (n, p, r), known part (n, r)."""
-        to_motor, linear = self.drive_train.to_motor, self.linear()
-        mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
-        return mixed, to_motor @ self.known()
-
     def motor_columns(self) -> list[FloatArray]:
         """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, shape (p + 2, r)."""
-        linear, known = self.motor_torque()
+        to_motor, linear = self.drive_train.to_motor, self.linear()
+        mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
         return [
             np.concatenate((current[None], columns, rest[None]))
-            for current, columns, rest in zip(self.current, linear, known, strict=True)
+            for current, columns, rest in zip(self.current, mixed, to_motor @ self.known(), strict=True)
         ]
 
     def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
         return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
 
-    def only(self, rows: BoolArray) -> Observation:
-        """Keep some of the rows."""
+    def only(self, rows: BoolArray | IntArray) -> Observation:
+        """Keep some of the rows, in the order of their indices."""
         return replace(
             self,
             current=self.current[:, rows],
@@ -251,13 +227,12 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     run, move, mounting = [], [], []
     first_move = 0
     for index, data in enumerate(datasets):
-        last = first_move
+        last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
         for rows in rows_of(model, data, conditioning):
             parts.append((rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange])))
             move.append(rows.move + first_move)
             last = int(move[-1].max()) + 1
             run.append(np.full(len(rows.move), index, dtype=np.int64))
-            mounted = -1 if data.payload is None else mountings.index(data.payload.mounting)
             mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
         first_move = last
     return Observation(

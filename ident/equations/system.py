@@ -115,8 +115,8 @@ def qr_update(triangle: FloatArray | None, columns: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class System:
-    """W_tot χ_tot = ρ of several runs, W_tot = [V | −W | −W_uL | −W_kL χ_kL], χ_tot = (g, χ, χ_uL, 1)."""
+class Equations:
+    """Unknowns of eq. (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1)."""
 
     drive_train: DriveTrain  #: R
     base: BaseParameters  #: how the base parameters were regrouped
@@ -125,12 +125,6 @@ class System:
     #: For each mounting, its unknown parameters that these data see, as indices of LINK_PARAMETERS.
     payload_columns: tuple[tuple[int, ...], ...]
     runs: tuple[str, ...]  #: names of the runs
-    joints: Triangles  #: triangle of each joint's rows of W_tot, c = n + p + 1 columns
-    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
-    #: (T W χ + T W_kL χ_kL)_i holds one current alone.
-    motors: Triangles
-    #: For each move (or neighbouring moves together), the rows or the triangle of each motor's rows.
-    moves: tuple[tuple[FloatArray, ...], ...]
 
     @property
     def joint_count(self) -> int:
@@ -140,7 +134,23 @@ class System:
     @property
     def unknowns(self) -> tuple[Column, ...]:
         """χ, then χ_uL of each mounting: everything linear that is estimated beside the gains."""
-        return unknowns(self.columns, self.payloads, self.payload_columns)
+        return self.columns + tuple(
+            Column(f"{LINK_PARAMETERS[index]}:{payload.mounting}", LINK_UNITS[index])
+            for payload, indices in zip(self.payloads, self.payload_columns, strict=True)
+            for index in indices
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class System(Equations):
+    """The equations of several runs as triangles, W_tot = [V | −W | −W_uL | −W_kL χ_kL]."""
+
+    joints: Triangles  #: triangle of each joint's rows of W_tot, c = n + p + 1 columns
+    #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
+    #: (T W χ + T W_kL χ_kL)_i holds one current alone.
+    motors: Triangles
+    #: For each move (or neighbouring moves together), the rows or the triangle of each motor's rows.
+    moves: tuple[tuple[FloatArray, ...], ...]
 
     @property
     def knows_payload(self) -> bool:
@@ -172,17 +182,6 @@ class System:
             motors=folded(self.motors, 1),
             moves=tuple(tuple(held(rows, 1) for rows in move) for move in self.moves),
         )
-
-
-def unknowns(
-    columns: tuple[Column, ...], payloads: tuple[Payload, ...], payload_columns: tuple[tuple[int, ...], ...]
-) -> tuple[Column, ...]:
-    """Names and units of χ, then χ_uL of each mounting."""
-    return columns + tuple(
-        Column(f"{LINK_PARAMETERS[index]}:{payload.mounting}", LINK_UNITS[index])
-        for payload, indices in zip(payloads, payload_columns, strict=True)
-        for index in indices
-    )
 
 
 def require_rows(system: System) -> None:
