@@ -94,8 +94,12 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
     # One move holds all joints: without a log of moves, they part where every joint is at standstill.
-    move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
-    move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
+    whole = np.any(moving, axis=0)
+    move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if run.move is None else run.move[1:-1]
+    # Long moves are cut: standard errors and folds rest on many, and continuous motion would be a single one.
+    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
+    move = np.cumsum(since % round(LONGEST_MOVE_S * rate) == 0, dtype=np.int64) - 1
     return Dataset(
         name=run.name,
         rate_hz=rate,
@@ -181,18 +185,6 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
         move=np.zeros(shape[0], dtype=np.int64),
         payload=payload,
     )
-
-
-def _moves(moving: BoolArray) -> IntArray:
-    starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
-    return np.cumsum(starts, dtype=np.int64)
-
-
-def _parted(move: IntArray, longest: int) -> IntArray:
-    """Cut long moves: standard errors and folds rest on many moves, and continuous motion would be a single one."""
-    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
-    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
-    return np.cumsum((since % longest) == 0, dtype=np.int64) - 1
 
 
 def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> None:

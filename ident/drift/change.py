@@ -120,7 +120,11 @@ def decide(
     changes = tuple(
         change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
     )
-    adjusted = _holm(np.array([change.probability for change in changes]))
+    # Holm: the smallest probability counts times their number, the next times one less, never falling.
+    probabilities = np.array([change.probability for change in changes])
+    order = np.argsort(probabilities)
+    adjusted = np.empty(n)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
     differs = bool(adjusted.min(initial=1.0) <= false_alarm)
     words = _words(axes, changes, adjusted, false_alarm)
     return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
@@ -191,15 +195,6 @@ def _ratio(part: float, whole: float) -> float:
     if whole:
         return part / whole
     return math.copysign(math.inf, part) if part else 0.0
-
-
-def _holm(probabilities: FloatArray) -> FloatArray:
-    """Adjust for several tests: the smallest times their number, the next times one less, never falling."""
-    order = np.argsort(probabilities)
-    count = len(probabilities)
-    adjusted = np.empty(count)
-    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(count, 0, -1)))
-    return adjusted
 
 
 def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:

@@ -133,8 +133,15 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
     sign = 1.0 if values.sum() > 0 else -1.0
     deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, chart)
     slopes = trend_statistic(sign * values, stds, dispersion)
-    found = [_alarm(*one, chart) for one in enumerate(zip(deviations, upper, lower, slopes, strict=True))]
-    alarms = tuple(alarm for alarm in found if alarm is not None)
+    found: list[Alarm] = []
+    for index, (z, above, below, slope) in enumerate(zip(deviations, upper, lower, slopes, strict=True)):
+        if max(above, below) > chart.threshold:
+            found.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
+        elif abs(z) > chart.single:
+            found.append(Alarm(index, AlarmKind.JUMP, bool(z > 0)))
+        elif abs(slope) > chart.trend:
+            found.append(Alarm(index, AlarmKind.TREND, bool(slope > 0)))
+    alarms = tuple(found)
     # The onset of an alarm that has passed bounds no baseline: that change is over.
     present = _present(alarms, len(values))
     onset = None if present is None else _onset(present, upper, lower)
@@ -143,7 +150,10 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
         baseline, baseline_std = line.start, line.start_std
         change, change_std = steps * line.slope, steps * line.slope_std
     else:
-        first, newest = _compared(len(values), onset, chart)
+        # The baseline ends at the onset, and the newest calibrations begin behind both.
+        first = max(1, min(len(values) - 1 if onset is None else onset + 1, chart.baseline))
+        since = first if onset is None else max(first, onset + 1)
+        newest = max(1, min(_RECENT, len(values) - since))
         baseline, baseline_std = _mean(values[:first], stds[:first])
         recent, recent_std = _mean(values[-newest:], stds[-newest:])
         change = recent - baseline if len(values) > 1 else 0.0
@@ -243,30 +253,11 @@ def _bounded(stds: FloatArray, scale: float) -> FloatArray:
     return np.asarray(np.clip(relative, middle / _APART, middle * _APART))
 
 
-def _compared(count: int, onset: int | None, chart: Chart) -> tuple[int, int]:
-    """Numbers of first and of newest calibrations that are compared with each other."""
-    # The baseline ends at the onset, and the newest calibrations begin behind both.
-    first = max(1, min(count - 1 if onset is None else onset + 1, chart.baseline))
-    since = first if onset is None else max(first, onset + 1)
-    return first, max(1, min(_RECENT, count - since))
-
-
 def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
     """Mean weighted by 1/σ², and its σ."""
     weights = 1.0 / stds**2
     total = float(weights.sum())
     return float(weights @ values) / total, math.sqrt(1.0 / total)
-
-
-def _alarm(index: int, found: tuple[float, float, float, float], chart: Chart) -> Alarm | None:
-    z, upper, lower, slope = found
-    if max(upper, lower) > chart.threshold:
-        return Alarm(index, AlarmKind.DRIFT, bool(upper > lower))
-    if abs(z) > chart.single:
-        return Alarm(index, AlarmKind.JUMP, bool(z > 0))
-    if abs(slope) > chart.trend:
-        return Alarm(index, AlarmKind.TREND, bool(slope > 0))
-    return None
 
 
 def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:

@@ -143,8 +143,16 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         if not math.isfinite(value):
             raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
     for setting, allowed in _ranges(type(effect)).items():
-        if setting == "other_axis":
-            _check_other_axis(effect, settings[setting], axis, axes)
+        value = settings[setting]
+        if setting == "other_axis" and effect.abscissa is not Abscissa.OTHER_VELOCITY:
+            if value != 0:
+                raise EffectRefused(f"effect {name!r} is given other_axis = {value:g}; it has no other axis: 0")
+        elif setting == "other_axis":
+            if value not in range(1, axes + 1) or value == axis + 1:
+                raise EffectRefused(
+                    f"effect {name!r} on axis {axis + 1} is given other_axis = {value:g}; it is the number of another "
+                    f"of the {axes} axes"
+                )
         elif not allowed.least <= settings[setting] <= allowed.largest:
             raise EffectRefused(
                 f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between {allowed.least:g} and "
@@ -155,17 +163,6 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
     if "lower" in settings and not settings["lower"] < settings["upper"]:
         raise EffectRefused(
             f"effect {name!r} is given the range {settings['lower']:g} to {settings['upper']:g}; it must not be empty"
-        )
-
-
-def _check_other_axis(effect: Effect, other: float, axis: int, axes: int) -> None:
-    if effect.abscissa is not Abscissa.OTHER_VELOCITY:
-        if other != 0:
-            raise EffectRefused(f"effect {effect.name!r} is given other_axis = {other:g}; it has no other axis: 0")
-    elif other not in range(1, axes + 1) or other == axis + 1:
-        raise EffectRefused(
-            f"effect {effect.name!r} on axis {axis + 1} is given other_axis = {other:g}; it is the number of another "
-            f"of the {axes} axes"
         )
 
 

@@ -49,16 +49,10 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
         if joint.kind is JointKind.PRISMATIC:
             offset = offset + position_rad[:, index, None] * (joint.rotation @ joint.axis)
         else:
-            turn = joint.rotation @ _turns(joint.axis, position_rad[:, index])
+            x, y, z = joint.axis  # Rodrigues' formula
+            skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            angle, outer = position_rad[:, index, None, None], np.outer(joint.axis, joint.axis)
+            turn = joint.rotation @ (outer + np.cos(angle) * (np.eye(3) - outer) + np.sin(angle) * skew)
         origin[index + 1] = origin[joint.parent + 1] + np.einsum("kij,kj->ki", parent, offset)
         rotation[index + 1] = parent @ turn
     return Poses(rotation, origin)
-
-
-def _turns(axis: FloatArray, angle: FloatArray) -> FloatArray:
-    """Rotations about a unit axis (Rodrigues' formula), shape (k, 3, 3)."""
-    x, y, z = axis
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    cosine, sine = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-    outer = np.outer(axis, axis)
-    return np.asarray(outer + cosine * (np.eye(3) - outer) + sine * skew)

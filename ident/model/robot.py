@@ -168,7 +168,14 @@ def _joint(element: Element, at: _Frame) -> Joint:
     axis = np.array([1.0, 0.0, 0.0]) if declared is None else _vector(declared, "xyz", name)
     length = float(np.linalg.norm(axis))
     axis = axis / length if length > 0.0 else axis
-    _check_geometry(name, at.translation_m, axis)
+    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
+        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
+    distance = float(np.max(np.abs(at.translation_m)))
+    if not distance <= LARGEST_DISTANCE_M:
+        raise ModelError(
+            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
+            "is the URDF in mm?"
+        )
     return Joint(
         name=name,
         kind=JointKind.PRISMATIC if kind == "prismatic" else JointKind.REVOLUTE,
@@ -290,14 +297,3 @@ def _finite(text: str) -> float | None:
     except ValueError:
         return None
     return number if isfinite(number) and "_" not in text else None
-
-
-def _check_geometry(name: str, translation_m: FloatArray, axis: FloatArray) -> None:
-    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
-        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
-    distance = float(np.max(np.abs(translation_m)))
-    if not distance <= LARGEST_DISTANCE_M:
-        raise ModelError(
-            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
-            "is the URDF in mm?"
-        )

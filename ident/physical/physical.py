@@ -74,7 +74,9 @@ class Programme:
         torque_of = self.triangle @ self.grouping
         torque = (torque_of @ place) @ scalars
         for link, factor, columns in zip(links, self.factors, self.link_columns, strict=True):
-            torque = torque + (torque_of @ _linear_map(factor, columns, len(place))) @ cp.vec(link, order="C")
+            # Standard parameters of the link per entry of Q, row by row.
+            units = [link_parameters(factor @ unit.reshape(4, 4) @ factor.T) for unit in np.eye(16)]
+            torque = torque + (torque_of[:, columns] @ np.column_stack(units)) @ cp.vec(link, order="C")
         distance = cp.norm2(torque - self.triangle @ base)
         size = sum(cp.trace(link) for link in links)
         _solve(cp, cp.Minimize(distance + _TRACE * size), constraints, (*links, scalars))
@@ -171,16 +173,6 @@ def _solve(cp: Any, objective: Any, constraints: list[Any], unknowns: Sequence[A
         if problem.status in {cp.OPTIMAL, cp.OPTIMAL_INACCURATE} and all(one.value is not None for one in unknowns):
             return
     raise NotPhysical("the semidefinite programme has no solution", f"{problem.status or 'failed'} {message}".strip())
-
-
-def _linear_map(factor: FloatArray, columns: IntArray, count: int) -> FloatArray:
-    """Standard parameters per entry of Q (row by row), shape (c, 16)."""
-    out = np.zeros((count, 16))
-    for entry in range(16):
-        unit = np.zeros(16)
-        unit[entry] = 1.0
-        out[columns, entry] = link_parameters(factor @ unit.reshape(4, 4) @ factor.T)
-    return out
 
 
 DEFAULT_MASS_KG = 1.0  #: Mass of a link without one in the URDF
@@ -295,19 +287,15 @@ def regroup(model: Model, names: Sequence[str], columns: FloatArray) -> BasePara
     grouping = weights * scale / scale[list(independent), None]
     grouping[:, list(independent)] = np.eye(len(independent))
     for row, name in zip(grouping, ordered, strict=True):
-        _check_weights(name, row, index)
+        for sign, size, other in _TERM.findall(name):
+            declared = float(sign + size)
+            found = float(row[index[other]]) if other in index else float("nan")
+            if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):
+                raise ModelError(
+                    f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; this robot's "
+                    f"geometry gives {found:.6g}: it is not the robot, the gravity or the drive train of the fit"
+                )
     return BaseParameters(independent, grouping, ordered)
-
-
-def _check_weights(name: str, row: FloatArray, index: dict[str, int]) -> None:
-    for sign, size, other in _TERM.findall(name):
-        declared = float(sign + size)
-        found = float(row[index[other]]) if other in index else float("nan")
-        if not abs(found - declared) <= _SAME * max(1.0, abs(declared)):
-            raise ModelError(
-                f"the base parameter {name!r} of the calibration gathers {declared:g}*{other}; this robot's geometry "
-                f"gives {found:.6g}: it is not the robot, the gravity or the drive train of the fit"
-            )
 
 
 EXACT = 1e-6  #: Share of the torque below which a consistent set counts as predicting the identified torque
@@ -388,7 +376,11 @@ def physical_parameters(
     nearest = programme.nearest(values)
     apart = float(np.linalg.norm(triangle @ (base.grouping @ nearest - values)))
     exact = apart <= EXACT
-    directions = _null_space(base) if exact else np.eye(len(nearest))
+    directions = np.eye(len(nearest))
+    if exact:  # only the changes that keep all base parameters
+        rest = np.setdiff1d(np.arange(len(nearest)), leading)
+        directions = directions[:, rest]
+        directions[leading] = -base.grouping[:, rest]
     standard = programme.closest_to_prior(nearest, directions, values, (1.0 + SLACK) * apart)
     if exact:
         # The leading parameters take the rest of the solver's tolerance.
@@ -443,7 +435,11 @@ def _programme(
             if len(joints) == 1:
                 positive.append(index[names[0]])
             else:
-                dissipative.append((tuple(index[name] for name in names), _shares(model, joints, motors)))
+                # Contribution of each joint's, then each motor's parameter to the matrix over these joints, (p, k, k).
+                turned = [model.drive_train.direction[motor, list(joints)] for motor in motors]
+                shares = [np.diag(unit) for unit in np.eye(len(joints))]
+                shares += [np.outer(r, r) - np.diag(r**2) for r in turned]
+                dissipative.append((tuple(index[name] for name in names), np.array(shares)))
     return Programme(
         factors=np.array([np.linalg.cholesky(pseudo_inertia(link)) for link in prior.links]),
         link_columns=link_columns,
@@ -466,24 +462,5 @@ def _turned_together(model: Model) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(sorted(group)) for group in groups)
 
 
-def _shares(model: Model, joints: tuple[int, ...], motors: list[int]) -> FloatArray:
-    """Contribution of each joint's, then each motor's parameter to the matrix over these joints, shape (p, k, k)."""
-    shares = [np.diag(unit) for unit in np.eye(len(joints))]
-    for motor in motors:
-        r = model.drive_train.direction[motor, list(joints)]
-        shares.append(np.outer(r, r) - np.diag(r**2))
-    return np.array(shares)
-
-
 def _link_columns(model: Model) -> IntArray:
     return 14 * np.arange(model.robot.joint_count)[:, None] + np.arange(10)
-
-
-def _null_space(base: BaseParameters) -> FloatArray:
-    """Changes of the standard parameters that keep all base parameters, shape (c, c − b)."""
-    count = base.grouping.shape[1]
-    rest = np.setdiff1d(np.arange(count), base.independent)
-    out = np.zeros((count, len(rest)))
-    out[rest, np.arange(len(rest))] = 1.0
-    out[list(base.independent)] = -base.grouping[:, rest]
-    return out

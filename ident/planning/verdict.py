@@ -78,20 +78,17 @@ class GainVerdict:
 
     def words(self, axis_name: str) -> str:
         """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
-        if not self.sources or not np.isfinite(self.std_percent):
-            text = f"{axis_name} is not identifiable"
-        else:
-            text = f"{axis_name} is identifiable {self._through()}: σ {self.std_percent:.2g} %"
+        through = " and ".join(source.value for source in self.sources)
+        if not self.gravity_acts:
+            shared = Source.COUPLING in self.sources
+            through = "inertia" + (", partly through parameters shared with other axes" if shared else "")
+        only = "only " if len(self.sources) == 1 or not self.gravity_acts else ""
+        text = f"{axis_name} is not identifiable"
+        if self.sources and np.isfinite(self.std_percent):
+            text = f"{axis_name} is identifiable {only}through {through}: σ {self.std_percent:.2g} %"
         if self.advice is None:
             return text
         return f"{text}; add {self.advice.seconds:.0f} s of {self.advice.words} (σ {self.advice.std_percent:.2g} %)"
-
-    def _through(self) -> str:
-        if not self.gravity_acts:
-            shared = Source.COUPLING in self.sources
-            return "only through inertia" + (", partly through parameters shared with other axes" if shared else "")
-        only = "only " if len(self.sources) == 1 else ""
-        return f"{only}through " + " and ".join(source.value for source in self.sources)
 
 
 Runs = Sequence[tuple[Excitation, Sequence[int | None]]]
@@ -126,16 +123,11 @@ def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> t
             Source.INERTIA: inertia,
             Source.COUPLING: float(design.std_percent(blind)[axis]),
         }
-        verdict = _verdict(std)
+        weak = Verdict.WEAK if std <= UNSEEN_PERCENT else Verdict.UNSEEN
+        verdict = Verdict.GOOD if std <= GOOD_PERCENT else weak
         advice = None if verdict is Verdict.GOOD else _advice(axis, std, with_extras)
         judged.append(GainVerdict(axis, std, alone, acts, verdict, advice))
     return tuple(judged)
-
-
-def _verdict(std_percent: float) -> Verdict:
-    if std_percent <= GOOD_PERCENT:
-        return Verdict.GOOD
-    return Verdict.WEAK if std_percent <= UNSEEN_PERCENT else Verdict.UNSEEN
 
 
 def _advice(axis: int, std_percent: float, tried: Sequence[tuple[ExtraMoves, FloatArray]]) -> Advice | None:
@@ -151,9 +143,8 @@ def _own_rows(
 ) -> list[tuple[float, float, bool]]:
     """Judge gravity and inertia in each motor's own rows.
 
-    Returns:
-        for each motor the deviations that gravity and inertia of the known payload give alone [%], and whether gravity
-        of any body on the last link acts there.
+    Return for each motor the deviations that gravity and inertia of the known payload give alone [%], and whether
+    gravity of any body on the last link acts there.
     """
     count = len(design.expectation.gains)
     others: list[list[FloatArray]] = [[] for _ in range(count)]
