@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from ident.estimators.identify import Identification, identify
     from ident.estimators.method import Method
     from ident.model.bodies import Payload
-    from ident.model.kinematics import Motion
     from ident.model.model import DriveTrain, Model
-    from ident.model.robot import Robot, robot_from_urdf
+    from ident.model.robot import Motion, Robot, robot_from_urdf
     from ident.prediction import measured_torque, predict_current, predict_torque
 
 __all__ = [
@@ -108,9 +107,8 @@ _MODULES = {
     "ident.estimators.identify": ("Identification", "identify"),
     "ident.estimators.method": ("Method",),
     "ident.model.bodies": ("Payload",),
-    "ident.model.kinematics": ("Motion",),
     "ident.model.model": ("DriveTrain", "Model"),
-    "ident.model.robot": ("Robot", "robot_from_urdf"),
+    "ident.model.robot": ("Motion", "Robot", "robot_from_urdf"),
     "ident.prediction": ("measured_torque", "predict_current", "predict_torque"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

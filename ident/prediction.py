@@ -8,7 +8,7 @@ from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import Effect, PlacedEffect, at_joints, check_settings
+from ident.effects.effect import PlacedEffect, at_joints, check_settings
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -101,16 +101,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     axes = tuple(gain.axis for gain in calibration.gains)
     if accepted.axis not in axes:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
-    placed = PlacedEffect(_rebuilt(accepted, axes.index(accepted.axis), len(axes)), axes.index(accepted.axis))
-    values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
-    expected = tuple(column.name for column in placed.columns)
-    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
-        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
-        raise EffectRefused(f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}")
-    return placed, np.array([values[name] for name in expected])
-
-
-def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
+    axis = axes.index(accepted.axis)
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
@@ -118,12 +109,18 @@ def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
-    check_settings(known, accepted.settings, axis, axes)
+    check_settings(known, accepted.settings, axis, len(axes))
     # A file knows one kind of number; an order must be whole.
     given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:
         raise EffectRefused(f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers")
-    return known.with_settings(given)
+    placed = PlacedEffect(known.with_settings(given), axis)
+    values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
+    expected = tuple(column.name for column in placed.columns)
+    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
+        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
+        raise EffectRefused(f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}")
+    return placed, np.array([values[name] for name in expected])
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
@@ -136,7 +133,7 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
 def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
     payload = data.payload
     if payload is None:
-        return payload_parameters(None, {})
+        return np.zeros(len(LINK_PARAMETERS))
     identified: dict[str, float] = {}
     mountings: set[str] = set()
     for parameter in calibration.parameters:

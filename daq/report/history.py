@@ -13,7 +13,7 @@ from daq.files import replace_file
 from daq.ledger.watch import Series
 from daq.report.picture import BLUE, DPI, GREY, ORANGE, PURPLE, SKY, legend_below, panels, unformatted
 from daq.report.text import inert_row
-from ident.drift.chart import CHART, Chart
+from ident.drift.change import CHART, Chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

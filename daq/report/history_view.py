@@ -24,7 +24,7 @@ from daq.writeback.drive_record import drives_of
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import Scalar, rewrite_gain
-from ident.drift.chart import CHART
+from ident.drift.change import CHART
 
 
 def show(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:

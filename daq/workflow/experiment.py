@@ -14,8 +14,7 @@ from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.motion.move import Trapezoid, synchronised
 from ident.data.conditioning import decimator
-from ident.model.kinematics import Motion
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Motion, Robot
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.excitation import (
     Design,

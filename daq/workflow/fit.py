@@ -34,8 +34,18 @@ from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
-from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
-from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
+from ident.planning.excitation import (
+    GOOD_PERCENT,
+    Design,
+    Excitation,
+    Expectation,
+    ExpectedPayload,
+    ExtraMoves,
+    GainVerdict,
+    effective_noise,
+    recorded,
+    verdicts,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,9 +15,8 @@ from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCE
 from daq.workflow.experiment import Experiment, PlannedMove, duration_of, experiment_of
 from daq.workflow.plan_search import Search
 from drivers.motion.move import Trapezoid, synchronised
-from ident.model.kinematics import poses
-from ident.model.robot import JointKind
-from ident.planning.verdict import ExtraMoves
+from ident.model.robot import JointKind, poses
+from ident.planning.excitation import ExtraMoves
 
 
 @dataclass(frozen=True, slots=True)

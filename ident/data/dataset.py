@@ -11,8 +11,8 @@ from ident.data.conditioning import Conditioning, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
-from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain
+from ident.model.robot import Motion
 
 STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the speed that a joint exceeds in a twentieth of a run."""

@@ -150,12 +150,18 @@ def prepare_search(
         gains_fixed=estimate.gains_fixed,
     )
     floors = noise_floors(datasets, observation.conditioning)
+    rows: list[Signals] = []
+    for run, data in zip(runs, datasets, strict=True):
+        at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
+        arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in at_rate.items()}
+        time_s = arrays["time_s"]
+        rows.append(Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays))
     return SearchProblem(
         model=model,
         datasets=datasets,
         observation=observation,
         runs=runs,
-        rows=tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True)),
+        rows=tuple(rows),
         folds=cut(problem, whole=whole),
         floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
         cache={} if cache is None else cache,
@@ -180,15 +186,6 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     used = np.flatnonzero(observation.motor_use.any(axis=0))
     _, at = np.unique(pieces[used], return_index=True)
     return pieces, move[used[at]]
-
-
-def _at_rows(run: Signals, data: Dataset, observation: Observation) -> Signals:
-    def rows(column: FloatArray) -> FloatArray:
-        return decimate_rows(data, observation.conditioning, column)
-
-    arrays = {array.name: rows(getattr(run, array.name)) for array in fields(run) if array.name != "rate_hz"}
-    time_s = arrays["time_s"]
-    return Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays)
 
 
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
@@ -312,7 +309,7 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
         np.zeros((count, n, q)),
     )
     felt = [bool(np.any(columns[problem.motor == motor])) for motor in range(n)]
-    for rows, k, m, i in zip(folds.blocks, folds.fold, folds.move, folds.motor, strict=True):
+    for rows, k, m, i in folds.blocks:
         if not felt[i]:
             continue
         inside = columns[rows]

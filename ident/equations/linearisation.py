@@ -179,10 +179,7 @@ class Folds:
 
     problem: Linearisation  #: the linearisation, its rows sorted by fold, move and motor
     moves: int  #: whole moves that the folds were dealt, whatever pieces the problem's clusters are
-    blocks: tuple[slice, ...]  #: rows of each block
-    fold: IntArray  #: of each block, shape (blocks,)
-    move: IntArray  #: of each block, shape (blocks,)
-    motor: IntArray  #: of each block, shape (blocks,)
+    blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, move and motor of each block
     whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
@@ -201,7 +198,7 @@ class Folds:
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
         total = np.zeros((self.count, len(self.problem.gamma)))
-        for rows, fold, motor in zip(self.blocks, self.fold, self.motor, strict=True):
+        for rows, fold, _, motor in self.blocks:
             total[fold, motor] += float(residual[rows] @ residual[rows])
         return total
 
@@ -229,13 +226,13 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
-    blocks = tuple(slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
+    rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
     move, motor = problem.cluster[starts], problem.motor[starts]
-    fold = fold_of[move]
+    blocks = tuple(zip(rows_of, fold_of[move].tolist(), move.tolist(), motor.tolist(), strict=True))
     move_hessian, move_score = np.zeros((problem.moves, width, width)), np.zeros((problem.moves, width))
     part_hessian = np.zeros((count, motors, width, width))
     motor_score = np.zeros((motors, width))
-    for rows, k, m, i in zip(blocks, fold, move, motor, strict=True):
+    for rows, k, m, i in blocks:
         inside = problem.jacobian[rows]
         gram, score = inside.T @ inside, inside.T @ problem.residual[rows]
         move_hessian[m] += gram
@@ -256,7 +253,7 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores, strict=True)]
     residual = np.empty_like(problem.residual)
     part_score = np.zeros((count, motors, width))
-    for rows, k, i in zip(blocks, fold, motor, strict=True):
+    for rows, k, _, i in blocks:
         inside = problem.jacobian[rows]
         residual[rows] = problem.residual[rows] - inside @ steps[k]
         part_score[k, i] += inside.T @ residual[rows]
@@ -264,9 +261,6 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
         problem=problem,
         moves=moves,
         blocks=blocks,
-        fold=fold,
-        move=move,
-        motor=motor,
         whole=linalg.cho_factor(hessian, lower=True),
         factors=tuple(factors),
         scores=np.stack(scores),

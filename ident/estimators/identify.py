@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,19 +91,15 @@ def identify(
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
     if fixed_gains is None:
-        require_seen_payload(estimate if method is Method.ML else _ml_or(estimate, system), system)
+        judged = estimate
+        # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
+        # contradict each other; ml's do, where it has an estimate.
+        with suppress(DataUnfit, NotConverged, RankDeficient, TooFewMoves):
+            judged = estimate if method is Method.ML else ml(system)
+        require_seen_payload(judged, system)
     rest = reduce_runs(model, _mounted_among(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)
-
-
-def _ml_or(estimate: Estimate, system: System) -> Estimate:
-    """``ml``'s estimate where it has one: the deviations of the linear ones are those of independent rows (eqs. 10, 23)
-    and do not see that moves contradict each other."""
-    try:
-        return ml(system)
-    except (DataUnfit, NotConverged, RankDeficient, TooFewMoves):
-        return estimate
 
 
 def require_seen_payload(estimate: Estimate, system: System) -> None:

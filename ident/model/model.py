@@ -9,9 +9,8 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
-from ident.model.kinematics import Motion
 from ident.model.regressor import fill_rigid
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""

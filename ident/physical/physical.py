@@ -16,9 +16,8 @@ from ident.errors import IdentificationError, ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
 from ident.model.bodies import Body, link_parameters, pseudo_inertia
-from ident.model.kinematics import Motion
 from ident.model.model import Model
-from ident.model.robot import read_urdf
+from ident.model.robot import Motion, read_urdf
 
 MARGIN = 1e-4  #: Every pseudo-inertia is at least this share of its prior's, in every direction (Q ⪰ MARGIN·1)
 _ROOM = 2.0  #: The first programme keeps this multiple of the margin, so that the second has room to search

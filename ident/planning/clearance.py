@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.model.kinematics import poses
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Robot, poses
 
 BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004

@@ -13,9 +13,8 @@ from scipy.linalg import solve_triangular
 from ident.equations.system import qr_update
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS
-from ident.model.kinematics import Motion
 from ident.model.regressor import fill_rigid
-from ident.model.robot import Robot
+from ident.model.robot import Motion, Robot
 
 FloatArray = NDArray[np.float64]
 
