@@ -88,30 +88,22 @@ __all__ = [
 
 # Importing the package stays light: a name brings its module along when it is first used.
 _MODULES = {
-    "ident.calibration": ("Calibration", "calibration_of"),
-    "ident.data.conditioning": ("Conditioning",),
-    "ident.data.dataset": ("Dataset", "differentiate", "planned"),
-    "ident.data.run": ("Run",),
-    "ident.discovery.loop": ("Evidence", "Step", "find_effects", "gather"),
-    "ident.errors": (
-        "DataUnfit",
-        "EffectRefused",
-        "IdentificationError",
-        "ModelError",
-        "NotConverged",
-        "PayloadUnseen",
-        "RankDeficient",
-        "TooFewMoves",
-    ),
-    "ident.estimators.estimate": ("Estimate", "RelativeError"),
-    "ident.estimators.identify": ("Identification", "identify"),
-    "ident.estimators.method": ("Method",),
-    "ident.model.bodies": ("Payload",),
-    "ident.model.model": ("DriveTrain", "Model"),
-    "ident.model.robot": ("Motion", "Robot", "robot_from_urdf"),
-    "ident.prediction": ("measured_torque", "predict_current", "predict_torque"),
+    "ident.calibration": "Calibration calibration_of",
+    "ident.data.conditioning": "Conditioning",
+    "ident.data.dataset": "Dataset differentiate planned",
+    "ident.data.run": "Run",
+    "ident.discovery.loop": "Evidence Step find_effects gather",
+    "ident.errors": "DataUnfit EffectRefused IdentificationError ModelError NotConverged PayloadUnseen RankDeficient "
+    "TooFewMoves",
+    "ident.estimators.estimate": "Estimate RelativeError",
+    "ident.estimators.identify": "Identification identify",
+    "ident.estimators.method": "Method",
+    "ident.model.bodies": "Payload",
+    "ident.model.model": "DriveTrain Model",
+    "ident.model.robot": "Motion Robot robot_from_urdf",
+    "ident.prediction": "measured_torque predict_current predict_torque",
 }
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 
 if not TYPE_CHECKING:  # a type checker knows the names from above, and no others

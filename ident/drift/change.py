@@ -147,7 +147,17 @@ def decide(
     adjusted = np.empty(n)
     adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
     differs = bool(adjusted.min(initial=1.0) <= false_alarm)
-    words = _words(axes, changes, adjusted, false_alarm)
+    words = "no gain to compare"
+    if axes:
+        parts = [
+            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {n})"
+            for axis, change, p in zip(axes, changes, adjusted, strict=True)
+        ]
+        largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
+        words = f"no gain has changed by more than noise: the largest change is {largest}"
+        if differs:
+            changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= false_alarm]
+            words = f"changed by more than noise: {', '.join(changed)}"
     return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
 
 
@@ -216,20 +226,6 @@ def _ratio(part: float, whole: float) -> float:
     if whole:
         return part / whole
     return math.copysign(math.inf, part) if part else 0.0
-
-
-def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:
-    if not axes:
-        return "no gain to compare"
-    parts = [
-        f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {len(axes)})"
-        for axis, change, p in zip(axes, changes, adjusted, strict=True)
-    ]
-    changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= level]
-    if changed:
-        return f"changed by more than noise: {', '.join(changed)}"
-    largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
-    return f"no gain has changed by more than noise: the largest change is {largest}"
 
 
 def _short(sigmas: float) -> str:
@@ -349,7 +345,10 @@ def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION,
     alarms = tuple(found)
     # The onset of an alarm that has passed bounds no baseline: that change is over.
     present = _present(alarms, len(values))
-    onset = None if present is None else _onset(present, upper, lower)
+    onset = None if present is None else 0
+    if present is not None and present.kind is not AlarmKind.TREND:
+        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change point).
+        onset = int(np.flatnonzero((upper if present.rose else lower)[: present.index + 1] == 0.0)[-1])
     if present is not None and present.kind is AlarmKind.TREND:
         line, steps = fit_line(values, stds), len(values) - 1
         baseline, baseline_std = line.start, line.start_std
@@ -468,11 +467,3 @@ def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
 def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:
     """Alarm of the newest of `count` calibrations."""
     return alarms[-1] if alarms and alarms[-1].index == count - 1 else None
-
-
-def _onset(alarm: Alarm, upper: FloatArray, lower: FloatArray) -> int:
-    """Last calibration where the sum that has the alarm was zero (Page's estimate of the change point)."""
-    if alarm.kind is AlarmKind.TREND:
-        return 0
-    sums = (upper if alarm.rose else lower)[: alarm.index + 1]
-    return int(np.flatnonzero(sums == 0.0)[-1])

@@ -165,7 +165,7 @@ class Design:
         out = np.zeros((self.size, self.size))
         gains = np.arange(self.others, self.size)
         for payload in payloads:
-            place, source = self._columns(payload)
+            place, source = self.columns(payload)
             out[np.ix_(place, place)] += summed[np.ix_(source, source)]
             torque = np.tile(self.expected(payload), (len(grams), 1))
             if blind is not None and payload is not None:
@@ -174,13 +174,6 @@ class Design:
             out[np.ix_(place, gains)] -= seen[:, source].T
             out[gains, gains] += np.einsum("na,na->n", seen, torque)
         out[self.others :, : self.others] = out[: self.others, self.others :].T
-        return out
-
-    def others_of(self, whitened: FloatArray, payload: int | None) -> FloatArray:
-        """Columns of J for all unknowns but the gains, by motor, shape (n, k, others)."""
-        place, source = self._columns(payload)
-        out = np.zeros((len(whitened), whitened.shape[2], self.others))
-        out[:, :, place] = whitened[:, source].transpose(0, 2, 1)
         return out
 
     def expected(self, payload: int | None) -> FloatArray:
@@ -195,7 +188,7 @@ class Design:
         mounted[list(self.expectation.payloads[payload].unknown)] = 0.0
         return np.concatenate((np.zeros(len(self.base.independent)), mounted))
 
-    def _columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
+    def columns(self, payload: int | None) -> tuple[IntArray, IntArray]:
         """Unknowns of a run, and the columns of ``whitened`` that they belong to."""
         base = len(self.base.independent)
         place, source = list(range(base)), list(range(base))
@@ -454,7 +447,9 @@ def _own_rows(
         weights += np.einsum("nck,nck->n", static[:, -10:], static[:, -10:])
         wholes += np.einsum("nck,nck->n", columns[:, -10:], columns[:, -10:])
         for payload in payloads:
-            rest = design.others_of(columns, payload)
+            place, source = design.columns(payload)
+            rest = np.zeros((count, columns.shape[2], design.others))  # columns of J for all unknowns but the gains
+            rest[:, :, place] = columns[:, source].transpose(0, 2, 1)
             mounted = np.zeros(columns.shape[1]) if payload is None else design.known(payload)
             gravity = np.einsum("nck,c->nk", static, mounted)
             inertia = np.einsum("nck,c->nk", columns, mounted) - gravity
