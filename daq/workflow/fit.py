@@ -143,9 +143,9 @@ BOOTSTRAP_SEED = 0
 
 
 def fit_logs(
-    logs: Sequence[Path],
+    logs: Sequence[Path | str],
     *,
-    holdout: Sequence[Path] = (),
+    holdout: Sequence[Path | str] = (),
     cell: Cell | None = None,
     effects: bool = True,
     created: datetime | None = None,
@@ -166,7 +166,7 @@ def fit_logs(
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
-    fitted = fit(logs, holdout=holdout, cell=cell)
+    fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell)
     if effects:
         fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
     return calibration_of(fitted, created or datetime.now(UTC))
