@@ -19,7 +19,7 @@ read a log                          `read_log` (raw counts), `load_run` (SI unit
 logs to a `Calibration`              `fit_logs`; in steps: `fit`, `close_loop`, `calibration_of`, `Fit`
 keep a calibration                  `save_calibration`, `load_calibration`
 test it on other logs               `validate`, `Validation`
-where the gains are written         `FileTarget`, `DriveTarget`
+where the gains are written         `FileTarget`, `ControllerFormat`, `DriveTarget`
 write them, and undo it             `Request`, `propose`, `Proposal`, `apply`, `Written`, `rollback`
 errors                              `DaqError` and its subclasses (daq/errors.py)
 ==================================  ==============================================================================
@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.config.cell_file import load_cell
+    from daq.config.controller import ControllerFormat
     from daq.errors import (
         CalibrationRefused,
         ConfigurationError,
@@ -67,6 +68,7 @@ __all__ = [
     "Cell",
     "ConfigurationError",
     "ControllerChanged",
+    "ControllerFormat",
     "ControllerUnfit",
     "DaqError",
     "DataError",
@@ -101,6 +103,7 @@ __all__ = [
 _HOMES = {
     "daq.config.cell": ("Cell",),
     "daq.config.cell_file": ("load_cell",),
+    "daq.config.controller": ("ControllerFormat",),
     "daq.log.conversion": ("load_run",),
     "daq.log.reader": ("Log", "LossyLogs", "read_log"),
     "daq.workflow.calibration_file": ("load_calibration", "save_calibration"),

@@ -10,7 +10,7 @@ import importlib
 import inspect
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,8 @@ from daq.simulation.simulation_file import SimulationModel
 from daq.workflow.calibration_file import CalibrationDocument
 from daq.writeback.gates.table import GATES
 from drivers.errors import DriverError
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect
 from ident.errors import IdentificationError
 
 SCHEMAS: dict[str, tuple[str, type[BaseModel]]] = {
@@ -271,6 +273,26 @@ def gates() -> str:
     return head + "\n".join(rows)
 
 
+def effects() -> str:
+    """Return the table of the effect dictionary, in the order in which the search tries it."""
+    rows = ["| effect | torque | settings tried | signature |", "|---|---|---|---|"]
+    for family in EFFECTS:
+        text = " ".join((inspect.getdoc(type(family[0])) or "").split())
+        signature = text.partition("Signature: ")[2].rstrip(".")
+        cells = (f"`{family[0].name}`", _summary(type(family[0])), _settings(family), signature)
+        rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(rows)
+
+
+def _settings(family: Sequence[Effect]) -> str:
+    """Values of the searched parameters; of more than four only the range."""
+    parts = []
+    for name in family[0].settings:
+        values = [f"{value:.3g}" for value in sorted({effect.settings[name] for effect in family})]
+        parts.append(f"`{name}` " + (", ".join(values) if len(values) <= 4 else f"{values[0]} to {values[-1]}"))
+    return "; ".join(parts)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "command line": command_line,
     "cell file": cell_file,
@@ -278,5 +300,6 @@ PARTS: dict[str, Callable[[], str]] = {
     "errors": errors,
     "api": api,
     "gates": gates,
+    "effects": effects,
 }
 """What a page can ask for."""

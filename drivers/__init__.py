@@ -133,7 +133,7 @@ _MODULES = {name: home for home, names in _HOMES.items() for name in names.split
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
     name_there = "scan_bus" if name == "scan" else name
     module = import_module(f"{__name__}.{_MODULES.get(name_there, 'errors')}")
     value = globals()[name] = getattr(module, name_there)

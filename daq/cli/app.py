@@ -25,7 +25,7 @@ VERBS = (
     Listed("demo", "daq.cli.simulate:DEMO", "Run the whole calibration on a simulated six-axis cell."),
     Listed("init", "daq.cli.init:INIT", "Create a folder for a new cell, with templates to fill in."),
     Listed("scan", "daq.cli.scan:SCAN", "Compare the nodes on the bus with the cell file."),
-    Listed("monitor", "daq.cli.monitor:MONITOR", "Show the state of the axes; nothing is changed."),
+    Listed("monitor", "daq.cli.scan:MONITOR", "Show the state of the axes; nothing is changed."),
     Listed("explain-emcy", "daq.cli.scan:EXPLAIN_EMCY", "Explain an error code of an amplifier."),
     Listed("plan", "daq.cli.record:PLAN", "Choose moves that excite every parameter."),
     Listed("record", "daq.cli.record:RECORD", "Execute a plan and log it; this moves the robot."),
@@ -33,13 +33,13 @@ VERBS = (
     Listed("salvage", "daq.cli.logs:SALVAGE", "Save the readable part of an unfinished or damaged log."),
     Listed("import", "daq.cli.logs:IMPORT", "Convert CSV files to a log."),
     Listed("fit", "daq.cli.fit:FIT", "Identify all drive gains and dynamic parameters."),
-    Listed("residual", "daq.cli.residual:RESIDUAL", "Fit, then detect and add missing effects."),
+    Listed("residual", "daq.cli.fit:RESIDUAL", "Fit, then detect and add missing effects."),
     Listed("fleet", "daq.cli.fleet:FLEET", "Fit the logs of many cells."),
     Listed("validate", "daq.cli.validate:VALIDATE", "Predict the torque of other logs with a calibration."),
     Listed("export", "daq.cli.export:EXPORT", "Write a calibration or a log for other programs."),
     Listed("sign", "daq.cli.sign:SIGN", "Sign a calibration as its second approver."),
     Listed("apply", "daq.cli.apply:APPLY", "Write gains to the controller; a dry run without --yes."),
-    Listed("rollback", "daq.cli.rollback:ROLLBACK", "Undo the last write."),
+    Listed("rollback", "daq.cli.apply:ROLLBACK", "Undo the last write."),
     Listed("history", "daq.cli.history:HISTORY", "Show the calibrations of a cell and any drift."),
     Listed("recalibrate", "daq.cli.recalibrate:RECALIBRATE", "Scheduled job: record, fit, propose or apply."),
     Listed("install-units", "daq.cli.recalibrate:INSTALL_UNITS", "Schedule the job with systemd or cron."),
@@ -76,20 +76,12 @@ def build_app() -> typer.Typer:
     )
     app.callback()(_options)
     for listed in VERBS:
-        app.command(listed.name, help=listed.summary)(_placeholder)
+        app.command(listed.name, help=listed.summary)(lambda: None)  # never called
     return app
 
 
-def _placeholder() -> None:
-    """Entry in the list of verbs; never called."""
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command line and return its exit code.
-
-    Args:
-        arguments: without the command's name; None for those of this process.
-    """
+    """Run one command line, by default that of this process, and return its exit code."""
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
@@ -131,14 +123,10 @@ def _output_failed(error: OSError) -> int:
 
 def show_error(error: Exception, console: Console) -> None:
     """Print subject, found, expected and remedy of an error, a line each, and its notes."""
-    lines = [("error", str(error), "bold red")]
+    lines = [("error", error.subject if isinstance(error, DaqError) else str(error), "bold red")]
     if isinstance(error, DaqError):
-        lines = [
-            ("error", error.subject, "bold red"),
-            ("found", error.found, "bold"),
-            ("expected", error.expected, "bold"),
-            ("do", error.remedy, "bold"),
-        ]
+        parts = (("found", error.found), ("expected", error.expected), ("do", error.remedy))
+        lines += [(label, text, "bold") for label, text in parts]
     notes = getattr(error, "__notes__", ())
     lines += [(label, text, "bold") for label, _, text in (note.partition(": ") for note in notes) if label in NOTES]
     # A stop of the axes that could not be confirmed is a note on the error.

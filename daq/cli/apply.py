@@ -1,43 +1,48 @@
-"""`drivegain apply`: write the identified gains to the controller's file or to its drives; a dry run without --yes."""
+"""`drivegain apply` and `rollback`: write the identified gains to the controller's file or to its drives, and undo it.
+
+Both are dry runs without --yes, but for the rollback of a file, whose backup can be reviewed.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
+import os
 import shlex
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
+from daq.cli.terminal import at_most_one, interruptible, writing
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.cli.writing import (
-    Applier,
-    ByOption,
-    DrivesOption,
-    RamOnlyOption,
-    SaveUnknownOption,
-    applier,
-    audit_of,
-    drives_on_the_bus,
-    query_history,
-    record_in_history,
-    saving_of,
-    saving_text,
-)
-from daq.errors import CalibrationRefused, OutputFailed, UsageError
+from daq.environment import login
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.config.policy import ApplyPolicy
+    from daq.ledger.judgement import Known
     from daq.ledger.ledger import Ledger
-    from daq.writeback.request import Edit, Request
+    from daq.writeback.drive_target import DriveTarget
+    from daq.writeback.request import GainChange, Request
     from daq.writeback.target import E, Proposal, Target, Written
+    from drivers.canopen.parameters import Saving
     from ident.calibration import Calibration
+
+_LOG = logging.getLogger("drivegain")
+
+ByOption = Annotated[str | None, typer.Option("--by", help="Name of the operator for the audit; by default the login.")]
+DrivesOption = Annotated[bool, typer.Option("--drives", help="The objects in the drives, not the controller's file.")]
+RamOnlyOption = Annotated[bool, typer.Option("--ram-only", help="Do not save: a power cycle loses the gains.")]
+SaveUnknownOption = Annotated[
+    bool, typer.Option("--save-unknown", help="Save even if it is unknown what a drive saves.")
+]
 
 
 def apply_verb(
@@ -46,25 +51,19 @@ def apply_verb(
     to: Annotated[Path | None, typer.Option(help="Controller file, instead of the one that the cell names.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write; without it the change is only shown.")] = False,
     base: Annotated[
-        str | None, typer.Option("--base", help="Write only the change whose dry run printed this BEFORE-AFTER.")
+        str | None, typer.Option("--base", help="Write only the change with this BEFORE-AFTER of its dry run.")
     ] = None,
     by: ByOption = None,
     payload_mass: Annotated[
-        list[str] | None,
-        typer.Option(help="NAME=KG: mass of a payload from the scale, where `record --mass` was not given."),
+        list[str] | None, typer.Option(help="NAME=KG from the scale, for a payload recorded without --mass.")
     ] = None,
-    max_change_percent: Annotated[
-        float | None, typer.Option(help="Largest change from the gain in the file; at most the cell's.", min=0.0)
-    ] = None,
+    max_change_percent: Annotated[float | None, typer.Option(help="Tighter bound on the change [%].", min=0.0)] = None,
     max_nameplate_percent: Annotated[
-        float | None, typer.Option(help="Largest distance from the nameplate; at most the cell's.", min=0.0)
+        float | None, typer.Option(help="Tighter bound on the distance from the nameplate [%].", min=0.0)
     ] = None,
-    max_std_percent: Annotated[
-        float | None, typer.Option(help="Largest standard deviation of a gain; at most the cell's.", min=0.0)
-    ] = None,
+    max_std_percent: Annotated[float | None, typer.Option(help="Tighter bound on σ [%].", min=0.0)] = None,
     configuration_changed: Annotated[
-        bool,
-        typer.Option("--configuration-changed", help="Accept a cell configuration that changed since the recording."),
+        bool, typer.Option("--configuration-changed", help="Accept a cell file that changed since the recording.")
     ] = False,
     drives: DrivesOption = False,
     ram_only: RamOnlyOption = False,
@@ -97,10 +96,7 @@ def apply_verb(
     audit = audit_of(declared, (cell, calibration, to))
     undo = f"drivegain rollback --cell {shlex.quote(str(cell))}"
     if drives:
-        if to is not None:
-            raise UsageError(
-                "--drives", found="--to beside it", expected="one target", remedy="leave out one of the two"
-            )
+        at_most_one(drives=drives, to=to)
         opening = drives_on_the_bus(declared, saving_of(ram_only, save_unknown))
         apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
         return
@@ -120,18 +116,8 @@ def apply_to(
     yes: bool,
     json: bool,
 ) -> None:
-    """Show what a calibration changes in a target of a cell, and write it with `yes`.
-
-    Args:
-        opening: opens the target.
-        declared: the cell.
-        request: what is to be written.
-        actor: the operator.
-        audit: file of the audit, None for none.
-        undo: command that undoes the write.
-        yes: write.
-        json: print a document instead of text.
-    """
+    """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it."""
+    from daq.files import sha256
     from daq.report.proposal import describe, show
     from daq.writeback.target import apply, propose
 
@@ -144,30 +130,28 @@ def apply_to(
             show(proposal, Console(), known)
         try:
             if yes:
-                written = apply(proposal, request.now, audit=audit, who=str(actor))
+                with writing(edit.place):
+                    written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
             if json:
                 print_json(describe(proposal, None, known))
             raise
-        except OSError as error:
-            raise OutputFailed.of(edit.place, error) from error
     if yes and not proposal.refusals:
-        record_in_history(declared, actor, lambda ledger: _enter(ledger, edit, written, request))
+
+        def enter(ledger: Ledger) -> None:
+            # A write of an earlier command too, that was killed before it could enter it.
+            digest, entry = sha256(request.signed), None if written is None else written.audit_sha256
+            ledger.add(request.calibration, digest=digest, at=request.now)
+            after = sha256(edit.after)
+            ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=after, entry=entry)
+
+        record_in_history(declared, actor, enter)
     if json:
         print_json(describe(proposal, written, known))
     else:
         _show_outcome(proposal, written, audit, undo, yes=yes)
     if proposal.refusals:
         raise proposal.error
-
-
-def _enter(ledger: Ledger, edit: Edit, written: Written | None, request: Request) -> None:
-    """Enter the write into the history; also one of an earlier command that was killed before it could."""
-    from daq.files import sha256
-
-    digest, entry = sha256(request.signed), None if written is None else written.audit_sha256
-    ledger.add(request.calibration, digest=digest, at=request.now)
-    ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=sha256(edit.after), entry=entry)
 
 
 def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | None, undo: str, *, yes: bool) -> None:
@@ -183,7 +167,7 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
             console.print(f"  --yes --base {edit.base}")
     elif written is not None and isinstance(target, DriveTarget):
         console.print(f"Written to the drives and read back; {written.backup} has the values before.", end=" ")
-        console.print(saving_text(target.saving))
+        console.print(_saving_text(target.saving))
         console.print(f"To undo: {undo}")
     elif written is not None:
         backup = "none" if written.backup is None else written.backup.name
@@ -201,40 +185,25 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
 def tightened(
     policy: ApplyPolicy, change_percent: float | None, nameplate_percent: float | None, std_percent: float | None
 ) -> ApplyPolicy:
-    """Take bounds of the command line into the cell's policy; they may be tighter and not wider.
-
-    Args:
-        policy: of the cell.
-        change_percent, nameplate_percent, std_percent: requested bounds [%]; None leaves the cell's.
-
-    Raises:
-        UsageError: one is wider.
-    """
-    return replace(
-        policy,
-        max_change_percent=_tighter("max_change_percent", change_percent, policy.max_change_percent),
-        max_nameplate_percent=_tighter("max_nameplate_percent", nameplate_percent, policy.max_nameplate_percent),
-        max_std_percent=_tighter("max_std_percent", std_percent, policy.max_std_percent),
-    )
-
-
-def _tighter(name: str, asked: float | None, allowed: float) -> float:
-    if asked is None or asked <= allowed:
-        return allowed if asked is None else asked
-    raise UsageError(
-        f"--{name.replace('_', '-')} {asked:g}",
-        found="a bound that is wider than the cell's",
-        expected=f"at most {allowed:g}",
-        remedy=f"the person responsible for the cell may widen it in its file: `policy: {{apply: {{{name}: ...}}}}`",
-    )
+    """Take bounds of the command line [%] into the cell's policy, none of them wider; None leaves the cell's."""
+    names = ("max_change_percent", "max_nameplate_percent", "max_std_percent")
+    asked = zip(names, (change_percent, nameplate_percent, std_percent), strict=True)
+    tighter: dict[str, Any] = {name: bound for name, bound in asked if bound is not None}
+    for name, bound in tighter.items():
+        allowed = getattr(policy, name)
+        if not bound <= allowed:
+            raise UsageError(
+                f"--{name.replace('_', '-')} {bound:g}",
+                found="a bound that is wider than the cell's",
+                expected=f"at most {allowed:g}",
+                remedy="the person responsible for the cell may widen it in its file: "
+                f"`policy: {{apply: {{{name}: ...}}}}`",
+            )
+    return replace(policy, **tighter)
 
 
 def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str, float]:
-    """Parse the values of --payload-mass: masses by payload [kg].
-
-    Raises:
-        UsageError: not NAME=KG, or no log of the calibration had that payload.
-    """
+    """Parse the values of --payload-mass, NAME=KG of payloads in the calibration's logs: masses by payload [kg]."""
     mounted = tuple(dict.fromkeys(one.payload for one in calibration.sources if one.payload is not None))
     found = {}
     for text in entries:
@@ -255,3 +224,221 @@ def entered_masses(entries: Sequence[str], calibration: Calibration) -> dict[str
 
 
 APPLY = Verb("apply", apply_verb, "drivegain apply calibration.yaml --cell cells/demo.yaml --yes")
+
+
+def rollback(
+    cell: Annotated[Path | None, typer.Option(help="Cell file; it names the controller file and the audit.")] = None,
+    to: Annotated[Path | None, typer.Option("--to", help="Another controller file than the cell's.")] = None,
+    by: ByOption = None,
+    drives: DrivesOption = False,
+    ram_only: RamOnlyOption = False,
+    save_unknown: SaveUnknownOption = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --drives: write, not only show.")] = False,
+    audit: Annotated[Path | None, typer.Option("--audit", help="Audit file, where no --cell names it.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Undo the last write to a controller file; the replaced content is backed up too, so a second rollback undoes it.
+
+    A file that was edited since, and a backup that was changed, are refused. With --to alone the audit is not known:
+    give it with --audit, or the rollback is not in an audit. Drives are shown first and written with --yes: their
+    values are in no file that could be reviewed.
+    """
+    from daq.config.cell_file import load_cell
+    from daq.report.proposal import describe_file_rollback, show_file_rollback
+    from daq.writeback import target
+    from daq.writeback.file_target import FileTarget
+
+    declared = None if cell is None else load_cell(cell)
+    at_most_one(audit=audit, cell=cell)  # writes to a cell's controller are in the cell's audit
+    if drives:
+        at_most_one(drives=drives, to=to)
+    if cell is None and (to is None or drives):
+        raise UsageError(
+            "rollback",
+            found="no cell" if drives else "neither a cell nor a controller file",
+            expected="--cell CELL, which says where the gains are",
+            remedy="name the cell whose controller is to be rolled back",
+        )
+    now, actor, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
+    if audit is not None:
+        require_separate_audit(audit, (to,))
+    if drives and declared is not None:
+        saving = saving_of(ram_only, save_unknown)
+        rollback_drives(declared, now=now, actor=actor, saving=saving, audit=book, yes=yes, json=json)
+        return
+    path = to if declared is None else to or declared.controller_path
+    if path is None:
+        raise ConfigurationInconsistent(
+            f"{cell}: controller", found="no file", expected="one", remedy="give it with --to FILE"
+        )
+    format_ = None if declared is None or declared.controller is None else declared.controller.format
+    with writing(path):
+        written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=book, who=str(actor))
+    if declared is not None:
+        _enter_rollback(declared, written, now, actor)
+    if json:
+        print_json({**describe_file_rollback(written), "audit": None if book is None else str(book)})
+        return
+    console = Console(soft_wrap=True, highlight=False)
+    show_file_rollback(written, console)
+    if book is None:
+        console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
+
+
+def rollback_drives(
+    declared: Cell, *, now: datetime, actor: Applier, saving: Saving, audit: Path | None, yes: bool, json: bool
+) -> None:
+    """Show the values in the drives before the last write, and restore them with `yes`; a second time undoes it."""
+    from daq.report.proposal import describe_drive_rollback, show_drive_rollback
+    from daq.writeback import target
+    from daq.writeback.drive_record import record_folder
+
+    written: Written | None = None
+    console = Console(soft_wrap=True, highlight=False, markup=False)
+    with drives_on_the_bus(declared, saving) as drives:
+        planned = drives.plan_rollback()
+        if not json:
+            show_drive_rollback(planned, console)
+        if yes:
+            with writing(record_folder(declared)):
+                written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
+    if written is not None:
+        _enter_rollback(declared, written, now, actor)
+    if json:
+        print_json(describe_drive_rollback(planned, written))
+    elif written is None:
+        console.print("Dry run, nothing was written. To restore them, repeat the command with --yes.")
+    else:
+        backup = "" if written.backup is None else written.backup.name
+        console.print(f"Restored the values of {planned.source}; those before are now in {backup}.", end=" ")
+        console.print(_saving_text(saving))
+
+
+def _enter_rollback(cell: Cell, written: Written, now: datetime, actor: Applier) -> None:
+    from daq.files import sha256
+
+    target, after, entry = written.edit.subject, sha256(written.edit.after), written.audit_sha256
+    record_in_history(
+        cell, actor, lambda ledger: ledger.record_rolled_back(at=now, target=target, sha256_after=after, entry=entry)
+    )
+
+
+ROLLBACK = Verb("rollback", rollback, "drivegain rollback --cell cells/demo.yaml")
+
+
+@dataclass(frozen=True, slots=True)
+class Applier:
+    """The operator."""
+
+    name: str  #: as given, or the login
+    login: str  #: of the operating system
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every name that is the operator's: none of them is a second person."""
+        return tuple(dict.fromkeys((self.name, self.login)))
+
+    def __str__(self) -> str:
+        return self.name if self.name == self.login else f"{self.name} (login {self.login})"
+
+
+def applier(by: str | None) -> Applier:
+    """Return the operator, by the name given, which must be printable."""
+    user = login()
+    if by is not None and not by.isprintable():
+        raise UsageError(
+            f"--by {by!a}", found="characters that cannot be shown", expected="a name", remedy="type it again"
+        )
+    return Applier(by or user, user)
+
+
+def audit_of(cell: Cell, others: Iterable[Path | None]) -> Path | None:
+    """Return the audit file of a cell, which is no other file of the command; None for a cell read from a log."""
+    if cell.history is None:
+        return None
+    require_separate_audit(cell.history.audit, (cell.history.store, cell.controller_path, *others))
+    return cell.history.audit
+
+
+def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
+    """Refuse an audit that is another file of the command, by any name, whether it exists or not."""
+    for other in others:
+        if other is None:
+            continue
+        same = os.path.realpath(audit) == os.path.realpath(other)
+        with suppress(OSError):
+            same = same or audit.samefile(other)
+        if same:
+            raise AuditUnusable(
+                str(audit),
+                found=f"the same file as {other}",
+                expected="a file of the audit's own",
+                remedy="correct `history.audit` of the cell file, or --audit; nothing was written",
+            )
+
+
+def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
+    """Return the figures of the cell's history that a change is judged by; none where it cannot be read."""
+    from daq.files import sha256
+    from daq.ledger.judgement import NOTHING, known_of
+    from daq.ledger.store import HistoryStore
+
+    if cell.history is None:
+        return NOTHING
+    try:
+        with HistoryStore(cell.history.store) as store:
+            return known_of(store, target, sha256(request.signed), changes)
+    except DaqError as error:
+        _LOG.warning("the history cannot be read: the numbers in the controller are taken as exact: %s", error)
+        return NOTHING
+
+
+def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], object]) -> None:
+    """Enter a write into the cell's history; a history that cannot take it is only warned about."""
+    from daq.ledger.ledger import Ledger
+
+    if cell.history is None:
+        return
+    try:
+        with Ledger(cell, cell.history, str(actor)) as ledger:
+            record(ledger)
+    except Exception as error:  # noqa: BLE001 - the controller has its gains: no error of the history may call that undone
+        _LOG.warning("the history does not know of this: %s", error)
+
+
+def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
+    """Combine the two options, which exclude each other."""
+    from drivers.canopen.parameters import Saving
+
+    at_most_one(ram_only=ram_only, save_unknown=save_unknown)
+    return Saving.RAM if ram_only else Saving.ANY if save_unknown else Saving.KNOWN
+
+
+@contextmanager
+def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
+    """Open the drives of a cell, its buses locked; Ctrl-C and SIGTERM restore the values written until then."""
+    from daq.config.bus import cell_address, drive_axes
+    from daq.workflow.safeguards import bus_lock
+    from daq.writeback.drive_target import DriveTarget
+    from drivers.canopen.network import CanopenNetwork
+
+    address, axes = cell_address(declared), drive_axes(declared)
+    try:
+        with (
+            bus_lock(declared),
+            interruptible() as block_signals,
+            CanopenNetwork(address, axes, block_signals=block_signals) as network,
+        ):
+            yield DriveTarget(declared, network, saving)
+    except KeyboardInterrupt as interrupt:
+        said = "; ".join(getattr(interrupt, "__notes__", ())) or "nothing was written to the drives"
+        typer.echo(f"interrupted: {said}", err=True)
+        raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+
+
+def _saving_text(saving: Saving) -> str:
+    from drivers.canopen.parameters import Saving
+
+    if saving is Saving.RAM:
+        return "The drives have NOT saved: the gains are lost when they lose power."
+    return "The drives have saved."

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, VerbGroup, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFailed, UsageError
 
 if TYPE_CHECKING:
@@ -25,9 +25,7 @@ def export_log_verb(
     log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
     out: Annotated[Path, typer.Option("--out", help="Table to write; must not exist.")],
     csv: Annotated[bool, typer.Option("--csv", help="Comma-separated text.")] = False,
-    parquet: Annotated[
-        bool, typer.Option("--parquet", help="Apache Parquet; needs pip install 'drivegain[parquet]'.")
-    ] = False,
+    parquet: Annotated[bool, typer.Option("--parquet", help="Apache Parquet, needs drivegain[parquet].")] = False,
     json: JsonOption = False,
 ) -> None:
     """Write the samples of a log into a table: a row per SYNC, joint positions and currents in SI beside raw numbers.
@@ -73,6 +71,7 @@ def export_urdf_verb(
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
     from daq.workflow.calibration_file import load
+    from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
 
     one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
@@ -80,7 +79,14 @@ def export_urdf_verb(
     require_solver()
     check_output(out, (calibration, given), FORMAT)
     known = load(calibration)
-    require_good(known, str(calibration))
+    left = known.relative_error_percent.total
+    if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
+        raise ModelContradicted(
+            str(calibration),
+            found=f"a relative error of {left:.3g} %",
+            expected=f"at most {DOUBTFUL_PERCENT:g} %",
+            remedy="fit again; `drivegain fit` lists what to check",
+        )
     content = bundle(given)[URDF] if urdf is None else read_bytes(given)
     if out.exists() and out.read_bytes() == content:
         raise UsageError(str(out), found="the input URDF", expected="a file of its own", remedy="choose another name")
@@ -97,24 +103,6 @@ def export_urdf_verb(
         print_json(urdf_document(known, robot, updates, updated, out, same))
     else:
         print_view(urdf_view(known, robot, updates, updated, same), out)
-
-
-def require_good(calibration: Calibration, name: str) -> None:
-    """Refuse a calibration that explains too little of the torque to derive bodies from it.
-
-    Raises:
-        ModelContradicted: the calibration's relative error is above DOUBTFUL_PERCENT.
-    """
-    from daq.workflow.fit import DOUBTFUL_PERCENT
-
-    left = calibration.relative_error_percent.total
-    if not left <= DOUBTFUL_PERCENT:
-        raise ModelContradicted(
-            name,
-            found=f"a relative error of {left:.3g} %",
-            expected=f"at most {DOUBTFUL_PERCENT:g} %",
-            remedy="fit again; `drivegain fit` lists what to check",
-        )
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:
@@ -163,11 +151,7 @@ def _plain(urdf: str) -> tuple[Model, FloatArray]:
 
 
 def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
-    """Write the URDF whole or not at all, after reading it back as a robot with these links.
-
-    Raises:
-        OutputFailed: the file system refuses, or the file reads back with other inertias.
-    """
+    """Write the URDF whole or not at all, after reading it back as a robot with these links."""
     import numpy as np
 
     from daq.cli.terminal import writing
@@ -191,4 +175,4 @@ EXPORT_LOG = Verb("log", export_log_verb, "drivegain export log loaded.mcap --cs
 EXPORT_URDF = Verb(
     "urdf", export_urdf_verb, "drivegain export urdf calibration.yaml --cell cells/demo.yaml --out robot.urdf"
 )
-EXPORT = VerbGroup("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))
+EXPORT = Verb("export", export_verb, EXPORT_URDF.example, (EXPORT_URDF, EXPORT_LOG))

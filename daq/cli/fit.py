@@ -1,4 +1,4 @@
-"""`drivegain fit`: all gains and all parameters from logs, in one step; and the options it shares with `residual`."""
+"""`drivegain fit` and `residual`: all gains and all parameters from logs, and the effects that the model lacks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.verb import CellOption, JsonOption, Verb, print_json
-from daq.errors import UsageError
 from daq.workflow.choices import Known
 from ident.estimators.method import Method
 
@@ -31,39 +30,26 @@ class Gains(Enum):
 
 LogsArgument = Annotated[list[Path], typer.Argument(help="Logs: without load, and with a weighed payload.")]
 HoldoutOption = Annotated[
-    list[Path] | None,
-    typer.Option("--holdout", help="Held-out log, for the final error; repeatable."),
+    list[Path] | None, typer.Option("--holdout", help="Held-out log, for the final error; repeatable.")
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", help="Calibration file to write (calibration.yaml).")]
 PicturesOption = Annotated[Path | None, typer.Option("--pictures", help="Folder for pictures (PNG); it is created.")]
 AcceptLossesOption = Annotated[
     bool,
-    typer.Option(
-        "--accept-losses",
-        help="Use logs that are invalid because of lost frames, without those samples; `apply` refuses the result.",
-    ),
+    typer.Option("--accept-losses", help="Use logs with lost frames, less those samples; `apply` refuses the result."),
 ]
 GainsOption = Annotated[Gains, typer.Option(help="fixed: hold the nameplate gains (classical IDIM).")]
-KnownOption = Annotated[
-    Known,
-    typer.Option(help="Known of the payload: its weighed mass; with cad also centre and inertia from the cell file."),
-]
+KnownOption = Annotated[Known, typer.Option(help="What is known of the payload; cad: its drawing too.")]
 EssentialOption = Annotated[
     float | None,
-    typer.Option(
-        min=1.5,
-        help="Keep only essential parameters: the largest relative σ below this many times the smallest (10 to 30).",
-    ),
+    typer.Option(min=1.5, help="Keep only essential parameters, whose relative σ are within this factor (10 to 30)."),
 ]
 CasesOption = Annotated[
-    Path | None,
-    typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml, a file each."),
+    Path | None, typer.Option("--cases", help="Folder for the paper's cases 1 to 4, the nameplate gains and ml.")
 ]
 CompareOption = Annotated[
     bool,
-    typer.Option(
-        "--compare", help="Also run every estimator, with the cell's filters and with half and twice the cut-offs."
-    ),
+    typer.Option("--compare", help="Also run every estimator, at the cell's cut-offs, their half and their double."),
 ]
 
 
@@ -89,7 +75,7 @@ def fit_verb(
     from dataclasses import replace
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status
+    from daq.cli.terminal import at_most_one, check_output, print_view, status
     from daq.config.cell_file import load_cell
     from daq.log.reader import LossyLogs
     from daq.report.fit import fit_document, fit_view
@@ -97,7 +83,8 @@ def fit_verb(
     from daq.workflow.fit import check_explained, compare_estimators, fit
 
     if cases is not None:
-        _require_cases_alone(method is not None or known is not Known.MASS or gains is not Gains.FREE, out, pictures)
+        other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own
+        at_most_one(cases=cases, method=method, **other, out=out, pictures=pictures)
         _fit_cases(logs, holdout or (), None if cell is None else load_cell(cell), essential, cases, json=json)
         return
     check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
@@ -115,10 +102,7 @@ def fit_verb(
         if essential is not None:
             found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
         calibration = calibration_of_case(found, datetime.now(UTC))
-    if out is not None:
-        save_calibration(calibration, out)
-    if pictures is not None:
-        save_pictures(found.fitted, calibration, pictures)
+    _save(found.fitted, calibration, out, pictures)
     comparison = None
     if compare:
         with status("comparing estimators") as report_step:
@@ -129,16 +113,6 @@ def fit_verb(
         print_view(fit_view(found, calibration, comparison), out, pictures)
 
 
-def _require_cases_alone(chosen: bool, out: Path | None, pictures: Path | None) -> None:
-    if chosen or out is not None or pictures is not None:
-        raise UsageError(
-            "--cases",
-            found="--method, --gains, --known, --out or --pictures beside it",
-            expected="none of them: every case has its own, and a file in the folder",
-            remedy="leave them out, or fit one case without --cases",
-        )
-
-
 def _fit_cases(
     logs: Sequence[Path], holdout: Sequence[Path], cell: Cell | None, ratio: float | None, folder: Path, *, json: bool
 ) -> None:
@@ -147,8 +121,8 @@ def _fit_cases(
 
     from daq.cli.terminal import check_output, print_view, status, writing
     from daq.files import replace_file
-    from daq.report.fit import case_tables, cases_document, cases_view
-    from daq.report.paper_tables import page
+    from daq.report.fit import cases_document, cases_view
+    from daq.report.paper_tables import case_tables, page
     from daq.workflow.calibration_file import save
     from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
 
@@ -177,31 +151,95 @@ def _fit_cases(
         print_view(cases_view(fits, tables), *files.values(), page_file)
 
 
-def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration file whole or not at all.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
-    from daq.cli.terminal import writing
-    from daq.workflow.calibration_file import save
-
-    with writing(path):
-        save(calibration, path)
+FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
 
 
-def save_pictures(fitted: Fit, calibration: Calibration, folder: Path) -> None:
-    """Draw torques, gains, and the residual before and after each effect.
+def residual_verb(
+    logs: LogsArgument,
+    gains: GainsOption = Gains.FREE,
+    holdout: HoldoutOption = None,
+    seed: Annotated[int, typer.Option(help="Seed of the significance test, which fixes its verdict.", min=0)] = 0,
+    out: OutOption = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Folder for report.html and residual.json.")] = None,
+    pictures: PicturesOption = None,
+    leave_out_runs: Annotated[
+        bool, typer.Option("--leave-out-runs", help="Also predict each run from a fit of the others: slow.")
+    ] = False,
+    cell: CellOption = None,
+    accept_losses: AcceptLossesOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Fit, then detect the effect that explains the residual, add it, refit everything, and repeat."""
+    from datetime import UTC, datetime
 
-    Raises:
-        OutputFailed: the file system refuses.
-    """
-    from daq.cli.terminal import writing
-    from daq.report.plots import draw_fit
+    from daq.cli.terminal import check_output, print_view, status
+    from daq.config.cell_file import load_cell
+    from daq.log.reader import LossyLogs
+    from daq.report.fit import start_of
+    from daq.report.residual import residual_document, residual_view
+    from daq.report.residual_page import save_report
+    from daq.workflow.fit import calibration_of, close_loop, fit
+    from ident.discovery.before_after import account
+    from ident.estimators.method import Method
 
+    check_output(out, (*logs, *(holdout or ()), cell), CALIBRATION)
+    check_report(report)
+    with status("identifying") as report_step:
+        fitted = fit(
+            logs,
+            holdout=holdout or (),
+            method=Method.ML,
+            gains_fixed=gains is Gains.FIXED,
+            cell=None if cell is None else load_cell(cell),
+            lossy=LossyLogs.ACCEPTED if accept_losses else LossyLogs.REFUSED,
+        )
+        closed = close_loop(fitted, seed, report_step)
+        calibration = calibration_of(closed, datetime.now(UTC))
+        report_step("computing the errors before and after")
+        changed = account(start_of(closed), closed.steps, leave_out_runs=leave_out_runs, progress=report_step)
+    _save(closed, calibration, out, pictures)
+    if report is not None:
+        with status("drawing the report"):
+            save_report(closed, changed, calibration, report)
+    if json:
+        print_json(residual_document(closed, changed, calibration))
+    else:
+        print_view(residual_view(closed, changed, calibration), out, report, pictures)
+
+
+def check_report(folder: Path | None) -> None:
+    """Create the folder of a report before any long work, and refuse one with other files of the same names."""
+    from tempfile import TemporaryFile
+
+    from daq.cli.terminal import check_replaceable, writing
+    from daq.report.residual_page import MARKS
+
+    if folder is None:
+        return
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        draw_fit(fitted, calibration, None, folder)
+        with TemporaryFile(dir=folder):
+            pass
+    for name, mark in MARKS.items():
+        check_replaceable(folder / name, mark, "report of `drivegain residual`")
 
 
-FIT = Verb("fit", fit_verb, "drivegain fit bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml")
+RESIDUAL = Verb(
+    "residual",
+    residual_verb,
+    "drivegain residual bare.mcap loaded.mcap --holdout held-out.mcap --out calibration.yaml --report report",
+)
+
+
+def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
+    from daq.cli.terminal import writing
+    from daq.report.plots import draw_fit
+    from daq.workflow.calibration_file import save
+
+    if out is not None:
+        with writing(out):
+            save(calibration, out)
+    if pictures is not None:
+        with writing(pictures):
+            pictures.mkdir(parents=True, exist_ok=True)
+            draw_fit(fitted, calibration, None, pictures)

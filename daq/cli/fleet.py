@@ -24,14 +24,10 @@ def fleet_verb(
         int | None,
         typer.Option(min=1, help="Cells fitted at a time; by default one per processor or thread of the scheduler."),
     ] = None,
-    residual: Annotated[
-        bool, typer.Option("--residual", help="Also detect and add missing effects in every cell: slow.")
-    ] = False,
+    residual: Annotated[bool, typer.Option("--residual", help="Also detect missing effects: slow.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", help="Folder for a calibration of each cell; a cell is not fitted again from the same logs."
-        ),
+        typer.Option(help="Folder for a calibration of each cell; a cell is not fitted again from the same logs."),
     ] = None,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table; an earlier table is replaced.")] = None,
     json: JsonOption = False,
@@ -43,16 +39,20 @@ def fleet_verb(
     """
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import print_view, progress_bar, writing
+    from daq.cli.terminal import check_replaceable, print_view, progress_bar, writing
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
     from daq.jobs.fleet import fit_fleet
     from daq.jobs.fleet_survey import list_logs
     from daq.jobs.workers import worker_pool
-    from daq.report.fleet import fleet_csv, fleet_document, fleet_view
+    from daq.report.fleet import FIRST_COLUMNS, fleet_csv, fleet_document, fleet_view
 
     loop = Loop.CLOSED if residual else Loop.OPEN
-    check_table(csv)
+    if csv is not None:
+        # Refused before any work: a missing folder, and a file of another kind.
+        if not csv.parent.is_dir():
+            raise OutputFailed.of(csv, FileNotFoundError(2, "No such folder"))
+        check_replaceable(csv, ",".join(FIRST_COLUMNS), "table of a fleet")
     wanted = worker_pool(scheduler, workers)
     found = list_logs(logs)
     cache = None if out is None else open_cache(out, loop)
@@ -67,23 +67,6 @@ def fleet_verb(
         print_view(fleet_view(rows), out, csv)
     if not all(row.fitted for row in rows):
         raise typer.Exit(ExitCode.DATA_UNFIT)
-
-
-def check_table(path: Path | None) -> None:
-    """Refuse a table that could not be written, or would overwrite a file of another kind.
-
-    Raises:
-        UsageError: there is another file of that name.
-        OutputFailed: the folder does not exist.
-    """
-    from daq.cli.terminal import check_replaceable
-    from daq.report.fleet import FIRST_COLUMNS
-
-    if path is None:
-        return
-    if not path.parent.is_dir():
-        raise OutputFailed.of(path, FileNotFoundError(2, "No such folder"))
-    check_replaceable(path, ",".join(FIRST_COLUMNS), "table of a fleet")
 
 
 FLEET = Verb("fleet", fleet_verb, "drivegain fleet logs --scheduler processes --out calibrations --csv fleet.csv")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from daq.cli.terminal import say_written
+from daq.cli.apply import applier
+from daq.cli.terminal import check_replaceable, say_written, writing
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.cli.writing import applier
-from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _SHOWN = 5  #: Sentences of a kind in an error; --json has all
 
-_PICTURES = {".png": b"\x89PNG", ".svg": b"<?xml"}  #: Suffixes of pictures, and how such a file begins
+_PICTURES = {".png": "PNG\r\n", ".svg": "<?xml"}  #: Suffixes of pictures, and text at the beginning of such a file
 
 
 def history_verb(
@@ -35,23 +35,16 @@ def history_verb(
     csv: Annotated[Path | None, typer.Option("--csv", help="Table to write, for a spreadsheet.")] = None,
     add: Annotated[Path | None, typer.Option("--add", help="Enter a calibration by hand.")] = None,
     acknowledge: Annotated[
-        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained: a new baseline begins.")
+        str | None, typer.Option("--acknowledge", metavar="AXIS", help="A change is explained; begin a baseline.")
     ] = None,
-    by: Annotated[
-        str | None, typer.Option("--by", help="With --acknowledge: who explains it; you, by default.")
-    ] = None,
+    by: Annotated[str | None, typer.Option("--by", help="With --acknowledge: who explains it; you by default.")] = None,
     why: Annotated[str | None, typer.Option("--why", help="With --acknowledge: what happened.")] = None,
     since: Annotated[
-        str | None,
-        typer.Option("--since", metavar="DATE", help="With --acknowledge: first day that counts for the new baseline."),
+        str | None, typer.Option("--since", metavar="DATE", help="With --acknowledge: first day of the baseline.")
     ] = None,
-    verify: Annotated[
-        bool,
-        typer.Option("--verify", help="Check audit and history, by themselves and together; exit code 4 if broken."),
-    ] = False,
+    verify: Annotated[bool, typer.Option("--verify", help="Check audit and history; exit code 4 if broken.")] = False,
     rebuild: Annotated[
-        bool,
-        typer.Option("--rebuild", help="Make the history anew from the audit; the old file is kept beside it."),
+        bool, typer.Option("--rebuild", help="Rebuild it from the audit; the old file is kept.")
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -64,7 +57,7 @@ def history_verb(
     from daq.config.cell_file import load_cell
     from daq.ledger.ledger import Ledger
     from daq.ledger.watch import watch
-    from daq.report.history_view import (
+    from daq.report.history import (
         describe,
         describe_actions,
         describe_verification,
@@ -76,9 +69,12 @@ def history_verb(
     from daq.writeback.file_access import resolve_links
 
     declared = load_cell(cell)
-    place = _place(declared, cell)
-    picture = None if plot is None else _picture(plot)
-    _check_csv(csv)
+    place = declared.history
+    if place is None:
+        raise ConfigurationInconsistent(
+            str(cell), found="no history", expected="a cell file", remedy="give the cell file, not a log"
+        )
+    _check_files(plot, csv)
     if acknowledge is None and (why is not None or since is not None or by is not None):
         raise UsageError(
             "--by, --why, --since",
@@ -97,7 +93,7 @@ def history_verb(
             _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)
             all_series = watch(ledger.entries(), ledger.acknowledgements())
         chosen = all_series if axis is None else (_named(all_series, axis, declared),)
-        _write_files(chosen, declared, picture, csv)
+        _write_files(chosen, declared, plot, csv)
         entries = ledger.entries()
         current = in_force(declared, ledger)
         actions = describe_actions(entries, ledger.events(), current)
@@ -116,7 +112,7 @@ def history_verb(
                 show_axis(chosen[0], all_series, actions, console)
             else:
                 show(entries, all_series, actions, console)
-            say_written(console, picture, csv)
+            say_written(console, plot, csv)
         if checked is not None:
             _require(checked)
 
@@ -130,12 +126,7 @@ def _session_heads(cell: Cell) -> list[str]:
 
 
 def _require(checked: Verification) -> None:
-    """Raise what is wrong.
-
-    Raises:
-        DataError: the audit log is not what was written, with the first line that is not and all flaws.
-        HistoryUnreadable: the history is broken, contradicts the audit log, or lacks a write.
-    """
+    """Raise what is wrong: with the audit log, with the history, or with a write that it lacks."""
     from daq.ledger.ledger import audit_error
 
     if not checked.verdict.holds:
@@ -172,25 +163,36 @@ def _first(sentences: Sequence[str]) -> str:
     return shown + (f"; and {more} more (--json has all)" if more > 0 else "")
 
 
+def _check_files(plot: Path | None, csv: Path | None) -> None:
+    from daq.report.history import COLUMNS
+
+    if plot is not None:
+        mark = _PICTURES.get(plot.suffix.lower())
+        if mark is None:
+            raise UsageError("--plot", found=plot.name, expected="a name in .png or .svg", remedy="give one")
+        check_replaceable(plot, mark, "picture")
+    if csv is not None:
+        check_replaceable(csv, ",".join(COLUMNS[:3]), "table of a history")
+
+
 def _rebuild(cell: Cell, place: HistoryPlace, who: str, now: datetime) -> None:
     from daq.ledger.ledger import rebuild
 
     done = rebuild(cell, place, who=who, at=now, heads=_session_heads(cell))
-    console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    console.print(
-        f"Rebuilt from {place.audit}: {done.calibrations} calibrations, {done.writes} writes, {done.acknowledgements} "
-        f"acknowledgements. {'There was no history before.' if done.kept is None else f'The old one is {done.kept}.'}"
-    )
+    kept = "There was no history before." if done.kept is None else f"The old one is {done.kept}."
+    counts = f"{done.calibrations} calibrations, {done.writes} writes, {done.acknowledgements} acknowledgements"
+    typer.echo(f"Rebuilt from {place.audit}: {counts}. {kept}", err=True)
     if done.kept is not None and not done.trusted:
-        console.print("The old history was broken: what only it had was not taken over.")
+        typer.echo("The old history was broken: what only it had was not taken over.", err=True)
 
 
-def _place(cell: Cell, file: Path) -> HistoryPlace:
-    if cell.history is None:
-        raise ConfigurationInconsistent(
-            str(file), found="no history", expected="a cell file", remedy="give the cell file, not a log"
-        )
-    return cell.history
+def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | None, now: datetime) -> None:
+    if not why or not why.strip():
+        reason = "what happened, for a reader in a year"
+        raise UsageError("--why", found="nothing", expected=reason, remedy='give it: --why "gearbox changed"')
+    # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
+    begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
+    ledger.acknowledge_change(series.axis, since=begins, at=now, who=ledger.who, why=why)
 
 
 def _add(ledger: Ledger, file: Path, now: datetime) -> None:
@@ -206,26 +208,12 @@ def _add(ledger: Ledger, file: Path, now: datetime) -> None:
             remedy="give the file of the cell that it belongs to; nothing was entered",
         )
     new = ledger.add(calibration, digest=hashlib.sha256(content).hexdigest(), at=now)
-    console = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-    console.print(f"{file.name}: {'entered' if new else 'it was in the history already'}.")
+    typer.echo(f"{file.name}: {'entered' if new else 'it was in the history already'}.", err=True)
     # The process that wrote it may have been killed before it was entered.
     for write in ledger.catch_up():
-        console.print(f"Entered too: {printable(str(write))}.")
+        typer.echo(f"Entered too: {printable(str(write))}.", err=True)
     if not ledger.verify(_session_heads(ledger.cell)).complete:
-        console.print("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.")
-
-
-def _acknowledge(ledger: Ledger, series: Series, why: str | None, since: str | None, now: datetime) -> None:
-    if not why or not why.strip():
-        raise UsageError(
-            "--why",
-            found="nothing",
-            expected="what happened, for a reader in a year",
-            remedy='give it: --why "gearbox changed"',
-        )
-    # Of a drift, only the newest calibration surely shows the gain as it is now; a log's clock may be ahead of ours.
-    begins = min(series.points[-1].entry.recorded, now) if since is None else _day(since, now)
-    ledger.acknowledge_change(series.axis, since=begins, at=now, who=ledger.who, why=why)
+        typer.echo("Not all writes in the audit could be entered: see `drivegain history CELL --verify`.", err=True)
 
 
 def _day(text: str, now: datetime) -> datetime:
@@ -265,52 +253,25 @@ def _named(all_series: tuple[Series, ...], axis: str, cell: Cell) -> Series:
     return known[axis]
 
 
-def _picture(path: Path) -> Path:
-    begins = _PICTURES.get(path.suffix.lower())
-    if begins is None:
-        raise UsageError("--plot", found=path.name, expected="a name in .png or .svg", remedy="give one")
-    _require_replaceable(path, begins)
-    return path
-
-
-def _check_csv(path: Path | None) -> None:
-    from daq.report.history import COLUMNS
-
-    if path is not None:
-        _require_replaceable(path, ",".join(COLUMNS[:3]).encode())
-
-
-def _require_replaceable(path: Path, begins: bytes) -> None:
-    """A file of another kind is not written over."""
-    if path.is_dir() or (path.is_file() and path.stat().st_size and not path.read_bytes().startswith(begins)):
-        raise UsageError(
-            str(path),
-            found="something of another kind",
-            expected="no file, or an earlier one of the same kind",
-            remedy="choose another name, or move it away",
-        )
-
-
 def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, csv: Path | None) -> None:
     from daq.files import replace_file
     from daq.report.history import csv_text, plot_history
 
     drawn = [series for series in chosen if series.points]
-    if picture is not None and not drawn:
-        raise UsageError(
-            "--plot", found="an empty history", expected="at least one calibration", remedy="fit and apply one first"
-        )
     if picture is not None:
-        _write(picture, lambda path: plot_history(path, drawn, title=f"Drive gains of {cell.name}"))
+        if not drawn:
+            raise UsageError(
+                "--plot",
+                found="an empty history",
+                expected="at least one calibration",
+                remedy="fit and apply one first",
+            )
+        kind = picture.suffix.lower().removeprefix(".")
+        with writing(picture):
+            replace_file(picture, plot_history(drawn, kind, title=f"Drive gains of {cell.name}"))
     if csv is not None:
-        _write(csv, lambda path: replace_file(path, csv_text(chosen).encode()))
-
-
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    try:
-        write(path)
-    except OSError as error:
-        raise OutputFailed.of(path, error) from error
+        with writing(csv):
+            replace_file(csv, csv_text(chosen).encode())
 
 
 HISTORY = Verb("history", history_verb, "drivegain history cells/demo.yaml --axis J4 --plot history.png")

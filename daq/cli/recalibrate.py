@@ -19,16 +19,8 @@ if TYPE_CHECKING:
 
 def recalibrate_verb(
     cell: Annotated[Path, typer.Option(help="Cell file; `recalibration` and `policy` configure the job.")],
-    dry_run: Annotated[
-        bool,
-        typer.Option(
-            "--dry-run", help="Query interlock and drives and show the next steps; nothing is moved or written."
-        ),
-    ] = False,
-    now: Annotated[
-        bool,
-        typer.Option("--now", help="Run even if the last good calibration is recent: a motor was replaced."),
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show the next steps; move and write nothing.")] = False,
+    now: Annotated[bool, typer.Option("--now", help="Run even if the last good calibration is recent.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Record, fit, decide, and propose or apply, unattended, for a timer. Events go to stderr, a line each.
@@ -51,16 +43,17 @@ def recalibrate_verb(
         journal.say(Level.ERROR, "interrupted", axes="; ".join(notes) or "stopped")
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
     except (DaqError, DriverError, IdentificationError) as error:
-        journal.say(Level.ERROR, "failed", error=type(error).__name__, text=str(error), notes=error_notes(error))
+        journal.say(
+            Level.ERROR,
+            "failed",
+            error=type(error).__name__,
+            text=str(error),
+            notes=list(getattr(error, "__notes__", ())),
+        )
         if journal.form is Form.TEXT:
             raise
         # A program reads stderr, and the message for the terminal is no line of JSON.
         raise typer.Exit(exit_code(type(error)) or ExitCode.UNEXPECTED) from error
-
-
-def error_notes(error: BaseException) -> list[str]:
-    """Return the notes of an error."""
-    return list(getattr(error, "__notes__", ()))
 
 
 def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> None:
@@ -105,14 +98,9 @@ _SYSTEM, _OF_USER = Path("/etc/systemd/system"), Path(".config/systemd/user")
 
 def install_units(
     cell: Annotated[Path, typer.Option(help="Cell file with `recalibration`.")],
-    to: Annotated[
-        Path | None,
-        typer.Option("--to", help="Folder of the units; by default /etc/systemd/system, or the user's with --user."),
-    ] = None,
+    to: Annotated[Path | None, typer.Option("--to", help="Folder of the units, by default that of systemd.")] = None,
     user: Annotated[bool, typer.Option("--user", help="Install units of this user, not of the system.")] = False,
-    schedule: Annotated[
-        str, typer.Option(help="When: weekly, daily, or a calendar expression of systemd such as 'Sun 03:00'.")
-    ] = "weekly",
+    schedule: Annotated[str, typer.Option(help="weekly, daily, or as 'Sun 03:00' (systemd.time).")] = "weekly",
     cron: Annotated[bool, typer.Option("--cron", help="Print a line for crontab instead.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Write the units; without it they are only shown.")] = False,
 ) -> None:
@@ -128,7 +116,12 @@ def install_units(
 
     declared = load_cell(cell)
     section, _ = section_of(declared), target_of(declared)
-    wanted = Installation(cell.resolve(), program(), schedule, user, owner_of(cell.resolve()))
+    place = cell.resolve()
+    try:
+        owner = place.owner()
+    except KeyError:  # a user without a name
+        owner = str(place.stat().st_uid)
+    wanted = Installation(place, program(), schedule, user, owner)
     if cron:
         typer.echo(cron_line(wanted))
         if yes:
@@ -152,11 +145,7 @@ def install_units(
 
 
 def program() -> Path:
-    """Return the path of the command that the timer calls.
-
-    Raises:
-        UsageError: drivegain is not installed as a command.
-    """
+    """Return the path of the command that the timer calls."""
     import shutil
 
     beside = Path(sys.executable).parent / "drivegain"
@@ -171,20 +160,8 @@ def program() -> Path:
     return Path(found).absolute()
 
 
-def owner_of(path: Path) -> str:
-    """Return the name of a file's owner, or the number of one without a name."""
-    try:
-        return path.owner()
-    except KeyError:
-        return str(path.stat().st_uid)
-
-
 def check_schedule(schedule: str) -> None:
-    """Check a calendar expression with systemd, where this computer has it.
-
-    Raises:
-        UsageError: it is no calendar expression.
-    """
+    """Check a calendar expression with systemd, where this computer has it."""
     import shutil
     import subprocess
 
@@ -205,35 +182,23 @@ def check_schedule(schedule: str) -> None:
 
 
 def require_own_unit(path: Path, option: str = "") -> None:
-    """Refuse to replace a file that this verb did not write, or that it wrote for another cell.
-
-    Args:
-        path: of the unit.
-        option: text that a unit of this cell contains.
-
-    Raises:
-        UsageError: the file is not ours.
-    """
+    """Refuse to replace a file that this verb did not write, or a unit without the option of this cell."""
     from daq.cli.terminal import writing
     from daq.jobs.units import MARK
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else None
-    if (text is None and path.exists()) or (text is not None and not text.startswith(MARK)):
-        raise UsageError(
-            str(path),
-            found="a unit that drivegain did not write",
-            expected="no such file, or one of an earlier `install-units`",
-            remedy="name another folder with --to, or move it away",
-        )
-    if text is not None and option not in text:
-        raise UsageError(
-            str(path),
-            found="the unit of another cell file",
-            expected=f"no such file, or one with {option}",
-            remedy="name another folder with --to, or remove it if the cell file has moved",
-        )
+    if text is None and not path.exists():
+        return
+    found, expected = "", ""
+    if text is None or not text.startswith(MARK):
+        found, expected = "a unit that drivegain did not write", "one of an earlier `install-units`"
+    elif option not in text:
+        found, expected = "the unit of another cell file", f"one with {option}"
+    if found:
+        remedy = "name another folder with --to, or move it away; remove it if the cell file has moved"
+        raise UsageError(str(path), found=found, expected=f"no such file, or {expected}", remedy=remedy)
 
 
 INSTALL_UNITS = Verb("install-units", install_units, "drivegain install-units --cell cells/demo.yaml --schedule weekly")

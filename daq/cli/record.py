@@ -25,23 +25,12 @@ def record_verb(
     out: Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")],
     enable_motion: Annotated[
         bool,
-        typer.Option(
-            "--enable-motion",
-            help="Allow the axes to move; nothing moves without it, or the cell's `policy: {motion: allowed}`.",
-        ),
+        typer.Option("--enable-motion", help="Allow motion, where the cell's `policy: {motion: allowed}` does not."),
     ] = False,
     payload: Annotated[str | None, typer.Option(help="Mounted payload, by its name in the cell file.")] = None,
-    mass: Annotated[
-        float | None,
-        typer.Option(
-            help="Mass of the payload [kg], read off the scale now; it must agree with the cell file.", min=0.0
-        ),
-    ] = None,
+    mass: Annotated[float | None, typer.Option(help="Mass of the payload read off the scale [kg].", min=0.0)] = None,
     operator: Annotated[str | None, typer.Option(help="Operator of this recording; you, by default.")] = None,
-    speed: Annotated[
-        float,
-        typer.Option(help="Share of the plan's speed, for a first run; it is kept in the log.", min=0.05, max=1.0),
-    ] = 1.0,
+    speed: Annotated[float, typer.Option(help="Share of the plan's speed, for a first run.", min=0.05, max=1.0)] = 1.0,
     json: JsonOption = False,
 ) -> None:
     """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
@@ -99,8 +88,7 @@ def record_verb(
             error.add_note(
                 f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
             )
-        lost = isinstance(error, SampleLost)
-        if lost and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
+        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
                 "lockstep` in the cell file; on a real cell, check the load of bus and computer"
@@ -123,23 +111,15 @@ def record_verb(
 
 
 def _free(out: Path) -> Path:
-    """Return the file in which the log grows until it is finished; called before the bus is used.
-
-    Raises:
-        UsageError: the log exists, or an unfinished recording of that name.
-    """
+    """Return the file in which the log grows until it is finished, before the bus is used; neither may exist."""
     part = out.with_name(out.name + ".part")
-    if out.exists():
-        raise UsageError(
-            str(out), found="a file of that name", expected="none", remedy="choose another --out, or move it away"
-        )
-    if part.exists():
-        raise UsageError(
-            str(part),
-            found="the rest of a recording of that name that failed, was interrupted, or is still running",
-            expected="none",
-            remedy=f"`fit` does not read it; {_next_command(part)}",
-        )
+    unfinished = "the rest of a recording of that name that failed, was interrupted, or is still running"
+    for path, found, remedy in (
+        (out, "a file of that name", "choose another --out, or move it away"),
+        (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
+    ):
+        if path.exists():
+            raise UsageError(str(path), found=found, expected="none", remedy=remedy)
     return part
 
 
@@ -182,20 +162,14 @@ def granted(cell: Cell, who: str, enable_motion: bool) -> str | None:
 
 
 def mounted(cell: Cell, name: str | None) -> Payload | None:
-    """Return the payload of that name.
-
-    Raises:
-        UsageError: the cell declares no such payload.
-    """
-    if name is None:
-        return None
-    for candidate in cell.payloads:
-        if candidate.name == name:
-            return candidate.payload
+    """Return the payload of that name."""
+    known = {payload.name: payload.payload for payload in cell.payloads}
+    if name is None or name in known:
+        return None if name is None else known[name]
     raise UsageError(
         f"payload {name!r}",
         found="no such payload in the cell file",
-        expected=", ".join(payload.name for payload in cell.payloads) or "none: the cell declares no payloads",
+        expected=", ".join(known) or "none: the cell declares no payloads",
         remedy="weigh it and add it to `payloads` of the cell file",
     )
 
@@ -218,9 +192,7 @@ def plan_verb(
         float, typer.Option(help="Share of the limits that the fastest move uses.", min=0.05, max=1.0)
     ] = 1.0,
     condition: Annotated[float, typer.Option(help="Largest condition number.", min=1.0)] = LARGEST_CONDITION,
-    sigma: Annotated[
-        float, typer.Option(help="Largest standard deviation predicted for a gain [%].", min=0.01)
-    ] = LARGEST_STD_PERCENT,
+    sigma: Annotated[float, typer.Option(help="Largest σ predicted for a gain [%].", min=0.01)] = LARGEST_STD_PERCENT,
     json: JsonOption = False,
 ) -> None:
     """Choose point-to-point moves that identify the worst gain as precisely as the time allows.

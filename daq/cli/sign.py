@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from daq.cli.verb import CalibrationArgument, JsonOption, Verb, VerbGroup, print_json
+from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
 from daq.errors import UsageError
 
 
@@ -22,16 +22,24 @@ def sign_verb() -> None:
 def sign_key_verb(
     name: Annotated[str, typer.Option("--name", help="Name of the person, as in the cell file.")],
     folder: Annotated[Path, typer.Option("--folder", help="Folder for NAME.key and NAME.pub.")] = Path(),
-    no_password: Annotated[
-        bool, typer.Option("--no-password", help="Make a key that only its file permissions protect.")
-    ] = False,
+    no_password: Annotated[bool, typer.Option("--no-password", help="Only its file's permissions protect it.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Make a key pair: NAME.key is secret and stays with the person, the public key goes into the cell file."""
     from daq.cli.terminal import print_view
     from daq.writeback.signature import generate
 
-    password = "" if no_password else _new_password()
+    password = "" if no_password else _password()
+    again = password
+    if not no_password and sys.stdin.isatty():
+        again = typer.prompt("Repeat the password", hide_input=True, err=True)
+    if password != again or not (password or no_password):
+        raise UsageError(
+            "password",
+            found="two that differ" if password else "none",
+            expected="the same twice",
+            remedy="try again, or use --no-password for a key that only its file permissions protect",
+        )
     secret, public = generate(folder, name, password)
     if json:
         print_json({"name": name, "secret_key": str(secret), "public_key": public.line})
@@ -87,19 +95,6 @@ def sign_check_verb(
     )
 
 
-def _new_password() -> str:
-    first = _password()
-    again = typer.prompt("Repeat the password", hide_input=True, err=True) if sys.stdin.isatty() else first
-    if not first or first != again:
-        raise UsageError(
-            "password",
-            found="none" if not first else "two that differ",
-            expected="the same twice",
-            remedy="try again, or use --no-password for a key that only its file permissions protect",
-        )
-    return first
-
-
 def _password() -> str:
     if not sys.stdin.isatty():
         return sys.stdin.readline().rstrip("\n")
@@ -111,4 +106,4 @@ SIGN_CALIBRATION = Verb(
     "calibration", sign_calibration_verb, "drivegain sign calibration calibration.yaml --key keys/anna.key --name anna"
 )
 SIGN_CHECK = Verb("check", sign_check_verb, "drivegain sign check calibration.yaml --cell cells/demo.yaml")
-SIGN = VerbGroup("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))
+SIGN = Verb("sign", sign_verb, SIGN_CALIBRATION.example, (SIGN_KEY, SIGN_CALIBRATION, SIGN_CHECK))

@@ -29,29 +29,17 @@ def simulate(
         typer.Argument(help="Simulation file, the truth of a cell; or demo or clean, shipped with drivegain."),
     ],
     payload: Annotated[str | None, typer.Option(help="Name of the mounted body in the simulation file.")] = None,
-    faults: Annotated[
-        Path | None,
-        typer.Option(help="Scenario file of faults and their times; or faults-example, which lists all kinds."),
-    ] = None,
-    interface: Annotated[
-        str, typer.Option(help="socketcand starts a hub on 127.0.0.1; socketcan uses a real or virtual CAN.")
-    ] = "socketcand",
+    faults: Annotated[Path | None, typer.Option(help="Scenario file, or the shipped faults-example.")] = None,
+    interface: Annotated[str, typer.Option(help="socketcand, a hub on 127.0.0.1, or socketcan.")] = "socketcand",
     channel: Annotated[str, typer.Option(help="Channel of the bus.")] = "can0",
     bus: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CHANNEL=NODE,NODE,...",
-            help="One of several buses with the nodes on it, instead of --channel; repeat it for each bus.",
-        ),
+        typer.Option(metavar="CHANNEL=NODE,NODE,...", help="One of several buses, instead of --channel; repeatable."),
     ] = None,
     port: Annotated[int, typer.Option(help="Port of the hub; 0 takes a free one.", min=0, max=65535)] = 29536,
     payload_from: Annotated[
         Path | None,
-        typer.Option(
-            "--payload-from",
-            metavar="FILE",
-            help="File with the name of the mounted body, or none; read again whenever all axes are without power.",
-        ),
+        typer.Option(metavar="FILE", help="Names the mounted body, or none; read again while no axis has power."),
     ] = None,
 ) -> None:
     """Run a simulated cell until Ctrl-C or SIGTERM: amplifiers that answer NMT, SDO, PDO, SYNC, heartbeat and EMCY.
@@ -63,22 +51,25 @@ def simulate(
     from dataclasses import replace
     from functools import partial
 
-    from daq.cli.terminal import interruptible
+    from daq.cli.terminal import at_most_one, interruptible
     from daq.simulation.simulation_file import load_scenario, load_simulation, require_simulator, shipped_simulation
     from drivers.canopen.bus import BusAddress, open_answering_bus
     from drivers.canopen.hub import Hub
     from drivers.stream.split_bus import BusPart, SplitAddress, open_split_bus
 
     require_simulator()
-    from drivers.simulation.cell import MountingCell, SimulatedCell
+    from drivers.simulation.cell import SimulatedCell
 
-    if payload is not None and payload_from is not None:
-        raise UsageError(
-            "--payload-from", found="--payload beside it", expected="one of the two", remedy="leave out one of them"
-        )
+    at_most_one(payload_from=payload_from, payload=payload)
     shipped = simulation.name in _SHIPPED and not simulation.exists()
     truth = shipped_simulation(simulation.name) if shipped else simulation
-    mounted = None if payload_from is None else MountedFile(payload_from, partial(load_simulation, truth), _complain)
+    mounted = None
+    if payload_from is not None:
+        mounted = MountedFile(
+            payload_from,
+            partial(load_simulation, truth),
+            lambda error: typer.echo(f"{error}; the mounted body stays", err=True),
+        )
     spec = load_simulation(truth, payload) if mounted is None else mounted.at_power_on()
     if faults is not None:
         shipped = faults.name == _SHIPPED_FAULTS and not faults.exists()
@@ -95,7 +86,7 @@ def simulate(
         address = SplitAddress(parts) if bus else parts[0].address
         end = open_split_bus(address) if isinstance(address, SplitAddress) else open_answering_bus(address)
         stack.callback(end.shutdown)
-        cell = SimulatedCell(spec, end) if mounted is None else MountingCell(spec, end, mounted)
+        cell = SimulatedCell(spec, end, mounted=mounted)
         what = payload or "none" if payload_from is None else f"as {payload_from} says"
         faulty = len(spec.faults) or "no"
         typer.echo(f"{len(spec.axes)} amplifiers on {address}, payload {what}, {faulty} faults; Ctrl-C ends it")
@@ -115,18 +106,12 @@ class MountedFile:
     def __init__(
         self, path: Path, load: Callable[[str | None], CellSpec], complain: Callable[[UsageError], None]
     ) -> None:
-        self._path = path
-        self._load = load
-        self._complain = complain
+        self._path, self._load, self._complain = path, load, complain
         self._name: str | None = None
         self._spec: CellSpec | None = None
 
     def at_power_on(self) -> CellSpec:
-        """Load the cell with the body that the file names now.
-
-        Raises:
-            UsageError: the simulation does not know the body.
-        """
+        """Load the cell with the body that the file names now, an unknown one being an error."""
         self._name = self._read()
         self._spec = self._load(self._name)
         return self._spec
@@ -149,20 +134,8 @@ class MountedFile:
         return None
 
 
-def _complain(error: UsageError) -> None:
-    typer.echo(f"{error}; the mounted body stays", err=True)
-
-
 def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:
-    """Read the nodes of each channel.
-
-    Args:
-        options: CHANNEL=NODE,NODE,... of each bus.
-        node_ids: of the cell; each must be on exactly one bus.
-
-    Raises:
-        UsageError: an option is malformed, or the nodes are not those of the cell.
-    """
+    """Read the nodes of each channel from CHANNEL=NODE,NODE,...; each node of the cell must be on exactly one bus."""
     there: dict[str, frozenset[int]] = {}
     for one in options:
         channel, _, nodes = one.partition("=")
@@ -191,7 +164,15 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
     pacing = "timed" if parts[0].address.interface == "socketcan" else "lockstep"
     several = len(parts) > 1
-    buses = "".join(("  - name: " + part.name + "\n" if several else "") + _keys(part, several) for part in parts)
+    buses = ""
+    for part in parts:
+        address, indent = part.address, "    " if several else "  "
+        keys = {"interface": address.interface, "channel": address.channel}
+        if address.interface == "socketcand":
+            keys |= {"host": address.host, "port": str(address.port)}
+        keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
+        buses += f"  - name: {part.name}\n" if several else ""
+        buses += "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
     nodes = "".join(
         f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n" for part in parts
     )
@@ -201,15 +182,6 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
         + (f"{nodes}\n" if several else "")
         + "and try it in a second terminal: drivegain scan CELL"
     )
-
-
-def _keys(part: BusPart, several: bool) -> str:
-    address, indent = part.address, "    " if several else "  "
-    keys = {"interface": address.interface, "channel": address.channel}
-    if address.interface == "socketcand":
-        keys |= {"host": address.host, "port": str(address.port)}
-    keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
-    return "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
 
 
 SIMULATE = Verb("simulate", simulate, "drivegain simulate demo --payload disc --faults faults-example")
@@ -228,7 +200,7 @@ def demo(
 
     from rich.console import Console
 
-    from daq.cli.terminal import Stepper, print_view, writing
+    from daq.cli.terminal import print_view, show_steps, writing
     from daq.files import replace_file
     from daq.report.proposal import show as show_proposal
     from daq.report.text import json_text
@@ -238,7 +210,7 @@ def demo(
     began = time.monotonic()
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
     with writing(out):
-        with Stepper() as stepper:
+        with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}
         replace_file(out / "summary.json", json_text(document).encode())

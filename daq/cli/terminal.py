@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Self
+from types import FrameType
+from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -20,22 +20,11 @@ from daq.report.text import printable
 if TYPE_CHECKING:
     from drivers.canopen.network import SignalBlocker
 
-_HEAD_BYTES = 4096
-
 ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
-    """Refuse an output file that would overwrite an input or a file of another kind.
-
-    Args:
-        out: file to write, None where nothing is written.
-        inputs: files that the verb reads, None for options that were not given.
-        format_: name of the kind; its files say ``format: …`` in their first lines, and may be replaced.
-
-    Raises:
-        UsageError: it is an input, or a file of another kind.
-    """
+    """Refuse an output file that would overwrite an input, or a file without ``format: …`` in its first lines."""
     if out is None or not out.exists():
         return
     if any(given is not None and given.exists() and out.samefile(given) for given in inputs):
@@ -46,17 +35,14 @@ def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) 
 
 
 def check_replaceable(out: Path, mark: str, kind: str) -> None:
-    """Refuse to overwrite a file of another kind.
-
-    Args:
-        out: file to write.
-        mark: text in the first lines of every file of this kind.
-        kind: name of the kind, for the message.
-
-    Raises:
-        UsageError: the file exists and lacks the mark.
-    """
-    if out.exists() and not (out.is_file() and mark.encode() in _head(out)):
+    """Refuse to overwrite a file of another kind: one that is not empty and lacks the mark of this kind in its head."""
+    if out.is_file():
+        with out.open("rb") as stream:
+            head = stream.read(4096)
+        replaceable = not head or mark.encode() in head
+    else:
+        replaceable = not out.exists()
+    if not replaceable:
         raise UsageError(
             str(out),
             found=f"an existing file that is no {kind}",
@@ -65,18 +51,9 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
         )
 
 
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(_HEAD_BYTES)
-
-
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Report a refusal of the file system within the block as an output that failed.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
+    """Report a refusal of the file system within the block as an output that failed."""
     try:
         yield
     except OSError as error:
@@ -84,18 +61,19 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def one_of(remedy: str, **options: object) -> None:
-    """Require exactly one of several options, by their names on the command line.
+    """Require exactly one of several options, by their names on the command line."""
+    if not any(options.values()):
+        names = ", ".join(f"--{name}" for name in options)
+        raise UsageError(names, found="neither", expected="one of them", remedy=remedy)
+    at_most_one(**options)
 
-    Raises:
-        UsageError: none, or more than one, is given.
-    """
-    given = [name for name, value in options.items() if value]
-    if len(given) != 1:
+
+def at_most_one(**options: object) -> None:
+    """Refuse options that exclude each other, by their names on the command line."""
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
+    if len(given) > 1:
         raise UsageError(
-            ", ".join(f"--{name}" for name in options),
-            found="both" if given else "neither",
-            expected="one of them",
-            remedy=remedy,
+            given[0], found=f"{', '.join(given[1:])} beside it", expected="one of them", remedy="leave out all but one"
         )
 
 
@@ -116,32 +94,15 @@ def say_written(console: Console, *paths: Path | None) -> None:
 
 
 class Stepper:
-    """Progress bars on stderr for steps that follow each other; a context manager."""
+    """Progress bars for steps that follow each other."""
 
-    def __init__(self) -> None:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[remark]}", style="dim"),
-        )
-        self._bars = Progress(*columns, console=Console(stderr=True), refresh_per_second=5)
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
         self._task: TaskID | None = None
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is None:
-            self._end()
-        self._bars.stop()
 
     def step(self, title: str) -> None:
         """End the current step and begin the next."""
-        self._end()
+        self.end()
         self._task = self._bars.add_task(title, total=None, remark="")
 
     def progress(self, done: int, total: int, remark: str) -> None:
@@ -150,16 +111,28 @@ class Stepper:
             of = f"{done}/{total} " if total else ""
             self._bars.update(self._task, completed=done, total=total or None, remark=of + remark)
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """End the current step."""
         if self._task is not None:
             self._bars.update(self._task, completed=1, total=1)
             self._bars.stop_task(self._task)
 
 
 @contextmanager
+def show_steps() -> Iterator[Stepper]:
+    """Show progress bars on stderr; the last one is ended unless an error is raised."""
+    remark = TextColumn("{task.fields[remark]}", style="dim")
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(), remark)
+    with Progress(*columns, console=Console(stderr=True), refresh_per_second=5) as bars:
+        stepper = Stepper(bars)
+        yield stepper
+        stepper.end()
+
+
+@contextmanager
 def progress_bar(title: str) -> Iterator[ProgressCallback]:
     """Show one progress bar on stderr."""
-    with Stepper() as stepper:
+    with show_steps() as stepper:
         stepper.step(title)
         yield stepper.progress
 
@@ -192,10 +165,6 @@ def interruptible(
     yielded context manager protects a stop that a fault has started in the same way; a signal that arrives meanwhile is
     dropped, because it asks for what is happening already. Outside the main thread, where Python handles no signals,
     nothing changes.
-
-    Args:
-        clock: monotonic time [s].
-        signals: those that interrupt.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext

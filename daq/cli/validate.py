@@ -19,12 +19,9 @@ TABLES = "drivegain-validation-tables"  #: Format of the page of tables
 def validate_verb(
     calibration: CalibrationArgument,
     logs: Annotated[list[Path], typer.Argument(help="Logs of the same cell.")],
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder for a picture of each log: measured and predicted torque.")
-    ] = None,
+    pictures: Annotated[Path | None, typer.Option(help="Folder for pictures of the torques.")] = None,
     beside: Annotated[
-        list[Path] | None,
-        typer.Option(help="Another calibration, or a folder of them (`fit --cases`), to compare with; repeatable."),
+        list[Path] | None, typer.Option(help="Another calibration, or a folder of them (`fit --cases`); repeatable.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the paper's Tables 5 to 8 (tables.md).")] = None,
     cell: CellOption = None,
@@ -71,12 +68,7 @@ def validate_verb(
 
 
 def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]:
-    """Load calibrations by label, the one to validate first; a file that is named twice counts once.
-
-    Raises:
-        CalibrationMissing: a folder holds none.
-        CalibrationUnreadable, CalibrationRefused: a file is no calibration, or was edited by hand.
-    """
+    """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
     from collections import Counter
 
     from daq.workflow.calibration_file import load

@@ -30,41 +30,29 @@ class Verb:
     name: str  #: on the command line
     function: Callable[..., None]  #: takes its arguments as typer parses them; its docstring is the help
     example: str  #: a command line that works, shown at the end of the help
+    #: Verbs with arguments of their own, `drivegain export urdf …`; then `function` takes none and is the help alone.
+    kinds: tuple[Verb, ...] = ()
 
     def command(self) -> Any:
-        """Click command of this verb."""
-        app = _app()
-        self.add_to(app)
+        """Click command of this verb, or group of its kinds."""
+        # rich would read the units in brackets, [s], as markup and drop them.
+        app = typer.Typer(
+            add_completion=False,
+            pretty_exceptions_enable=False,
+            rich_markup_mode=None,
+            no_args_is_help=True,
+            epilog=self._epilog,
+        )
+        if self.kinds:
+            app.callback()(self.function)
+        for verb in self.kinds or (self,):
+            app.command(verb.name, epilog=verb._epilog)(verb.function)
         return typer.main.get_command(app)
 
-    def add_to(self, app: typer.Typer) -> None:
-        """Add the verb to an application."""
-        app.command(self.name, epilog=self.epilog)(self.function)
-
     @property
-    def epilog(self) -> str:
+    def _epilog(self) -> str:
         """Example as click shows it; \\b keeps it on one line, ready to copy."""
         return f"\b\nExample:\n  {self.example}"
-
-
-@dataclass(frozen=True, slots=True)
-class VerbGroup(Verb):
-    """Verb of several kinds, each with its own arguments: `drivegain export urdf …`."""
-
-    kinds: tuple[Verb, ...]  #: in the order of the help
-
-    def command(self) -> Any:
-        """Click group of the kinds; the docstring of `function`, which takes no arguments, is the help."""
-        group = _app(no_args_is_help=True, epilog=self.epilog)
-        group.callback()(self.function)
-        for kind in self.kinds:
-            kind.add_to(group)
-        return typer.main.get_command(group)
-
-
-def _app(**settings: Any) -> typer.Typer:
-    # rich would read the units in brackets, [s], as markup and drop them.
-    return typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, **settings)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from daq.config.bus import bus_loads, frame_bits
 from daq.config.cell import Pacing
-from daq.report.text import plain_table, printable
+from daq.report.text import picked, plain_table, printable
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
 
@@ -29,14 +29,7 @@ FAULTY = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
 
 def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], width: int) -> Iterator[RenderableType]:
-    """Table of the nodes, and what needs attention.
-
-    Args:
-        cell: that was scanned.
-        rows: of all buses, from `scan_rows`.
-        reset: axes whose fault was reset.
-        width: of the terminal, in columns.
-    """
+    """Table of the nodes on all buses, and what needs attention; at most `width` columns wide."""
     yield scan_table(rows, width, several=len({row["bus"] for row in rows}) > 1)
     for row in rows:
         if row["enabled"]:
@@ -45,26 +38,20 @@ def scan_view(cell: Cell, rows: list[dict[str, Any]], reset: Sequence[str], widt
     for name in reset:
         yield Text(f"The fault of {printable(name)} was reset; it has no power.")
     if any(row["in_fault"] for row in rows):
-        yield Text(_IN_FAULT, "yellow")
-    note = actual_current_note(cell)
-    if note is not None:
+        yield Text(
+            "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the last run (`drivegain "
+            "explain-emcy`) shows the cause. Remove it, then reset the fault with --reset-faults; nothing moves.",
+            "yellow",
+        )
+    if (note := actual_current_note(cell)) is not None:
         yield Text(note, "yellow")
 
 
-_IN_FAULT = (
-    "An axis is in fault. Its display, the drive's own tool or an EMCY in the log of the last run (`drivegain "
-    "explain-emcy`) shows the cause. Remove the cause, then reset the fault with --reset-faults; nothing moves."
-)
+_IDENTITY = ("vendor_id", "product_code", "serial")
 
 
 def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[str, Any]]:
-    """Rows of the nodes of one bus, configured or found.
-
-    Args:
-        cell: with the expected nodes.
-        found: nodes on the bus.
-        bus: name of the bus.
-    """
+    """Rows of the nodes of one bus, configured or found."""
     from drivers.canopen.link import nmt_name  # noqa: PLC0415 - a fit has a note from here, and needs no bus
 
     homes = {axis.node_id: axis.bus for axis in cell.axes if axis.node_id is not None}
@@ -89,9 +76,7 @@ def scan_rows(cell: Cell, found: tuple[FoundNode, ...], bus: str) -> list[dict[s
                 "bus": bus,
                 "node_id": node_id,
                 "axis": None if axis is None else axis.name,
-                "vendor_id": None if identity is None else identity.vendor_id,
-                "product_code": None if identity is None else identity.product_code,
-                "serial": None if identity is None else identity.serial,
+                **(dict.fromkeys(_IDENTITY) if identity is None else picked(identity, *_IDENTITY)),
                 "device_name": None if node is None else node.device_name,
                 "nmt": None if node is None or node.nmt is None else nmt_name(node.nmt),
                 "state": None if node is None or node.state is None else str(node.state),
@@ -141,8 +126,7 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
     """JSON document of one reading of the bus.
 
     Args:
-        cell: that was read.
-        reading: of its buses.
+        cell, reading: the cell, and what was read from its buses.
         ampere: amperes per raw unit of each axis' current, None where unknown.
         events: texts of recent events, oldest first.
     """
@@ -167,8 +151,7 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
                 "enabled": None if state is None else state in ENABLED,
                 "statusword": word,
                 "nmt": None if axis.nmt is None else nmt_name(axis.nmt),
-                "rate_hz": axis.rate_hz,
-                "lost": axis.lost,
+                **picked(axis, "rate_hz", "lost"),
                 "silent": axis.rate_hz == 0.0,
             }
         )
@@ -176,8 +159,7 @@ def monitor_document(cell: Cell, reading: CellReading, ampere: list[float | None
     return {
         "cell": cell.name,
         "source": reading.source.value,
-        "seconds": reading.seconds,
-        "sync_hz": reading.sync_hz,
+        **picked(reading, "seconds", "sync_hz"),
         "frames_per_s": sum(map(sum, reading.frames)) / reading.seconds,
         "bus_load_percent": max(loads),
         "buses": [{"bus": bus.name, "load_percent": load} for bus, load in zip(cell.buses, loads, strict=True)],
@@ -224,31 +206,20 @@ def monitor_view(document: dict[str, Any]) -> Group:
     """Table of the axes, with the load of the buses and recent events, from `monitor_document`."""
     table = plain_table(("axis", "position", "current", "state", "rate Hz", "lost"), left=(0, 3))
     for axis in document["axes"]:
-        table.add_row(*map(Text, _monitor_cells(axis)), style=_monitor_style(axis))
+        position = "?" if axis["position"] is None else f"{axis['position']:.3f} {axis['unit']}"
+        current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
+        if axis["current_a"] is not None:
+            current = f"{axis['current_a']:+.3f} A"
+        note, style = (" (ENABLED)", "bold") if axis["enabled"] else ("", None)
+        if axis["silent"]:
+            note, style = " (SILENT)", "red"
+        state = (axis["state"] or "?").lower() + note
+        cells = (printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"]))
+        table.add_row(*map(Text, cells), style=style)
     head = Text(printable(f"{document['cell']}: {_SOURCE_TEXT[document['source']]}"))
     loads = ", ".join(f"{printable(bus['bus'])} {bus['load_percent']:.1f} % at worst" for bus in document["buses"])
     load = Text(f"{loads}, {document['frames_per_s']:.0f} frames/s, SYNC {document['sync_hz']:.1f} Hz")
     return Group(head, table, load, *(Text(printable(event), "yellow") for event in document["events"]))
-
-
-def _monitor_cells(axis: dict[str, Any]) -> tuple[str, ...]:
-    position = "?" if axis["position"] is None else f"{axis['position']:.3f} {axis['unit']}"
-    if axis["current_a"] is not None:
-        current = f"{axis['current_a']:+.3f} A"
-    else:
-        current = "?" if axis["current_raw"] is None else f"{axis['current_raw']:+d} raw"
-    state = (axis["state"] or "?").lower()
-    if axis["silent"]:
-        state += " (SILENT)"
-    elif axis["enabled"]:
-        state += " (ENABLED)"
-    return printable(axis["axis"]), position, current, state, f"{axis['rate_hz']:.1f}", str(axis["lost"])
-
-
-def _monitor_style(axis: dict[str, Any]) -> str | None:
-    if axis["silent"]:
-        return "red"
-    return "bold" if axis["enabled"] else None
 
 
 def current_signals(cell: Cell) -> dict[str, str]:

@@ -30,12 +30,7 @@ WORDS = {
 
 
 def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
-    """Name an effect and its place: `load-friction on J3`, `coupling on J4 with J5`.
-
-    Args:
-        placed: effect and axis.
-        axes: their names.
-    """
+    """Name an effect and its place: `load-friction on J3`, `coupling on J4 with J5`."""
     if placed.effect.side is Side.ALL_MOTORS:
         return f"{placed.effect.name} on all axes"
     other = other_axis(placed.effect)

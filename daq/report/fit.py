@@ -12,10 +12,11 @@ from rich.text import Text
 from daq.report import paper_tables
 from daq.report.bus import actual_current_note
 from daq.report.gains import gain_table, partial_note
-from daq.report.text import percent_text, plain_table
+from daq.report.text import percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
+from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
 from ident.discovery.loop import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
@@ -25,13 +26,7 @@ from ident.planning.excitation import GOOD_PERCENT, GainVerdict
 
 
 def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> Iterator[RenderableType]:
-    """Gains and errors, what they rest on, and what the data cannot show.
-
-    Args:
-        found: the fit.
-        calibration: its result.
-        comparison: of all estimators, None where it was not asked for.
-    """
+    """Gains and errors, what they rest on, and what the data cannot show; `comparison` is of all estimators."""
     fitted = found.fitted
     axes, estimate = fitted.cell.axis_names, fitted.estimate
     yield gain_table(calibration.gains, title=f"Drive gains of {calibration.cell} by {calibration.method}")
@@ -62,23 +57,35 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
 
 
 def fit_document(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> dict[str, Any]:
-    """Build the object of `fit --json`; arguments as of `fit_view`."""
+    """Build the object of `fit --json`."""
     fitted = found.fitted
     axes, paper = fitted.cell.axis_names, fitted.paper
     compared = {}
     if paper is not None:
-        gains = [
-            {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
-            for axis, value, std in zip(axes, paper.gains, paper.gains_std, strict=True)
-        ]
-        compared = {"tls": {"gains": gains, "condition": paper.condition}}
+        compared = {"tls": {"gains": _gains(axes, paper.gains, paper.gains_std), "condition": paper.condition}}
     return {
         **as_document(calibration),
         "compared": compared,
         "removed": _removed(found),
-        "verdicts": [verdict_document(gain, axes) for gain in needed_verdicts(fitted)],
-        **({} if comparison is None else {"comparison": comparison_document(comparison, axes)}),
+        "verdicts": [
+            {
+                "axis": axes[gain.axis],
+                "std_percent": gain.std_percent,
+                "verdict": gain.verdict.value,
+                "seen_by": [source.value for source in gain.sources],
+                "words": gain.words(axes[gain.axis]),
+            }
+            for gain in needed_verdicts(fitted)
+        ],
+        **({} if comparison is None else {"comparison": [_trial(trial, axes) for trial in comparison.trials]}),
     }
+
+
+def _gains(axes: tuple[str, ...], gains: FloatArray, stds: FloatArray) -> list[dict[str, Any]]:
+    return [
+        {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
+        for axis, value, std in zip(axes, gains, stds, strict=True)
+    ]
 
 
 def cases_document(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calibration]) -> dict[str, Any]:
@@ -98,7 +105,7 @@ def cases_document(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calib
 
 def _removed(found: CaseFit) -> list[dict[str, Any]]:
     steps = () if found.essential is None else found.essential.removed
-    return [{"name": step.name, "std_percent": step.std_percent} for step in steps]
+    return [picked(step, "name", "std_percent") for step in steps]
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:
@@ -112,17 +119,6 @@ def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTabl
         yield ""
 
 
-def case_tables(calibrations: dict[str, Calibration]) -> tuple[paper_tables.PaperTable, ...]:
-    """Tables 1 to 4 of the paper, from the calibrations by name of their case."""
-    wls, tls = ((calibrations[f"case-{drawn}"], calibrations[f"case-{mass}"]) for drawn, mass in ((1, 2), (3, 4)))
-    return (
-        paper_tables.parameter_table(1, *wls, "IDIM-WLS"),
-        paper_tables.gain_table(2, *wls, "IDIM-WLS"),
-        paper_tables.parameter_table(3, *tls, "IDIM-TLS"),
-        paper_tables.gain_table(4, *tls, "IDIM-TLS"),
-    )
-
-
 def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, RelativeError | None]) -> Table:
     """Relative error of each axis and of all together, a row for each entry that is known."""
     table = plain_table(("", *axes, "total"), title=title)
@@ -132,12 +128,13 @@ def error_table(title: str, axes: tuple[str, ...], errors: Mapping[str, Relative
     return table
 
 
-def start_of(fitted: Fit) -> Evidence:
-    """Return the rows under the declared model; the logs are read again only where the rows were not kept.
+def error_document(error: RelativeError | None) -> dict[str, Any] | None:
+    """Return relative errors, for --json."""
+    return None if error is None else {"axes": list(error.axes), "total": error.total}
 
-    Raises:
-        DataError: a log can no longer be read.
-    """
+
+def start_of(fitted: Fit) -> Evidence:
+    """Return the rows under the declared model; the logs are read again only where the rows were not kept."""
     if not fitted.steps:
         return fitted.evidence()
     return without_effects(fitted.steps[0].after, fitted.identification.estimate)
@@ -203,17 +200,6 @@ def advice(fitted: Fit, judged: tuple[GainVerdict, ...]) -> tuple[str, ...]:
     return ("Excitation:", *(f"  {gain.words(fitted.cell.axis_names[gain.axis])}" for gain in judged))
 
 
-def verdict_document(gain: GainVerdict, axes: tuple[str, ...]) -> dict[str, Any]:
-    """Verdict on one gain, for --json."""
-    return {
-        "axis": axes[gain.axis],
-        "std_percent": gain.std_percent,
-        "verdict": gain.verdict.value,
-        "seen_by": [source.value for source in gain.sources],
-        "words": gain.words(axes[gain.axis]),
-    }
-
-
 def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Table, Table]:
     """Gains by every estimator under the declared filters, and their spread between half and twice the cut-offs."""
     first = comparison.trials[0]
@@ -231,21 +217,9 @@ def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Ta
     return gains, spreads
 
 
-def comparison_document(comparison: Comparison, axes: tuple[str, ...]) -> list[dict[str, Any]]:
-    """Return all trials, for --json."""
-    return [_trial(trial, axes) for trial in comparison.trials]
-
-
 def _trial(trial: Trial, axes: tuple[str, ...]) -> dict[str, Any]:
-    document: dict[str, Any] = {
-        "estimator": trial.estimator,
-        "position_cutoff_hz": trial.position_cutoff_hz,
-        "decimation_cutoff_hz": trial.decimation_cutoff_hz,
-    }
+    document = picked(trial, "estimator", "position_cutoff_hz", "decimation_cutoff_hz")
     if trial.gains is None or trial.std is None:
         return {**document, "gains": None, "reason": trial.reason}
-    gains = [
-        {"axis": axis, "value": float(value), "std_percent": 100.0 * float(std / abs(value))}
-        for axis, value, std in zip(axes, trial.gains, trial.std, strict=True)
-    ]
+    gains = _gains(axes, trial.gains, trial.std)
     return {**document, "gains": gains, "relative_error_percent": trial.relative_error_percent}

@@ -16,33 +16,18 @@ from daq.jobs.cell_fit import Failure
 from daq.jobs.fleet import FleetRow
 from daq.jobs.fleet_survey import Summary
 from daq.report.gains import with_deviation
-from daq.report.text import inert, inert_row, printable, spelled_bytes
+from daq.report.text import inert, inert_row, picked, printable, spelled_bytes
 from ident.calibration import Gain
 
 FIRST_COLUMNS = ("cell", "configuration_sha256", "fit", "holdout")
 LAST_COLUMNS = (
-    "worst_axis",
-    "worst_std_percent",
-    "error_percent",
-    "error_on",
-    "effects",
-    "partial",
-    "seconds",
-    "exit_code",
-    "error_kind",
-    "error",
-    "calibration",
+    *("worst_axis", "worst_std_percent", "error_percent", "error_on", "effects", "partial"),
+    *("seconds", "exit_code", "error_kind", "error", "calibration"),
 )
 
 
 def fleet_view(rows: Sequence[FleetRow]) -> Iterator[RenderableType]:
-    """Table of the cells, and remarks on it."""
-    yield _fleet_table(rows)
-    yield from map(printable, _remarks(rows))
-
-
-def _fleet_table(rows: Sequence[FleetRow]) -> Table:
-    """Table of the cells, a row each; errors are red."""
+    """Table of the cells, a row each, and remarks on it; errors are red."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     table.add_column("cell", overflow="fold")
     table.add_column("gains ± σ", ratio=1)
@@ -53,15 +38,14 @@ def _fleet_table(rows: Sequence[FleetRow]) -> Table:
         table.add_column("effects")
     table.add_column("s", justify="right", no_wrap=True)
     for row in rows:
-        cells = _failure_cells(row.result) if isinstance(row.result, Failure) else _summary_cells(row.result)
-        style = "bold red" if isinstance(row.result, Failure) else None
+        if isinstance(row.result, Failure):
+            cells, style = (printable(f"{row.result.kind}: {row.result.text}"), "", "", ""), "bold red"
+        else:
+            cells, style = _summary_cells(row.result), None
         shown = (*cells[:3], *(cells[3:] if effects else ()), f"{row.seconds:.2f}")
         table.add_row(*map(Text, (printable(row.cell), *shown)), style=style)
-    return table
-
-
-def _failure_cells(failure: Failure) -> tuple[str, str, str, str]:
-    return printable(f"{failure.kind}: {failure.text}"), "", "", ""
+    yield table
+    yield from map(printable, _remarks(rows))
 
 
 def _summary_cells(summary: Summary) -> tuple[str, str, str, str]:
@@ -172,10 +156,4 @@ def _measured_on(summary: Summary) -> str:
 
 
 def _gain(gain: Gain) -> dict[str, Any]:
-    return {
-        "axis": gain.axis,
-        "value": gain.value,
-        "std": gain.std,
-        "std_percent": gain.std_percent,
-        "unit": gain.unit,
-    }
+    return picked(gain, "axis", "value", "std", "std_percent", "unit")

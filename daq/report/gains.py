@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
-from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, save_png, unformatted
+from daq.report.picture import BLUE, GREEN, GREY, ORANGE, grid, legend_below, render, unformatted
 from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
 from ident.discovery.before_after import GainChange
@@ -18,19 +17,11 @@ _SIGMAS = 2.0
 _BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes
 
 
-def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> None:
+def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str) -> bytes:
     """Draw how far each identified gain is from its nameplate, with its uncertainty.
 
     Gains of different axes differ by an order of magnitude and may be negative, so all are shown in percent.
-
-    Args:
-        path: of the PNG.
-        gains: one an axis.
-        truth: true gain by axis, for a simulated cell only.
-        title: names the cell.
-
-    Raises:
-        OSError: from the file system.
+    Return a PNG. `truth` is by axis, for a simulated cell only.
     """
     figure, ((place,),) = grid(1, (1.0,), title, height_in=3.2)
     positions = np.arange(len(gains))
@@ -50,17 +41,11 @@ def plot_gains(path: Path, gains: tuple[Gain, ...], truth: Mapping[str, float] |
     place.margins(y=0.15)
     place.set_ylabel("change from the nameplate [%]", fontsize=8)
     legend_below(figure, place)
-    save_png(figure, path)
+    return render(figure)
 
 
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
-    """Table of the gains, a row an axis; fits a terminal of 80 columns.
-
-    Args:
-        gains: one an axis.
-        truth: true gain by axis, for a simulated cell only.
-        title: above the table.
-    """
+    """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
     headings = [
         "axis",
         "a priori",
@@ -102,25 +87,11 @@ def with_deviation(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
-def plot_gain_changes(
-    path: Path | None, changes: tuple[GainChange, ...], axes: tuple[str, ...], *, title: str
-) -> bytes:
+def plot_gain_changes(changes: tuple[GainChange, ...], axes: tuple[str, ...], *, title: str) -> bytes:
     """Draw each gain before and after, in per cent of the one before, with the interval of either.
 
     Both estimates share their noise, so the σ of the change decides whether a change is more than noise, not the
-    overlap of the intervals; axes where it is are starred.
-
-    Args:
-        path: of the PNG; None for its bytes alone.
-        changes: one an axis.
-        axes: their names.
-        title: names the cell.
-
-    Returns:
-        the PNG.
-
-    Raises:
-        OSError: from the file system.
+    overlap of the intervals; axes where it is are starred. Return a PNG.
     """
     figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=2.8)
     places = np.arange(len(changes))
@@ -132,15 +103,9 @@ def plot_gain_changes(
         ("after", BLUE, "o", _BESIDE, after, np.array([c.after_std for c in changes])),
     )
     for label, colour, marker, beside, values, std in kinds:
+        width, name = _SIGMAS * std * scale, f"{label} ± {_SIGMAS:g} σ"
         place.errorbar(
-            places + beside,
-            values,
-            yerr=_SIGMAS * std * scale,
-            fmt=marker,
-            color=colour,
-            capsize=5,
-            markersize=5,
-            label=f"{label} ± {_SIGMAS:g} σ",
+            places + beside, values, yerr=width, fmt=marker, color=colour, capsize=5, markersize=5, label=name
         )
     names = [f"{name} *" if change.significant else name for name, change in zip(axes, changes, strict=True)]
     place.set_xticks(places, [unformatted(name) for name in names])
@@ -148,4 +113,4 @@ def plot_gain_changes(
     place.margins(y=0.15)
     place.set_ylabel("change of the gain [%]", fontsize=8)
     legend_below(figure, place)
-    return save_png(figure, path)
+    return render(figure)

@@ -1,168 +1,289 @@
-"""The picture of a history: each gain over time with its baseline, and beneath it what raises alarms."""
+"""A history on the screen, as one JSON object, as a table for a spreadsheet, and as a picture of each gain."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from datetime import datetime
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from daq.files import replace_file
-from daq.ledger.watch import Series
-from daq.report.picture import BLUE, DPI, GREY, ORANGE, PURPLE, SKY, legend_below, panels, unformatted
-from daq.report.text import inert_row
-from ident.drift.change import CHART, Chart
+from rich.console import Console
+from rich.table import Table
+
+from daq.config.cell import Cell
+from daq.errors import ControllerUnfit
+from daq.ledger.audit import AuditEntry
+from daq.ledger.entry import Entry, Event, WriteAction
+from daq.ledger.ledger import Verification
+from daq.ledger.store import HistoryStore
+from daq.ledger.watch import Series, alarm_text, pattern_of, questions
+from daq.report.gains import with_deviation
+from daq.report.picture import BLUE, GREY, ORANGE, PURPLE, SKY, legend_below, panels, render, unformatted
+from daq.report.text import inert_row, picked, plain_table, printable
+from daq.writeback.drive_record import drives_of
+from daq.writeback.file_access import resolve_links
+from daq.writeback.formats.document import decode, read_bytes
+from daq.writeback.formats.scalar import Scalar, rewrite_gain
+from ident.drift.change import CHART
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
-_SIGMAS = 2.0
-_COLUMNS = 2
-_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
+def show(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
+    """The calibrations, a line each, with what was done with each by its digest; then each gain as it is now."""
+    if not entries:
+        console.print("The history is empty: no calibration was applied or entered yet.")
+        console.print("To enter one: drivegain history CELL --add CALIBRATION")
+        return
+    console.print(calibration_table(entries, all_series, actions))
+    console.print()
+    console.print(gain_table(all_series))
+    say_alarms(all_series, console)
 
 
-def plot_history(path: Path, all_series: Sequence[Series], *, title: str, chart: Chart = CHART) -> None:
-    """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
-
-    Args:
-        path: of the picture, .png or .svg.
-        all_series: one an axis, at least one.
-        title: says which cell it is.
-        chart: limits that `all_series` was watched with.
-
-    Raises:
-        OSError: from the file system.
-    """
-    columns = min(_COLUMNS, len(all_series))
-    bands = -(-len(all_series) // columns)
-    figure, places = panels(2 * columns * bands, columns, unformatted(title))
-    for number, series in enumerate(all_series):
-        band, column = divmod(number, columns)
-        above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
-        _draw_gains(above, series)
-        _draw_limits(beneath, series, chart)
-    for empty in range(len(all_series), columns * bands):
-        for row in range(2):
-            places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
-    _date(places, [_days(point.entry.recorded) for series in all_series for point in series.points])
-    upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
-    legend_below(figure, *upper)
-    # One legend for both kinds of panels would be wider than the picture of one axis.
-    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=_once(places[columns]))
-    _save(figure, path)
-
-
-def _draw_gains(place: Axes, series: Series) -> None:
-    times = [_days(point.entry.recorded) for point in series.points]
-    values = [point.gain.value for point in series.points]
-    widths = [_SIGMAS * series.dispersion * point.gain.std for point in series.points]
-    place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
-    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {_SIGMAS:g} σ")
-    held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
-    place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
-    alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
-    place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
-    for stretch in series.stretches:
-        drift = stretch.drift
-        ends = [times[stretch.began], times[stretch.ended - 1]]
-        low, high = (drift.baseline + sign * _SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
-        place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
-        place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
-        if drift.steady:
-            reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
-            place.plot(ends, [drift.baseline, reached], color=ORANGE, linewidth=1.2, label="steady change")
+def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str, str], console: Console) -> None:
+    """Every calibration of one gain."""
+    console.print(axis_table(series, actions))
     for noted in series.acknowledged:
-        place.axvline(_days(noted.since), color=PURPLE, linestyle=":", linewidth=1.2, label="change acknowledged")
-    place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
+        console.print(
+            f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
+            f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
+        )
+    words = alarm_text(series)
+    if words is not None:
+        say_alarms(all_series, console)
+    elif series.drift is not None:
+        console.print(f"No alarm. σ of the changes is {series.dispersion:.2f} × that of the fits.")
 
 
-def _draw_limits(place: Axes, series: Series, chart: Chart) -> None:
-    place.axhline(0.0, color=GREY, linewidth=0.8)
-    for sign in (-1.0, 1.0):
-        place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
-    for stretch in series.stretches:
-        times = [_days(point.entry.recorded) for point in series.points[stretch.began : stretch.ended]]
-        drift = stretch.drift
-        for sums in (drift.upper, -drift.lower):
-            place.step(times, sums / chart.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
-        place.plot(times, drift.trend / chart.trend, color=PURPLE, linewidth=1.0, label="trend")
-        place.plot(times, drift.deviations / chart.single, ".", color=GREY, markersize=4, label="one calibration")
-    place.set_ylabel("over its limit", fontsize=8)
+def say_alarms(all_series: Sequence[Series], console: Console) -> None:
+    """Print what changed, and possible causes."""
+    alarms = [words for series in all_series if (words := alarm_text(series)) is not None]
+    console.print("No alarm." if not alarms else "")
+    for words in alarms:
+        console.print(f"ALARM: {words}", style="bold")
+    for question in questions(all_series):
+        console.print(question[0].upper() + question[1:])
+    if alarms:
+        console.print('When it is explained: drivegain history CELL --acknowledge AXIS --why "what happened"')
 
 
-def _once(place: Axes) -> list[Any]:
-    """One handle a label."""
-    handles, labels = place.get_legend_handles_labels()
-    return list(dict(zip(labels, handles, strict=True)).values())
+def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], actions: Mapping[str, str]) -> Table:
+    """One row a calibration."""
+    headings = ("recorded (UTC)", "calibration", "error %", "largest change", "alarms", "applied")
+    table = plain_table(headings, left=(0, 1, 4, 5), wrap=(5,))
+    for entry in sorted(entries, key=lambda one: one.recorded):
+        points = [
+            (series, index, point)
+            for series in all_series
+            for index, point in enumerate(series.points)
+            if point.entry.digest == entry.digest
+        ]
+        alarms = [series.axis for series, index, _ in points if series.alarm_at(index) is not None]
+        changes = [(point.change, point.gain.axis) for _, _, point in points if point.change is not None]
+        largest = "-"
+        if changes:
+            change, axis = max(changes, key=lambda pair: abs(pair[0].sigmas))
+            largest = f"{printable(axis)} {change.percent:+.1f} % {abs(change.sigmas):.1f} σ"
+        error = entry.error_percent if entry.holdout_percent is None else entry.holdout_percent
+        table.add_row(
+            f"{entry.recorded:%Y-%m-%d %H:%M}",
+            entry.digest[:8],
+            f"{error:.2f}",
+            largest,
+            ", ".join(alarms) or "-",
+            printable(actions[entry.digest]),
+        )
+    return table
 
 
-def _days(at: datetime) -> float:
-    """As matplotlib counts dates: days since 1970, UTC."""
-    return at.timestamp() / 86_400.0
+def gain_table(all_series: Sequence[Series]) -> Table:
+    """Each gain as it was found last, beside its baseline."""
+    headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
+    table = plain_table(headings, left=(0, 5, 6))
+    for series in all_series:
+        if not series.points:
+            table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
+            continue
+        gain = series.points[-1].gain
+        count = len(series.points) - series.began
+        drift = series.drift if count > 1 else None
+        state = (
+            "ALARM" if series.alarmed else "ok" if count > CHART.baseline else f"baseline: {count} of {CHART.baseline}"
+        )
+        table.add_row(
+            printable(series.axis),
+            with_deviation(gain.value, gain.std),
+            f"{gain.nameplate:.4g}",
+            "-" if drift is None else f"{drift.change_percent:+.2f}",
+            "-" if drift is None else f"{abs(drift.change_sigmas):.1f}",
+            state,
+            printable(series.unit),
+        )
+    return table
 
 
-def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [when for when, _ in points], [value for _, value in points]
+def axis_table(series: Series, actions: Mapping[str, str]) -> Table:
+    """Every calibration of one gain, with the two sums and the slope that are watched."""
+    figures = (f"{series.axis} [{series.unit}]", "change %", "σ", "CUSUM +", "CUSUM −", "trend")
+    table = plain_table(("recorded (UTC)", *figures, "alarm", "applied"), left=(0, 7, 8), wrap=(8,))
+    for index, point in enumerate(series.points):
+        stretch = series.stretch_at(index)
+        place = index - stretch.began
+        alarm = series.alarm_at(index)
+        table.add_row(
+            f"{point.entry.recorded:%Y-%m-%d %H:%M}",
+            with_deviation(point.gain.value, point.gain.std),
+            "-" if point.change is None else f"{point.change.percent:+.2f}",
+            "-" if point.change is None else f"{abs(point.change.sigmas):.1f}",
+            f"{stretch.drift.upper[place]:.1f}",
+            f"{stretch.drift.lower[place]:.1f}",
+            f"{stretch.drift.trend[place]:+.1f}",
+            "-" if alarm is None else alarm.kind.value,
+            printable(actions[point.entry.digest]),
+        )
+    return table
 
 
-def _date(places: list[Axes], days: list[float]) -> None:
-    import matplotlib.dates  # noqa: PLC0415
-
-    dates: Any = matplotlib.dates  # without types
-    # Of a single day there would be no range to label.
-    beside = max(0.5, 0.03 * (max(days) - min(days)))
-    for place in places:
-        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
-        # At most so many labels as fit beside each other.
-        locator = dates.AutoDateLocator(maxticks=7)
-        place.xaxis.set_major_locator(locator)
-        place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
+_DRIFT = ("change_percent", "change_sigmas", "baseline", "baseline_std")
 
 
-def _save(figure: Figure, path: Path) -> None:
-    from matplotlib import rc_context  # noqa: PLC0415
+def describe(
+    cell: str, entries: Sequence[Entry], chosen: Sequence[Series], all_series: Sequence[Series], in_force: str | None
+) -> dict[str, Any]:
+    """All of it for --json; `chosen` are the axes that were asked for."""
+    return {
+        "cell": cell,
+        "calibrations": len(entries),
+        "in_force": in_force,
+        "chart": picked(CHART, "reference", "threshold", "single", "trend", "baseline"),
+        "pattern": pattern_of(all_series).value,
+        "questions": list(questions(all_series)),
+        "axes": [
+            {
+                **picked(series, "axis", "unit", "dispersion", "alarmed"),
+                "alarm": alarm_text(series),
+                "since": None if series.onset is None else series.onset.isoformat(),
+                **(dict.fromkeys(_DRIFT) if series.drift is None else picked(series.drift, *_DRIFT)),
+                "acknowledged": [
+                    {"since": a.since.isoformat(), "at": a.at.isoformat(), "who": a.who, "why": a.why}
+                    for a in series.acknowledged
+                ],
+                "points": rows(series),
+            }
+            for series in chosen
+        ],
+    }
 
-    drawn = io.BytesIO()
-    kind = path.suffix.lower().removeprefix(".")
-    # Neither time nor random names: the same history gives the same bytes.
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with rc_context({"svg.hashsalt": "drivegain"}):
-        figure.savefig(drawn, format=kind, dpi=DPI, metadata=metadata)
-    replace_file(path, drawn.getvalue())
+
+def say_verification(found: Verification, console: Console) -> None:
+    """Print the state of audit log and history; flaws are in the error."""
+    place, verdict = found.place, found.verdict
+    console.print(f"{place.audit}: {len(verdict.entries)} entries, chain {'unbroken' if verdict.holds else 'BROKEN'}.")
+    if verdict.torn:
+        lines = ", ".join(map(str, verdict.torn))
+        console.print(f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw.")
+    for one in verdict.open_writes:
+        begun = one.begun
+        console.print(
+            f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at {begun.at} was never "
+            f"ended; {printable(begun.subject)} was found {one.content.value}."
+        )
+    console.print(f"{place.store}: {'BROKEN' if found.broken else 'NOT COMPLETE' if found.unknown else 'sound'}.")
 
 
+def describe_verification(found: Verification) -> dict[str, Any]:
+    """Return the same for --json."""
+    verdict = found.verdict
+    return {
+        "file": str(found.place.audit),
+        "entries": len(verdict.entries),
+        "holds": verdict.holds,
+        "broken_line": verdict.broken,
+        "flaws": [{"line": f.line, "flaw": f.flaw.value, "says": f.says} for f in verdict.flaws],
+        "torn_lines": list(verdict.torn),
+        "open_writes": [{**_described(one.begun), "content": one.content.value} for one in verdict.open_writes],
+        "history_broken": [printable(one) for one in found.broken],
+        "unknown_writes": [
+            {**_described(one.ended), "action": one.ended.action.value, "calibration_sha256": one.calibration}
+            for one in found.unknown
+        ],
+    }
+
+
+def _described(entry: AuditEntry) -> dict[str, Any]:
+    return {"number": entry.number, "at": entry.at, "who": entry.who, "file": entry.subject}
+
+
+_WORDS = {WriteAction.APPLIED: "applied", WriteAction.ROLLED_BACK: "restored"}
+"""Words for an event after which a controller had the gains of a calibration."""
+
+
+def in_force(cell: Cell, store: HistoryStore) -> str | None:
+    """Return the digest of the calibration whose gains this cell's own controller has.
+
+    The controller's file is read: it may have been edited, or a backup copied back by hand, and a write to another file
+    (`apply --to`) is not in this controller. Drives are not read; the last write of the history counts. None where the
+    file has other numbers than every calibration, or cannot be read.
+    """
+    controller, file = cell.controller, cell.controller_path
+    if controller is None:
+        return None
+    if file is None or not controller.gains:
+        return store.in_force(drives_of(cell.name)) if controller.objects else None
+    try:
+        target = str(resolve_links(file))
+        scalars = decode(read_bytes(file), str(file), controller.format).locate(controller.gains)
+    except (ControllerUnfit, OSError):
+        return None
+    factors = controller.factors or (1.0,) * len(scalars)
+    numbers = dict(zip(cell.axis_names, zip(scalars, factors, strict=True), strict=True))
+    known, writes = store.in_force(target), [event.digest for event in store.events()]
+    # Where several have these numbers: the one that the history names, else the one that was written last.
+    order = [digest for digest in (known, *reversed(writes)) if digest is not None]
+    having = [entry.digest for entry in reversed(store.entries()) if _has(entry, numbers)]
+    return next((digest for digest in (*order, *having) if digest in having), None)
+
+
+def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_in_force: str | None) -> dict[str, str]:
+    """Return the writes of each calibration in words, by its digest; events are of all controllers, oldest first."""
+    described = {}
+    for entry in entries:
+        parts = []
+        mine = [place for place, event in enumerate(events) if event.digest == entry.digest]
+        if mine:
+            last = events[mine[-1]]
+            parts.append(f"{_WORDS[last.action]} by {last.who}")
+            then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
+            if then is not None and then.action is WriteAction.ROLLED_BACK:
+                parts.append(f"rolled back by {then.who}")
+        if entry.digest == digest_in_force:
+            parts.append("in force")
+        described[entry.digest] = ", ".join(parts) or "-"
+    return described
+
+
+def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
+    """Whether a write of this calibration would change no number."""
+    if {gain.axis for gain in entry.gains} != numbers.keys():
+        return False
+    if not all(math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value for gain in entry.gains):
+        return False
+    try:
+        put = [rewrite_gain(numbers[gain.axis][0], gain.value, gain.std, numbers[gain.axis][1]) for gain in entry.gains]
+    except ControllerUnfit:
+        return False
+    return all(one.new == one.old for one in put)
+
+
+_FIT = ("error_percent", "holdout_percent", "rows", "method", "software", "configuration_sha256")
 COLUMNS = (
-    "axis",
-    "recorded",
-    "gain",
-    "std",
-    "unit",
-    "nameplate",
-    "change_percent",
-    "change_sigmas",
-    "change_probability",
-    "deviation_sigmas",
-    "cusum_up",
-    "cusum_down",
-    "trend_sigmas",
-    "alarm",
-    "baseline",
-    "applied_at",
-    "applied_by",
-    "applied_to",
-    "error_percent",
-    "holdout_percent",
-    "rows",
-    "method",
-    "software",
-    "configuration_sha256",
-    "created",
-    "entered",
-    "digest",
+    *("axis", "recorded", "gain", "std", "unit", "nameplate", "change_percent", "change_sigmas", "change_probability"),
+    *("deviation_sigmas", "cusum_up", "cusum_down", "trend_sigmas", "alarm", "baseline"),
+    *("applied_at", "applied_by", "applied_to", *_FIT, "created", "entered", "digest"),
 )
 
 
@@ -191,9 +312,7 @@ def _row(series: Series, index: int) -> dict[str, Any]:
         "axis": series.axis,
         "recorded": entry.recorded.isoformat(),
         "gain": gain.value,
-        "std": gain.std,
-        "unit": gain.unit,
-        "nameplate": gain.nameplate,
+        **picked(gain, "std", "unit", "nameplate"),
         "change_percent": None if change is None else change.percent,
         "change_sigmas": None if change is None else change.sigmas,
         "change_probability": None if change is None else change.probability,
@@ -206,13 +325,97 @@ def _row(series: Series, index: int) -> dict[str, Any]:
         "applied_at": None if last is None else last.at.isoformat(),
         "applied_by": None if last is None else last.who,
         "applied_to": None if last is None else last.target,
-        "error_percent": entry.error_percent,
-        "holdout_percent": entry.holdout_percent,
-        "rows": entry.rows,
-        "method": entry.method,
-        "software": entry.software,
-        "configuration_sha256": entry.configuration_sha256,
+        **picked(entry, *_FIT),
         "created": entry.created.isoformat(),
         "entered": entry.entered.isoformat(),
         "digest": entry.digest,
     }
+
+
+_SIGMAS = 2.0
+_COLUMNS = 2
+_FIRST_DAY, _LAST_DAY = -719_162.0, 2_932_896.999  #: 1 January 1 and 31 December 9999: matplotlib draws no dates beyond
+
+
+def plot_history(all_series: Sequence[Series], kind: str, *, title: str) -> bytes:
+    """Draw gains ± 2σ, those that a controller had filled, alarms; CUSUM, trend and deviations over their limits.
+
+    There is at least one series; the kind is png or svg.
+    """
+    import matplotlib.dates  # noqa: PLC0415
+
+    dates: Any = matplotlib.dates  # without types
+    columns = min(_COLUMNS, len(all_series))
+    bands = -(-len(all_series) // columns)
+    figure, places = panels(2 * columns * bands, columns, unformatted(title))
+    for number, series in enumerate(all_series):
+        band, column = divmod(number, columns)
+        above, beneath = (places[(2 * band + row) * columns + column] for row in range(2))
+        _draw_gains(above, series)
+        _draw_limits(beneath, series)
+    for empty in range(len(all_series), columns * bands):
+        for row in range(2):
+            places[(2 * (bands - 1) + row) * columns + empty % columns].set_axis_off()
+    days = [_days(point.entry.recorded) for series in all_series for point in series.points]
+    # Of a single day there would be no range to label.
+    beside = max(0.5, 0.03 * (max(days) - min(days)))
+    for place in places:
+        place.set_xlim(max(min(days) - beside, _FIRST_DAY), min(max(days) + beside, _LAST_DAY))
+        # At most so many labels as fit beside each other.
+        locator = dates.AutoDateLocator(maxticks=7)
+        place.xaxis.set_major_locator(locator)
+        place.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
+    upper = [place for row in range(0, len(places), 2 * columns) for place in places[row : row + columns]]
+    legend_below(figure, *upper)
+    # One legend for both kinds of panels would be wider than the picture of one axis.
+    handles, labels = places[columns].get_legend_handles_labels()
+    once = list(dict(zip(labels, handles, strict=True)).values())
+    places[columns].legend(loc="best", ncols=2, fontsize=7, edgecolor="none", handles=once)
+    return render(figure, kind)
+
+
+def _draw_gains(place: Axes, series: Series) -> None:
+    times = [_days(point.entry.recorded) for point in series.points]
+    values = [point.gain.value for point in series.points]
+    widths = [_SIGMAS * series.dispersion * point.gain.std for point in series.points]
+    place.errorbar(times, values, yerr=widths, fmt="none", ecolor=BLUE, elinewidth=1.0, capsize=2)
+    place.plot(times, values, "o", color=BLUE, markerfacecolor="white", markersize=4, label=f"gain ± {_SIGMAS:g} σ")
+    held = [(_days(point.entry.recorded), point.gain.value) for point in series.points if point.entry.applied]
+    place.plot(*_columns(held), "o", color=BLUE, markersize=4, label="applied")
+    alarmed = [(times[i], values[i]) for i in range(len(times)) if series.alarm_at(i) is not None]
+    place.plot(*_columns(alarmed), "o", color=ORANGE, markerfacecolor="none", markersize=9, label="alarm")
+    for stretch in series.stretches:
+        drift = stretch.drift
+        ends = [times[stretch.began], times[stretch.ended - 1]]
+        low, high = (drift.baseline + sign * _SIGMAS * drift.baseline_std for sign in (-1.0, 1.0))
+        place.fill_between(ends, low, high, color=SKY, alpha=0.3, linewidth=0)
+        place.plot(ends, [drift.baseline] * 2, color=GREY, linestyle="--", linewidth=1.2, label="baseline")
+        if drift.steady:
+            reached = drift.baseline * (1.0 + drift.change_percent / 100.0)
+            place.plot(ends, [drift.baseline, reached], color=ORANGE, linewidth=1.2, label="steady change")
+    for noted in series.acknowledged:
+        place.axvline(_days(noted.since), color=PURPLE, linestyle=":", linewidth=1.2, label="change acknowledged")
+    place.set_ylabel(unformatted(f"{series.axis} [{series.unit}]"), fontsize=8)
+
+
+def _draw_limits(place: Axes, series: Series) -> None:
+    place.axhline(0.0, color=GREY, linewidth=0.8)
+    for sign in (-1.0, 1.0):
+        place.axhline(sign, color=ORANGE, linestyle="--", linewidth=1.0, label="limit")
+    for stretch in series.stretches:
+        times = [_days(point.entry.recorded) for point in series.points[stretch.began : stretch.ended]]
+        drift = stretch.drift
+        for sums in (drift.upper, -drift.lower):
+            place.step(times, sums / CHART.threshold, where="mid", color=BLUE, linewidth=1.4, label="CUSUM up, down")
+        place.plot(times, drift.trend / CHART.trend, color=PURPLE, linewidth=1.0, label="trend")
+        place.plot(times, drift.deviations / CHART.single, ".", color=GREY, markersize=4, label="one calibration")
+    place.set_ylabel("over its limit", fontsize=8)
+
+
+def _days(at: datetime) -> float:
+    """As matplotlib counts dates: days since 1970, UTC."""
+    return at.timestamp() / 86_400.0
+
+
+def _columns(points: list[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [when for when, _ in points], [value for _, value in points]

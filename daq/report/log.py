@@ -10,14 +10,12 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from daq.config.cell import Cell
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete
 from daq.log.conversion import scaling
-from daq.log.metadata import RunStatistics
-from daq.log.reader import LogHead, LogReader
+from daq.log.reader import LogReader
 from daq.report.bus import current_signals
-from daq.report.text import printable
+from daq.report.text import picked, printable
 from drivers.stream.sample import EventKind
 
 _ROUTINE = {EventKind.MOVE_START, EventKind.MOVE_END, EventKind.NMT, EventKind.STATE}
@@ -41,51 +39,7 @@ def describe_log(path: Path) -> dict[str, Any]:
     head, statistics = reader.head, reader.statistics
     cell = cell_from_bundle(head.files, names={"cell.yaml": f"{path}, cell.yaml"})
     run = head.run
-    _check_counts(path, cell, head, statistics, samples, widths)
-    return {
-        "log": str(path),
-        "sha256": reader.digest,
-        "run_id": run.run_id,
-        "cell": cell.name,
-        "cell_sha256": cell.digest,
-        "axes": list(cell.axis_names),
-        "current": current_signals(cell),
-        "role": run.role.value,
-        "payload": None
-        if run.payload is None
-        else {"name": run.payload.name, "mounting": run.payload.mounting, "known": run.payload.known},
-        "rate_hz": run.rate_hz,
-        "speed": run.speed,
-        "samples": samples,
-        "duration_s": samples / run.rate_hz,
-        "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
-        "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
-        "lost_cycles": statistics.lost_cycles,
-        "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
-        "partial": reader.partial,
-        "valid": statistics.valid,
-        "reason": statistics.reason,
-        "events": [
-            {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
-            for e in reader.events
-            if e.kind not in _ROUTINE
-        ],
-        "operator": run.operator,
-        "software": run.software,
-        "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
-        "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
-        "wall_clock_step_s": None
-        if statistics.wall_minus_monotonic_ns is None
-        else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
-        "origin": run.origin,
-        "attachments": {name: len(data) for name, data in sorted(head.files.items())},
-    }
-
-
-def _check_counts(
-    path: Path, cell: Cell, head: LogHead, statistics: RunStatistics, samples: int, widths: set[int]
-) -> None:
-    """Make the checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory."""
+    # The checks of `daq.log.reader.read_log` and `daq.log.conversion.scaling` in bounded memory.
     scaling(cell, head.readback)
     axes = len(cell.axes)
     pairs = (
@@ -101,6 +55,39 @@ def _check_counts(
                 expected=expected,
                 remedy="another tool may have cut or changed the log; take the original",
             )
+    return {
+        "log": str(path),
+        "sha256": reader.digest,
+        "run_id": run.run_id,
+        "cell": cell.name,
+        "cell_sha256": cell.digest,
+        "axes": list(cell.axis_names),
+        "current": current_signals(cell),
+        "role": run.role.value,
+        "payload": None if run.payload is None else picked(run.payload, "name", "mounting", "known"),
+        **picked(run, "rate_hz", "speed"),
+        "samples": samples,
+        "duration_s": samples / run.rate_hz,
+        "stamped_duration_s": 0.0 if first_ns is None else (last_ns - first_ns) * 1e-9,
+        "moves": sum(event.kind is EventKind.MOVE_START for event in reader.events),
+        "lost_cycles": statistics.lost_cycles,
+        "missing": dict(zip(cell.axis_names, statistics.missing, strict=True)),
+        "partial": reader.partial,
+        **picked(statistics, "valid", "reason"),
+        "events": [
+            {"time_ns": e.time_ns, "axis": e.axis, "kind": e.kind.value, "code": e.code, "text": e.text}
+            for e in reader.events
+            if e.kind not in _ROUTINE
+        ],
+        **picked(run, "operator", "software"),
+        "started": datetime.fromtimestamp(run.started_wall_ns / 1e9, UTC).isoformat() if run.started_wall_ns else None,
+        "wall_minus_monotonic_s": run.wall_minus_monotonic_ns * 1e-9,
+        "wall_clock_step_s": None
+        if statistics.wall_minus_monotonic_ns is None
+        else (statistics.wall_minus_monotonic_ns - run.wall_minus_monotonic_ns) * 1e-9,
+        "origin": run.origin,
+        "attachments": {name: len(data) for name, data in sorted(head.files.items())},
+    }
 
 
 def log_table(description: Mapping[str, Any]) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from rich.console import RenderableType
@@ -27,13 +27,9 @@ class PaperTable:
 
     def markdown(self) -> str:
         """Section of a Markdown page."""
-        lines = [
-            f"## {self.title}",
-            "",
-            _row(self.headings),
-            _row(["---", *["---:"] * (len(self.headings) - 1)]),
-            *(_row(row) for row in self.rows),
-        ]
+        rule = ("---", *("---:" for _ in self.headings[1:]))
+        rows = (" | ".join(cell.replace("|", r"\|") for cell in cells) for cells in (self.headings, rule, *self.rows))
+        lines = [f"## {self.title}", "", *(f"| {row} |" for row in rows)]
         for note in self.notes:
             lines += ["", note]
         return "\n".join(lines) + "\n"
@@ -47,24 +43,31 @@ class PaperTable:
         yield from map(printable, self.notes)
 
 
-def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Build Table 1 or 3: essential parameters with the payload's drawing and with its mass alone.
+def case_tables(calibrations: Mapping[str, Calibration]) -> tuple[PaperTable, ...]:
+    """Build Tables 1 to 4 from the calibrations by name of their case."""
+    tables: list[PaperTable] = []
+    for number, method in ((1, "IDIM-WLS"), (3, "IDIM-TLS")):
+        pair = calibrations[f"case-{number}"], calibrations[f"case-{number + 1}"]
+        tables += [parameter_table(number, *pair, method), gain_table(number + 1, *pair, method)]
+    return tuple(tables)
 
-    Args:
-        number: of the table in the paper.
-        first, second: with the drawing, and with the mass alone.
-        method: as the paper calls it.
-    """
+
+def parameter_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
+    """Build Table 1 or 3: essential parameters with the payload's drawing (first) and with its mass alone (second)."""
     values = [{parameter.name: parameter for parameter in c.parameters} for c in (first, second)]
     names = _in_order([p.name for p in first.parameters], [p.name for p in second.parameters])
     rows, differences = [], []
     for name in names:
         one, other = values[0].get(name), values[1].get(name)
-        difference = _difference_percent(one, other)
+        difference = None
+        if one is not None and other is not None and one.value:
+            difference = 100.0 * abs((one.value - other.value) / one.value)
         # The mean is over the parameters that both identified; one given by the drawing is no comparison.
         if difference is not None and one is not None and one.std > 0.0:
             differences.append(difference)
-        rows.append((_short(name), *_parameter(one), *_parameter(other), percent(difference)))
+        leading, *regrouped = name.split()
+        short = f"{leading} R" if regrouped else leading
+        rows.append((short, *_parameter(one), *_parameter(other), percent(difference)))
     errors = "‖ρ‖/‖Y‖", *(cell for c in (first, second) for cell in (f"{c.relative_error_percent.total:.2f} %", "")), ""
     return PaperTable(
         title=f"Table {number}: essential parameters, {method}",
@@ -79,13 +82,7 @@ def parameter_table(number: int, first: Calibration, second: Calibration, method
 
 
 def gain_table(number: int, first: Calibration, second: Calibration, method: str) -> PaperTable:
-    """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone.
-
-    Args:
-        number: of the table in the paper.
-        first, second: with the drawing, and with the mass alone.
-        method: as the paper calls it.
-    """
+    """Build Table 2 or 4: a priori and identified gains, with the payload's drawing and with its mass alone."""
     rows = tuple(
         (
             one.axis,
@@ -123,12 +120,9 @@ def error_table(found: CrossValidation) -> PaperTable:
     rows = []
     for run in found.runs:
         errors = [run.errors.get(label) for label in labels]
-        if not run.errors:
-            continue
-        for index, axis in enumerate(axes):
-            rows.append(
-                (f"{run.run}, {axis}", *(NONE if error is None else percent(error.axes[index]) for error in errors))
-            )
+        for index, axis in enumerate(axes if run.errors else ()):
+            cells = (NONE if error is None else percent(error.axes[index]) for error in errors)
+            rows.append((f"{run.run}, {axis}", *cells))
     means = [
         _mean([value for run in found.runs if (error := run.errors.get(label)) is not None for value in error.axes])
         for label in labels
@@ -164,26 +158,19 @@ def _mass_table(found: CrossValidation, name: str, mounting: str, number: int) -
     errors: dict[str, list[float]] = {label: [] for label in labels}
     notes = []
     for run in runs:
-        masses = {label: run.masses[label] for label in labels}
-        rows.append(
-            (f"{run.run}, kg", *(NONE if isinstance(m, Failure) else f"{m.mass_kg:.3f}" for m in masses.values()))
-        )
-        rows.append(("%σ", *(NONE if isinstance(m, Failure) else percent(m.std_percent) for m in masses.values())))
-        rows.append(
-            (
-                "%σ with the gains'",
-                *(NONE if isinstance(m, Failure) else percent(m.std_with_gains_percent) for m in masses.values()),
-            )
-        )
-        if run.weighed_kg is not None:
-            rows.append(
-                ("%e", *(NONE if isinstance(m, Failure) else percent(m.error_percent) for m in masses.values()))
-            )
-        for label, mass in masses.items():
+        columns: list[tuple[str, ...]] = []
+        for label in labels:
+            mass = run.masses[label]
             if isinstance(mass, Failure):
+                columns.append((NONE,) * 4)
                 notes.append(f"{run.run}, {label}: {mass.reason}")
-            elif mass.error_percent is not None:
+                continue
+            percents = (mass.std_percent, mass.std_with_gains_percent, mass.error_percent)
+            columns.append((f"{mass.mass_kg:.3f}", *map(percent, percents)))
+            if mass.error_percent is not None:
                 errors[label].append(mass.error_percent)
+        figures = zip((f"{run.run}, kg", "%σ", "%σ with the gains'", "%e"), *columns, strict=True)
+        rows += [row for row in figures if row[0] != "%e" or run.weighed_kg is not None]
     weighed = runs[0].weighed_kg
     if weighed is not None:
         rows.append(("mean %e", *(percent(_mean(errors[label])) for label in labels)))
@@ -218,26 +205,11 @@ def percent(value: float | None) -> str:
     return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.0f}"
 
 
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", r"\|") for cell in cells) + " |"
-
-
-def _short(name: str) -> str:
-    leading, *regrouped = name.split()
-    return f"{leading} R" if regrouped else leading
-
-
 def _parameter(parameter: Parameter | None) -> tuple[str, str]:
     if parameter is None:
         return NONE, NONE
     deviation = percent(100.0 * parameter.std / abs(parameter.value)) if parameter.std and parameter.value else NONE
     return f"{parameter.value:.3g}", deviation
-
-
-def _difference_percent(one: Parameter | None, other: Parameter | None) -> float | None:
-    if one is None or other is None or one.value == 0.0:
-        return None
-    return 100.0 * abs((one.value - other.value) / one.value)
 
 
 def _in_order(first: list[str], second: list[str]) -> list[str]:

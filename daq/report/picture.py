@@ -1,15 +1,12 @@
-"""Shared by all pictures: size, colours and writing the file. No pyplot, which keeps figures in a global list."""
+"""Shared by all pictures: size, colours and rendering. No pyplot, which keeps figures in a global list."""
 
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-from daq.files import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,13 +32,7 @@ _TITLE_AND_LEGEND_IN = 1.1
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
-    """Make a figure of small multiples that share their horizontal axis, filled row by row.
-
-    Args:
-        count: number of panels.
-        columns: panels side by side, at most.
-        title: names what the picture shows.
-    """
+    """Make a figure of `count` small multiples that share their horizontal axis, filled row by row."""
     columns = min(columns, count)
     rows = -(-count // columns)
     figure = _figure(title, max(_PANEL_IN[0] * columns, 7.5), _PANEL_IN[1] * rows + _TITLE_AND_LEGEND_IN)
@@ -58,11 +49,7 @@ def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
 def grid(rows: int, widths: tuple[float, ...], title: str, height_in: float) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure whose rows share their vertical axis and whose columns share their horizontal one.
 
-    Args:
-        rows: number of rows.
-        widths: relative width of each column.
-        title: names what the picture shows.
-        height_in: of one row [inch].
+    `widths` are relative, one a column; `height_in` is that of one row [inch].
     """
     figure = _figure(title, 2 * _PANEL_IN[0], height_in * rows + _TITLE_AND_LEGEND_IN)
     places = figure.subplots(
@@ -99,58 +86,19 @@ def legend_below(figure: Figure, *places: Axes) -> None:
     )
 
 
-def save_png(figure: Figure, path: Path | None) -> bytes:
-    """Draw a figure and write it whole; the same figure gives the same bytes.
+def render(figure: Figure, kind: str = "png") -> bytes:
+    """Return the content of a file, png or svg; the same figure gives the same bytes: no time, no random names."""
+    from matplotlib import rc_context  # noqa: PLC0415
 
-    Args:
-        figure: to draw.
-        path: None for the bytes alone, as for a page that embeds its pictures.
-
-    Returns:
-        the file's content.
-
-    Raises:
-        OSError: from the file system.
-    """
     drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=DPI, metadata={"Software": None})
-    if path is not None:
-        replace_file(path, drawn.getvalue())
+    with rc_context({"svg.hashsalt": "drivegain"}):
+        figure.savefig(drawn, format=kind, dpi=DPI, metadata={"Date" if kind == "svg" else "Software": None})
     return drawn.getvalue()
 
 
 def unformatted(text: str) -> str:
     """Escape dollar signs, which would begin a formula in matplotlib."""
     return text.replace("$", r"\$")
-
-
-def thinned(time_s: FloatArray, columns: FloatArray, points: int = 6000) -> tuple[FloatArray, FloatArray]:
-    """Reduce the points to draw and keep every peak: minimum and maximum of each stretch, in order of time.
-
-    Args:
-        time_s: shape (k,).
-        columns: shape (k,); NaN where there is nothing to show.
-        points: of the result, at most.
-
-    Returns:
-        times and values, both of the same length.
-    """
-    stretch = -(-2 * len(time_s) // points)
-    if stretch <= 2:
-        return time_s, columns
-    whole = len(time_s) // stretch * stretch
-    blocks = columns[:whole].reshape(-1, stretch)
-    empty = np.isnan(blocks)
-    lowest = np.where(empty, np.inf, blocks).argmin(axis=1)
-    highest = np.where(empty, -np.inf, blocks).argmax(axis=1)
-    # The later point of a stretch with a gap becomes NaN, which breaks the line there.
-    picked = np.sort(np.stack([lowest, highest], axis=1), axis=1) + stretch * np.arange(len(blocks))[:, None]
-    values = columns[picked]
-    values[empty.any(axis=1), 1] = np.nan
-    return (
-        np.concatenate([time_s[picked.ravel()], time_s[whole:]]),
-        np.concatenate([values.ravel(), columns[whole:]]),
-    )
 
 
 def _plain(place: Axes) -> None:

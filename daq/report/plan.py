@@ -14,14 +14,7 @@ from ident.planning.excitation import GainVerdict
 def plan_document(
     out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]
 ) -> dict[str, object]:
-    """Build the JSON document of a plan.
-
-    Args:
-        out: its file.
-        cell, experiment: it was made for.
-        made: the plan.
-        judged: verdict on the gain of each axis.
-    """
+    """Build the JSON document of a plan, with the verdict on the gain of each axis."""
     return {
         "plan": str(out),
         "cell": made.cell,
@@ -49,7 +42,7 @@ def plan_document(
 
 
 def plan_text(out: Path, cell: Cell, experiment: Experiment, made: Plan, judged: tuple[GainVerdict, ...]) -> str:
-    """Describe a plan in lines for the operator; arguments as of `plan_document`."""
+    """Describe a plan in lines for the operator."""
     width = max(len(name) for name in (*cell.axis_names, "axis"))
     lines = [
         f"{out}: {len(made.moves)} moves in {made.duration_s:.0f} s, condition {made.condition:.0f}",

@@ -1,16 +1,16 @@
-"""Draw the pictures of a fit and of a residual: torques, effects, and the ranking of candidates."""
+"""The pictures of a fit and of a residual, each a PNG: torques, effects, and the ranking of candidates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from daq.config.cell import MILLIMETRE, Cell, JointUnit
-from daq.report.effect_names import effect_text, other_axis, variable_text
+from daq.files import replace_file
+from daq.report.effect_names import effect_text, other_axis, placed_name, variable_text
 from daq.report.fit import start_of
 from daq.report.gains import plot_gains
 from daq.report.picture import (
@@ -26,13 +26,13 @@ from daq.report.picture import (
     grid,
     legend_below,
     panels,
-    save_png,
-    thinned,
+    render,
     unformatted,
 )
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.loop import Evidence
+from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 from ident.effects.signals import Abscissa, fitted_signals, session_began_s
 from ident.equations.rows import decimate_rows
@@ -44,27 +44,37 @@ if TYPE_CHECKING:
 def draw_fit(fitted: Fit, calibration: Calibration, truth: dict[str, float] | None, out: Path) -> None:
     """Draw the torques of a held-out run (paper Fig. 2), the residual before and after each effect, and the gains.
 
-    Args:
-        fitted, calibration: the fit and its result.
-        truth: true gain by axis, for a simulated cell only.
-        out: folder of the pictures.
+    `truth` is the true gain by axis, for a simulated cell only.
 
     Raises:
         OSError: from the file system.
     """
     before = start_of(fitted)
     final = fitted.steps[-1].after if fitted.steps else before
-    draw_torques(out / "torques.png", final, fitted.cell)
-    plot_gains(out / "gains.png", calibration.gains, truth, title="Joint drive gains")
+    replace_file(out / "torques.png", draw_torques(final, fitted.cell))
+    replace_file(out / "gains.png", plot_gains(calibration.gains, truth, title="Joint drive gains"))
     for step in fitted.steps:
         for placed in (placed for placed in step.after.effects if placed not in before.effects):
-            name = fitted.cell.axis_names[placed.axis]
-            draw_effect(out / f"residual-{name}-{placed.effect.name}.png", before, step.after, placed, fitted.cell)
+            name = f"residual-{fitted.cell.axis_names[placed.axis]}-{placed.effect.name}.png"
+            replace_file(out / name, draw_effect(before, step.after, placed, fitted.cell))
         before = step.after
 
 
+def draw_torques(final: Evidence, cell: Cell) -> bytes:
+    """Draw measured and predicted torque of the first held-out run, or of the fit."""
+    rows = final.training if final.holdout is None else final.holdout
+    rows = rows.only(rows.run == rows.run[0])
+    return plot_torques(
+        rows.time_s,
+        np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T,
+        np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T,
+        cell.axis_names,
+        title=f"Joint torques of {'the first run of the fit' if final.holdout is None else 'a held-out run'}",
+        forces=tuple(axis.unit.force for axis in cell.axes),
+    )
+
+
 def plot_torques(
-    path: Path | None,
     time_s: FloatArray,
     measured_nm: FloatArray,
     predicted_nm: FloatArray,
@@ -79,7 +89,6 @@ def plot_torques(
     The relative error over each panel is that of the whole run, not only of the stretch that is drawn.
 
     Args:
-        path: of the PNG; None for its bytes alone.
         time_s: shape (k,) [s].
         measured_nm: torque from current and identified gain, shape (k, n) [forces]; NaN where a row was left out.
         predicted_nm: torque from the model, same shape [forces].
@@ -87,12 +96,6 @@ def plot_torques(
         title: names the run.
         forces: "Nm" or, along a prismatic joint, "N", for each axis; all are "Nm" when left out.
         shown_s: length of the stretch that is drawn, from the beginning [s]; in a longer one the lines merge.
-
-    Returns:
-        the PNG.
-
-    Raises:
-        OSError: from the file system.
     """
     shown = time_s <= time_s[0] + shown_s
     whole_s = float(time_s[-1] - time_s[0])
@@ -102,47 +105,23 @@ def plot_torques(
     )
     units = forces or ("Nm",) * len(axes)
     for index, (name, unit, place) in enumerate(zip(axes, units, places, strict=True)):
-        measured, predicted = measured_nm[shown, index], predicted_nm[shown, index]
-        place.plot(*thinned(time_s[shown], measured), color=SKY, linewidth=2.4, label="current × identified gain")
-        place.plot(*thinned(time_s[shown], predicted), color=BLACK, linewidth=1.5, linestyle=":", label="model")
-        both = np.isfinite(measured_nm[:, index]) & np.isfinite(predicted_nm[:, index])
-        error = _relative_error_percent(measured_nm[both, index], predicted_nm[both, index])
+        measured, predicted = measured_nm[:, index], predicted_nm[:, index]
+        place.plot(time_s[shown], measured[shown], color=SKY, linewidth=2.4, label="current × identified gain")
+        place.plot(time_s[shown], predicted[shown], color=BLACK, linewidth=1.5, linestyle=":", label="model")
+        both = np.isfinite(measured) & np.isfinite(predicted)
+        norm = float(np.linalg.norm(measured[both]))
+        # ‖ρ‖/‖Y‖ (paper, Table 6); unknown without samples.
+        error = 100.0 * float(np.linalg.norm((measured - predicted)[both])) / norm if norm else float("nan")
         place.set_title(f"{unformatted(name)}   relative error {error:.1f} %", fontsize=9, loc="left")
         place.set_ylabel(f"{QUANTITY[unit]} [{unit}]", fontsize=8)
         if index >= len(axes) - 2:
             place.set_xlabel("time [s]", fontsize=8)
     legend_below(figure, places[0])
-    return save_png(figure, path)
+    return render(figure)
 
 
-def _relative_error_percent(measured: FloatArray, predicted: FloatArray) -> float:
-    """‖ρ‖/‖Y‖ (paper, Table 6) [%]; NaN without samples."""
-    norm = float(np.linalg.norm(measured))
-    return 100.0 * float(np.linalg.norm(measured - predicted)) / norm if norm else float("nan")
-
-
-def draw_torques(path: Path | None, final: Evidence, cell: Cell) -> bytes:
-    """Draw measured and predicted torque of the first held-out run, or of the fit.
-
-    Raises:
-        OSError: from the file system.
-    """
-    rows = final.training if final.holdout is None else final.holdout
-    rows = rows.only(rows.run == rows.run[0])
-    measured = np.where(rows.use, rows.torque(final.estimate.gains), np.nan).T
-    predicted = np.where(rows.use, final.estimate.predicted_torque(rows), np.nan).T
-    which = "a held-out run" if final.holdout is not None else "the first run of the fit"
-    forces = tuple(axis.unit.force for axis in cell.axes)
-    title = f"Joint torques of {which}"
-    return plot_torques(path, rows.time_s, measured, predicted, cell.axis_names, title=title, forces=forces)
-
-
-def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> bytes:
-    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit.
-
-    Raises:
-        OSError: from the file system.
-    """
+def draw_effect(before: Evidence, after: Evidence, placed: PlacedEffect, cell: Cell) -> bytes:
+    """Draw the residual of an axis before and after an effect was added, on the first held-out run, or of the fit."""
     index = len(after.trained) if after.held_out else 0
     rows_before = before.holdout if before.holdout is not None else before.training
     rows_after = after.holdout if after.holdout is not None else after.training
@@ -158,16 +137,15 @@ def draw_effect(path: Path | None, before: Evidence, after: Evidence, placed: Pl
         np.where(use, model.estimate.residual_torque(rows)[placed.axis, chosen], np.nan)
         for model, rows in ((before, rows_before), (after, rows_after))
     )
-    name, unit = cell.axes[placed.axis].name, cell.axes[placed.axis].unit
+    axis = cell.axes[placed.axis]
     return plot_residual(
-        path,
         rows_after.time_s[chosen],
         *residuals,
         variable=variable,
-        variable_label=_label(placed, cell.axis_names, unit),
+        variable_label=_label(placed, cell.axis_names, axis.unit),
         velocity_rad_s=velocity,
-        title=f"{name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
-        force=unit.force,
+        title=f"{axis.name}: {effect_text(placed.effect, cell.axis_names)}, run {data.name}",
+        force=axis.unit.force,
     )
 
 
@@ -186,7 +164,6 @@ _BINS = 40
 
 
 def plot_residual(
-    path: Path | None,
     time_s: FloatArray,
     before_nm: FloatArray,
     after_nm: FloatArray,
@@ -204,7 +181,6 @@ def plot_residual(
     still lacks.
 
     Args:
-        path: of the PNG; None for its bytes alone.
         time_s: shape (k,) [s].
         before_nm, after_nm: residual torque without and with the effect, shape (k,) [force]; NaN where a row was left
             out.
@@ -213,31 +189,22 @@ def plot_residual(
         velocity_rad_s: of the axis, shape (k,) [rad/s or m/s].
         title: names axis, effect and run.
         force: "Nm", or "N" along a prismatic joint.
-
-    Returns:
-        the PNG.
-
-    Raises:
-        OSError: from the file system.
     """
     title = f"{unformatted(title)}\ngaps: samples left out, most of them at standstill"
-    figure, ((before_time, before_scatter), (after_time, after_scatter)) = grid(2, (1.7, 1.0), title, height_in=2.5)
-    rows = (
-        ("without the effect", before_nm, ORANGE, before_time, before_scatter),
-        ("with the effect", after_nm, BLUE, after_time, after_scatter),
-    )
-    for name, residual_nm, colour, over_time, scatter in rows:
-        over_time.plot(*thinned(time_s, residual_nm), color=colour, linewidth=0.8)
+    figure, places = grid(2, (1.7, 1.0), title, height_in=2.5)
+    rows = (("without the effect", before_nm, ORANGE), ("with the effect", after_nm, BLUE))
+    for (over_time, scatter), (name, residual_nm, colour) in zip(places, rows, strict=True):
+        over_time.plot(time_s, residual_nm, color=colour, linewidth=0.8)
         shown = np.isfinite(residual_nm)
         rms_nm = float(np.sqrt(np.mean(residual_nm[shown] ** 2))) if shown.any() else float("nan")
         over_time.set_title(f"{name}: RMS {rms_nm:.3g} {force}", fontsize=9, loc="left")
         over_time.set_ylabel(f"residual {QUANTITY[force]} [{force}]", fontsize=8)
         _draw_scatter(scatter, variable, residual_nm, velocity_rad_s)
-    after_time.set_xlabel("time [s]", fontsize=8)
-    after_scatter.set_xlabel(variable_label, fontsize=8)
-    before_scatter.set_title("the same against the variable of the effect", fontsize=9, loc="left")
-    legend_below(figure, before_scatter)
-    return save_png(figure, path)
+    places[1][0].set_xlabel("time [s]", fontsize=8)
+    places[1][1].set_xlabel(variable_label, fontsize=8)
+    places[0][1].set_title("the same against the variable of the effect", fontsize=9, loc="left")
+    legend_below(figure, places[0][1])
+    return render(figure)
 
 
 def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, velocity_rad_s: FloatArray) -> None:
@@ -248,66 +215,46 @@ def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, ve
         x, y = variable[known & moving], residual_nm[known & moving]
         step = max(len(x) // _POINTS, 1)
         place.plot(x[::step], y[::step], ".", color=colour, markersize=2, alpha=0.35, label=f"sample, {name}")
-        centres, means = _binned_mean(x, y)
+        # Stretches of the variable with equally many samples, so that no mean is of a handful of them.
+        order = np.argsort(x, kind="stable") if len(x) >= _BINS else np.array([], dtype=np.intp)
+        bins = np.array_split(order, _BINS) if len(order) else []
+        centres, means = [x[part].mean() for part in bins], [y[part].mean() for part in bins]
         # A white rim keeps the mean visible in a cloud of its own colour.
         place.plot(centres, means, color="white", linewidth=3.6)
         place.plot(centres, means, color=colour, linewidth=1.8, linestyle=line, label=f"mean, {name}")
 
 
-def _binned_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean of y in stretches of x with equally many samples, so that no mean is of a handful of them."""
-    if len(x) < _BINS:
-        return x[:0], y[:0]
-    order = np.argsort(x, kind="stable")
-    parts_x, parts_y = np.array_split(x[order], _BINS), np.array_split(y[order], _BINS)
-    return np.array([part.mean() for part in parts_x]), np.array([part.mean() for part in parts_y])
-
-
 _BAR_IN = 0.32
-_PASSED, _RIVAL, _FAILED = "passes every gate", "indistinguishable from the best", "fails a gate"
-_LOOK = {_PASSED: (BLUE, ""), _RIVAL: (ORANGE, "//"), _FAILED: (GREY, "")}
-"""Colour and hatch; the hatch distinguishes them in grey print."""
+_LOOK = {
+    "passes every gate": (BLUE, ""),
+    "indistinguishable from the best": (ORANGE, "//"),
+    "fails a gate": (GREY, ""),
+}
+"""Colour and hatch of a bar by its label; the hatch distinguishes them in grey print."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bar:
-    """One candidate."""
+def plot_ranking(
+    findings: Sequence[Finding], rivals: Sequence[PlacedEffect], axes: tuple[str, ...], *, title: str
+) -> bytes:
+    """Draw candidates by the fall of the squared error on left-out moves, the best first.
 
-    name: str  #: effect and axis
-    fall: float  #: fall of the squared error on left-out moves, in noise variances
-    passed: bool  #: whether it passes every gate
-    rival: bool  #: not distinguishable from the added one (or, where none was added, from the best)
-
-
-def plot_ranking(path: Path | None, bars: Sequence[Bar], *, title: str) -> bytes:
-    """Draw candidates from the best down; rivals of the best are marked.
-
-    Args:
-        path: of the PNG; None for its bytes alone.
-        bars: the best first, at least one.
-        title: names the turn.
-
-    Returns:
-        the PNG.
-
-    Raises:
-        OSError: from the file system.
+    Rivals are those not distinguishable from the added one or, where none was added, from the best; they are hatched.
     """
-    figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=_BAR_IN * len(bars))
+    figure, ((place,),) = grid(1, (1.0,), unformatted(title), height_in=_BAR_IN * len(findings))
+    hatched = {(rival.effect.name, rival.axis) for rival in rivals}
+    passed, rival, failed = _LOOK
+    labels = [
+        rival if (finding.effect.name, finding.axis) in hatched else passed if finding.passed else failed
+        for finding in findings
+    ]
     for label, (colour, hatch) in _LOOK.items():
-        rows = [row for row, bar in enumerate(bars) if _kind(bar) == label]
+        rows = [row for row, one in enumerate(labels) if one == label]
+        falls = [findings[row].held_out_fall for row in rows]
         if rows:
-            place.barh(
-                rows, [bars[row].fall for row in rows], color=colour, hatch=hatch, edgecolor="white", label=label
-            )
-    place.set_yticks(range(len(bars)), [unformatted(bar.name) for bar in bars])
+            place.barh(rows, falls, color=colour, hatch=hatch, edgecolor="white", label=label)
+    names = [placed_name(PlacedEffect(finding.effect, finding.axis), axes) for finding in findings]
+    place.set_yticks(range(len(names)), [unformatted(name) for name in names])
     place.invert_yaxis()
     place.set_xlabel("fall of the squared error on moves left out [noise variances]", fontsize=8)
     legend_below(figure, place)
-    return save_png(figure, path)
-
-
-def _kind(bar: Bar) -> str:
-    if bar.rival:
-        return _RIVAL
-    return _PASSED if bar.passed else _FAILED
+    return render(figure)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from daq.ledger.judgement import NOTHING, Known, judge
 from daq.report.gains import with_deviation
-from daq.report.text import terminal_lines, terminal_text
+from daq.report.text import picked, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
 from daq.writeback.request import Edit, GainChange
@@ -41,13 +41,7 @@ def show(proposal: Proposal[E], console: Console, known: Known = NOTHING) -> Non
 
 
 def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place: str = "in the file") -> Table:
-    """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns.
-
-    Args:
-        changes: one for each axis.
-        known: from the history.
-        place: heading of the gains that are in the controller now.
-    """
+    """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
     table.add_column("axis", no_wrap=True)
     for heading in (place, "identified ± σ", "σ %", "Δ %", "Δ in σ", "nameplate", "off %"):
@@ -76,7 +70,8 @@ def describe(proposal: Proposal[E], written: Written | None, known: Known = NOTH
     refusals = [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals]
     base = {"base_sha256": edit.base_sha256, "base": edit.base, "applied": written is not None}
     if isinstance(edit, DriveEdit):
-        changes = [_drive_change(change) for change in edit.changes]
+        names = ("old", "new", "std", "nameplate", "unit")
+        changes = [{"axis": one.axis, "object": one.key, **picked(one, *names)} for one in edit.changes]
         cell = None if proposal.target.cell is None else proposal.target.cell.name
         return {"cell": cell, **base, **_outcome(written), "changes": changes, "refusals": refusals}
     judged = _by_axis(edit.changes, known)
@@ -84,38 +79,19 @@ def describe(proposal: Proposal[E], written: Written | None, known: Known = NOTH
         "file": str(edit.place),
         **base,
         "backup": None if written is None else str(written.backup),
-        "changes": [_file_change(change, *judged.get(change.axis, (None, False))) for change in edit.changes],
+        "changes": [_file_change(change, judged.get(change.axis)) for change in edit.changes],
         "refusals": refusals,
         "diff": edit.diff if isinstance(edit, FileEdit) else "",
     }
 
 
-def _drive_change(change: GainChange) -> dict[str, Any]:
+def _file_change(change: GainChange, judged: tuple[float, bool] | None) -> dict[str, Any]:
+    sigmas, significant = (None, False) if judged is None else judged
     return {
-        "axis": change.axis,
-        "object": change.key,
-        "old": change.old,
-        "new": change.new,
-        "std": change.std,
-        "nameplate": change.nameplate,
-        "unit": change.unit,
-    }
-
-
-def _file_change(change: GainChange, sigmas: float | None, significant: bool) -> dict[str, Any]:
-    return {
-        "axis": change.axis,
-        "key": change.key,
-        "line": change.line,
-        "old": change.old,
-        "new": change.new,
-        "change_percent": change.change_percent,
+        **picked(change, "axis", "key", "line", "old", "new", "change_percent"),
         "change_sigmas": sigmas,
         "significant": significant,
-        "std_percent": change.std_percent,
-        "nameplate": change.nameplate,
-        "nameplate_percent": change.nameplate_percent,
-        "unit": change.unit,
+        **picked(change, "std_percent", "nameplate", "nameplate_percent", "unit"),
     }
 
 
@@ -192,11 +168,6 @@ def _show_diff(diff: str, console: Console) -> None:
 
 def _place(edit: Edit) -> str:
     return "in the drive" if isinstance(edit, DriveEdit) else "in the file"
-
-
-def significant(changes: Sequence[GainChange], known: Known = NOTHING) -> frozenset[str]:
-    """Axes whose gain differs from the controller's by more than noise."""
-    return frozenset(axis for axis, (_, beyond_noise) in _by_axis(changes, known).items() if beyond_noise)
 
 
 def _by_axis(changes: Sequence[GainChange], known: Known) -> dict[str, tuple[float, bool]]:

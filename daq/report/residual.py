@@ -1,22 +1,27 @@
-"""The closed loop in sentences and tables: the effects that were added, and what they changed."""
+"""The closed loop in sentences, tables and JSON: the effects that were added, and what they changed.
+
+docs/reference/residual-json.md describes the keys of the document.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from typing import Any
 
 from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from daq.report.effect_names import effect_text, is_unnamed, placed_name
-from daq.report.fit import error_table
+from daq.report.fit import coefficients, error_document, error_table
 from daq.report.gains import gain_table, partial_note, with_deviation
-from daq.report.text import plain_table
+from daq.report.text import picked, plain_table
+from daq.workflow.calibration_file import as_document
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
-from ident.discovery.before_after import Account, BeforeAfter, Errors, GainChange
-from ident.discovery.loop import MAX_EFFECTS
+from ident.discovery.before_after import Account, BeforeAfter, Errors
+from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
 from ident.effects.electrical import TimeSkew
@@ -30,13 +35,7 @@ WHEN = ("before", "after")
 
 
 def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> Iterator[RenderableType]:
-    """Turns of the loop, the effects with their coefficients, the summary, errors and gains.
-
-    Args:
-        fitted: with the turns of the loop.
-        account: of them.
-        calibration: with the accepted effects.
-    """
+    """Turns of the loop, the effects with their coefficients, the summary, errors and gains."""
     yield from turns_view(fitted)
     for effect in calibration.effects:
         sizes = ", ".join(f"{c.name} {with_deviation(c.value, c.std)} {c.unit}" for c in effect.coefficients)
@@ -56,29 +55,24 @@ def residual_view(fitted: Fit, account: Account, calibration: Calibration) -> It
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
     """Candidates of each turn of the loop, and the one that was added."""
     for number, step in enumerate(fitted.steps, start=1):
-        yield ranking_table(fitted, step.findings, f"Turn {number}: best candidates on left-out moves")
+        headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
+        table = plain_table(headings, title=f"Turn {number}: best candidates on left-out moves")
+        for finding in step.findings[:_SHOWN]:
+            table.add_row(
+                finding.effect.name,
+                fitted.cell.axes[finding.axis].name,
+                f"{finding.probability:.3f}",
+                f"{100 * finding.folds_better:.0f} %",
+                f"{100 * finding.explained:.1f} %",
+                f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
+                "pass" if finding.passed else "no",
+            )
+        yield table
         if step.accepted is None:
             yield "No candidate passes every gate; nothing is added.\n"
         else:
             placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
             yield f"Added: {placed_name(placed, fitted.cell.axis_names)}.\n"
-
-
-def ranking_table(fitted: Fit, findings: tuple[Finding, ...], title: str) -> Table:
-    """Table of the best findings and whether they passed every gate."""
-    headings = ("effect", "axis", "p", "folds", "explains", "left-out error", "gates")
-    table = plain_table(headings, title=title)
-    for finding in findings[:_SHOWN]:
-        table.add_row(
-            finding.effect.name,
-            fitted.cell.axes[finding.axis].name,
-            f"{finding.probability:.3f}",
-            f"{100 * finding.folds_better:.0f} %",
-            f"{100 * finding.explained:.1f} %",
-            f"{finding.error_before_percent:.2f} → {finding.error_after_percent:.2f} %",
-            "pass" if finding.passed else "no",
-        )
-    return table
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -87,12 +81,7 @@ def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
 
 
 def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
-    """Summarise in sentences: each accepted effect, the whole, the gains, and the limit of detection.
-
-    Args:
-        fitted: with the turns of the loop.
-        account: of them.
-    """
+    """Summarise in sentences: each accepted effect, the whole, the gains, and the limit of detection."""
     kept = fitted.steps[-1].after.effects
     found = tuple(
         _effect_sentence(fitted, account, turn, placed, step.accepted.share_of_excess)
@@ -101,21 +90,28 @@ def summary(fitted: Fit, account: Account) -> tuple[str, ...]:
         for placed in turn.added
         if placed in kept
     )
-    if not found:
-        error, where = strictest_error(account.total.after)
-        return (
-            f"No structure found: the error {where} is {error.total:.1f} %{_of_all(account)}.",
-            _silence(fitted),
-            *_skew_sentence(fitted),
+    (before, _), (after, where) = _strictest_error(account.total.before), _strictest_error(account.total.after)
+    floor = _floor(account).total
+    noise = f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
+    ending = [_silence(fitted)]
+    if (skew := time_skew(fitted)) is not None:
+        beside = " beside the effects found" if kept else ""
+        ending.append(
+            f"Currents were sampled {1e3 * abs(skew[0]):.2f} ± {1e3 * skew[1]:.2f} ms "
+            f"{'after' if skew[0] > 0 else 'before'} the positions on all axes alike{beside}."
         )
-    (before, _), (after, where) = strictest_error(account.total.before), strictest_error(account.total.after)
-    return (
-        *found,
-        f"All axes together: the error {where} {error_change_text(before.total, after.total)}{_of_all(account)}.",
-        *(() if fitted.estimate.gains_fixed else (_gains_sentence(fitted.cell.axis_names, account.total.gains),)),
-        _silence(fitted),
-        *_skew_sentence(fitted),
-    )
+    if not found:
+        return (f"No structure found: the error {where} is {after.total:.1f} %{noise}.", *ending)
+    whole = f"All axes together: the error {where} {error_change_text(before.total, after.total)}{noise}."
+    if fitted.estimate.gains_fixed:
+        return (*found, whole, *ending)
+    changed = [
+        f"{axis} by {change.change_percent:+.1f} %"
+        for axis, change in zip(fitted.cell.axis_names, account.total.gains, strict=True)
+        if change.significant
+    ]
+    gains = f"Drive gains that change by more than noise: {', '.join(changed)}."
+    return (*found, whole, gains if changed else "No drive gain changes by more than noise.", *ending)
 
 
 def time_skew(fitted: Fit) -> tuple[float, float] | None:
@@ -127,25 +123,16 @@ def time_skew(fitted: Fit) -> tuple[float, float] | None:
     return None if not skews else (float(skews[0].coefficients[0]), float(skews[0].deviations[0]))
 
 
-def _skew_sentence(fitted: Fit) -> tuple[str, ...]:
-    skew = time_skew(fitted)
-    if skew is None:
-        return ()
-    seconds, std = skew
-    beside = " beside the effects found" if fitted.steps[-1].after.effects else ""
-    return (
-        f"Currents were sampled {1e3 * abs(seconds):.2f} ± {1e3 * std:.2f} ms {'after' if seconds > 0 else 'before'} "
-        f"the positions on all axes alike{beside}.",
-    )
-
-
 def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     """Rows of the table of errors; errors that were not computed or are unknown are left out."""
     before, after = account.total.before, account.total.after
+    first, second = (
+        None if errors.left_out_runs is None else errors.left_out_runs.together for errors in (before, after)
+    )
     pairs = (
         ("fit", before.in_sample, after.in_sample),
         ("moves left out", before.cross_validated, after.cross_validated),
-        ("runs left out", _together(before), _together(after)),
+        ("runs left out", first, second),
         ("held out", before.holdout, after.holdout),
     )
     floors = (("noise floor", account.floor), ("noise floor, held out", account.holdout_floor))
@@ -155,7 +142,7 @@ def error_rows(account: Account) -> tuple[ErrorRow, ...]:
     )
 
 
-def strictest_error(errors: Errors) -> tuple[RelativeError, str]:
+def _strictest_error(errors: Errors) -> tuple[RelativeError, str]:
     """Return the most independent error, and the data it is measured on."""
     if errors.holdout is not None:
         return errors.holdout, "on held-out runs"
@@ -177,14 +164,14 @@ def _effect_sentence(
 ) -> str:
     axes = fitted.cell.axis_names
     name = axes[placed.axis]
-    (before, _), (after, where) = strictest_error(turn.before), strictest_error(turn.after)
+    (before, _), (after, where) = _strictest_error(turn.before), _strictest_error(turn.after)
     floor = _floor(account).axes[placed.axis]
     floor_text = f"noise floor {floor:.1f} %" if math.isfinite(floor) else "noise floor not known"
     excess = ""
     if is_unnamed(placed.effect) and share_of_excess is not None:
         excess = f" ({100.0 * share_of_excess:.0f} % of the residual beyond noise)"
     if placed.effect.side is Side.ALL_MOTORS:
-        before_all, after_all = (strictest_error(errors)[0].total for errors in (turn.before, turn.after))
+        before_all, after_all = (_strictest_error(errors)[0].total for errors in (turn.before, turn.after))
         change = error_change_text(before_all, after_all)
         return f"The recording has {effect_text(placed.effect, axes)}: the error {where} {change}."
     return (
@@ -194,24 +181,8 @@ def _effect_sentence(
 
 
 def _floor(account: Account) -> RelativeError:
-    """Noise floor of the rows that `strictest_error` is measured on."""
+    """Noise floor of the rows that `_strictest_error` is measured on."""
     return account.floor if account.holdout_floor is None else account.holdout_floor
-
-
-def _of_all(account: Account) -> str:
-    floor = _floor(account).total
-    return f" (noise floor {floor:.1f} %)" if math.isfinite(floor) else ""
-
-
-def _gains_sentence(axes: Sequence[str], changes: Sequence[GainChange]) -> str:
-    parts = [
-        f"{axis} by {change.change_percent:+.1f} %"
-        for axis, change in zip(axes, changes, strict=True)
-        if change.significant
-    ]
-    if not parts:
-        return "No drive gain changes by more than noise."
-    return f"Drive gains that change by more than noise: {', '.join(parts)}."
 
 
 def _silence(fitted: Fit) -> str:
@@ -232,5 +203,112 @@ def _silence(fitted: Fit) -> str:
     )
 
 
-def _together(errors: Errors) -> RelativeError | None:
-    return None if errors.left_out_runs is None else errors.left_out_runs.together
+_METRIC = (
+    "‖e‖/‖v‖ of each motor's current over the rows that count; in total √(Σ w²‖e‖²/Σ w²‖v‖²), w the gains of the "
+    "declared model"
+)
+
+
+def residual_document(fitted: Fit, account: Account, calibration: Calibration) -> dict[str, Any]:
+    """Build the object of `residual --json`, which is also the body of `residual.json`."""
+    axes, skew = fitted.cell.axis_names, time_skew(fitted)
+    return {
+        **as_document(calibration),
+        "summary": list(summary(fitted, account)),
+        "axes": list(axes),
+        "metric": _METRIC,
+        "noise_floor": {
+            "motors": [
+                None
+                if floor is None
+                else {
+                    "axis": axis,
+                    "noise": floor.noise_a,
+                    **picked(floor, "std_percent", "dwells"),
+                    "degrees_of_freedom": floor.freedom,
+                }
+                for axis, floor in zip(axes, account.floors, strict=True)
+            ],
+            "relative_error_percent": error_document(account.floor),
+            "holdout_error_percent": error_document(account.holdout_floor),
+        },
+        "time_skew": None if skew is None else {"seconds": skew[0], "std": skew[1]},
+        **_before_after(fitted, account.total),
+        "turns": [_turn(fitted, step, turn) for step, turn in zip(fitted.steps, account.turns, strict=True)],
+    }
+
+
+def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
+    axes = fitted.cell.axis_names
+    added, removed = ((), ()) if turn is None else (turn.added, turn.removed)
+    return {
+        "accepted": None if step.accepted is None else _finding(step.accepted, axes),
+        "added": [
+            {
+                **_placed(placed, axes),
+                "coefficients": [
+                    picked(one, "name", "value", "std", "unit") for one in coefficients(step.after, placed)
+                ],
+            }
+            for placed in added
+        ],
+        "removed": [placed_name(placed, axes) for placed in removed],
+        **(dict.fromkeys(("before", "after", "gain_changes")) if turn is None else _before_after(fitted, turn)),
+        "findings": [_finding(finding, axes) for finding in step.findings],
+        "structures": [_finding(finding, axes) for finding in step.structures],
+        "detection_limits": [
+            {"axis": axis.name, "rms": float(limit), "unit": axis.unit.force}
+            for axis, limit in zip(fitted.cell.axes, step.limits_nm, strict=True)
+        ],
+    }
+
+
+def _before_after(fitted: Fit, compared: BeforeAfter) -> dict[str, Any]:
+    figures = ("before", "before_std", "after", "after_std", "change_percent", "change_std_percent", "significant")
+    return {
+        "before": _errors(compared.before),
+        "after": _errors(compared.after),
+        "gain_changes": [
+            {"axis": axis.name, "unit": axis.gain_unit, **picked(change, *figures)}
+            for axis, change in zip(fitted.cell.axes, compared.gains, strict=True)
+        ],
+    }
+
+
+def _errors(errors: Errors) -> dict[str, Any]:
+    left_out = errors.left_out_runs
+    return {
+        "relative_error_percent": error_document(errors.in_sample),
+        "cross_validated_error_percent": error_document(errors.cross_validated),
+        "left_out_runs": None
+        if left_out is None
+        else {
+            "error_percent": error_document(left_out.together),
+            "runs": [
+                {"run": run.run, "error_percent": error_document(run.error), "reason": run.reason or None}
+                for run in left_out.runs
+            ],
+        },
+        "holdout_error_percent": error_document(errors.holdout),
+    }
+
+
+def _placed(placed: PlacedEffect | Finding, axes: tuple[str, ...]) -> dict[str, Any]:
+    settings = {name: float(value) for name, value in placed.effect.settings.items()}
+    return {"effect": placed.effect.name, "axis": axes[placed.axis], "settings": settings}
+
+
+def _finding(finding: Finding, axes: tuple[str, ...]) -> dict[str, Any]:
+    names = ("probability", "folds_better", "explained", "error_before_percent", "error_after_percent", "error_fall")
+    values = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
+    return {
+        **_placed(finding, axes),
+        "variable": finding.effect.abscissa.value,
+        "coefficients": [
+            {"name": column.name, "value": float(value), "std": float(std), "unit": column.unit}
+            for column, value, std in values
+        ],
+        **picked(finding, *names, "held_out_fall", "passed", "share_of_excess"),
+        # For findings that failed a gate it would be most of the file and of no use.
+        "ambiguity": [placed_name(rival, axes) for rival in finding.ambiguity] if finding.passed else None,
+    }

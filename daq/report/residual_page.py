@@ -13,18 +13,20 @@ from daq.files import replace_file
 from daq.report.effect_names import effect_text, placed_name, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.gains import partial_note, plot_gain_changes, with_deviation
-from daq.report.plots import Bar, draw_effect, draw_torques, plot_ranking
-from daq.report.residual import WHEN, ErrorRow, error_rows, summary
-from daq.report.residual_document import FORMAT, VERSION, residual_document
+from daq.report.plots import draw_effect, draw_torques, plot_ranking
+from daq.report.residual import WHEN, error_rows, residual_document, summary
 from daq.report.text import json_text, percent_text
 from daq.workflow.fit import Fit
 from ident.calibration import Calibration
 from ident.discovery.before_after import Account, BeforeAfter
 from ident.discovery.loop import Evidence, Step
-from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 
-GENERATOR = "drivegain"
+PAGE, DOCUMENT = "report.html", "residual.json"
+FORMAT, VERSION = "drivegain-residual", 1
+MARKS = {PAGE: '<meta name="generator" content="drivegain">', DOCUMENT: f'"format": "{FORMAT}"'}
+"""Text at the beginning of each file of a report, by which an earlier report is recognised."""
+_SHOWN = 10  #: Candidates of a turn that are drawn; residual.json has them all
 _UNSEEN = ("Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp")
 """Unicode categories: control, format, surrogates, private, unassigned, separators of lines and paragraphs."""
 _STYLE = """
@@ -44,32 +46,27 @@ img { max-width: 100%; }
 def page(title: str, body: Iterable[str]) -> str:
     """Build a document that needs no other file: no script, no address, pictures inside.
 
-    Args:
-        title: plain text.
-        body: pieces made by the functions below, which escape every text.
+    The pieces of the body come from the functions below, which escape every text.
     """
     # The security policy keeps a browser from opening an address, whatever text a file holds.
-    return "\n".join(
-        (
-            "<!DOCTYPE html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            f'<meta name="generator" content="{GENERATOR}">',
-            '<meta http-equiv="Content-Security-Policy" '
-            "content=\"default-src 'none'; img-src data:; style-src 'unsafe-inline'\">",
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{_spelled(title)}</title>",
-            f"<style>{_STYLE}</style>",
-            "</head>",
-            "<body>",
-            f"<h1>{_spelled(title)}</h1>",
-            *body,
-            "</body>",
-            "</html>",
-            "",
-        )
-    )
+    pieces = "\n".join(body)
+    return f"""\
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+{MARKS[PAGE]}
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{_spelled(title)}</title>
+<style>{_STYLE}</style>
+</head>
+<body>
+<h1>{_spelled(title)}</h1>
+{pieces}
+</body>
+</html>
+"""
 
 
 def section(title: str, *body: str) -> str:
@@ -83,34 +80,19 @@ def paragraph(text: str) -> str:
 
 
 def listed(texts: Iterable[str], kind: str = "") -> str:
-    """Build a list of plain texts.
-
-    Args:
-        texts: an entry each.
-        kind: CSS class of the list.
-    """
+    """Build a list of plain texts; its kind is a CSS class."""
     entries = "".join(f"<li>{_spelled(text)}</li>" for text in texts)
-    return f'<ul class="{_spelled(kind)}">{entries}</ul>' if kind else f"<ul>{entries}</ul>"
+    return f'<ul class="{kind}">{entries}</ul>' if kind else f"<ul>{entries}</ul>"
 
 
 def table(caption: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Build a table of plain texts; the first cell of each row is its heading."""
     head = "".join(f'<th scope="col">{_spelled(heading)}</th>' for heading in headings)
-    lines = [
-        f'<tr><th scope="row">{_spelled(row[0])}</th>'
-        + "".join(f"<td>{_spelled(cell)}</td>" for cell in row[1:])
-        + "</tr>"
-        for row in rows
-    ]
-    return "\n".join(
-        (
-            f"<table><caption>{_spelled(caption)}</caption>",
-            f"<thead><tr>{head}</tr></thead>",
-            "<tbody>",
-            *lines,
-            "</tbody></table>",
-        )
-    )
+    lines = [f"<table><caption>{_spelled(caption)}</caption>", f"<thead><tr>{head}</tr></thead>", "<tbody>"]
+    for first, *others in rows:
+        cells = "".join(f"<td>{_spelled(cell)}</td>" for cell in others)
+        lines.append(f'<tr><th scope="row">{_spelled(first)}</th>{cells}</tr>')
+    return "\n".join((*lines, "</tbody></table>"))
 
 
 def picture(png: bytes, caption: str) -> str:
@@ -130,14 +112,8 @@ def _spelled(text: str) -> str:
     return escape(shown)
 
 
-SHOWN = 10  #: Candidates of a turn that are drawn; residual.json has them all
-PAGE, DOCUMENT = "report.html", "residual.json"
-MARKS = {PAGE: f'<meta name="generator" content="{GENERATOR}">', DOCUMENT: f'"format": "{FORMAT}"'}
-"""Text at the beginning of each file of a report, by which an earlier report is recognised."""
-
-
 def save_report(fitted: Fit, account: Account, calibration: Calibration, folder: Path) -> None:
-    """Write report.html and residual.json, each whole or not at all; arguments as of `residual_page`.
+    """Write report.html and residual.json, each whole or not at all.
 
     Raises:
         OutputFailed: the file system refuses.
@@ -152,17 +128,16 @@ def save_report(fitted: Fit, account: Account, calibration: Calibration, folder:
 
 
 def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> str:
-    """Build the page.
-
-    Args:
-        fitted: with the turns of the loop.
-        account: of them.
-        calibration: with the accepted effects.
-    """
+    """Build the page of a closed loop, the account of its turns, and the calibration with the accepted effects."""
     axes = fitted.cell.axis_names
     note = partial_note(calibration)
-    start = start_of(fitted)
-    final = fitted.steps[-1].after
+    errors = [(name, *map(percent_text, (*error.axes, error.total))) for name, error in error_rows(account)]
+    sections, before = [], start_of(fitted)
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        if turn is not None:
+            sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
+        before = step.after
+    torques = picture(draw_torques(before, fitted.cell), "Measured and predicted joint torques")
     return page(
         f"Residual of cell {fitted.cell.name}",
         (
@@ -170,7 +145,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
             listed(summary(fitted, account), "summary"),
             section(
                 "Before and after",
-                _error_table(axes, error_rows(account)),
+                table("Relative error ‖e‖/‖v‖ [%]", ("", *axes, "total"), errors),
                 paragraph(
                     "Error: the share of each motor's current that the model leaves, ‖e‖/‖v‖, over the rows in motion; "
                     "in total with each current weighted by its gain. Compare errors only under the same filters (end "
@@ -178,77 +153,51 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
                     "noise is larger."
                 ),
             ),
-            *_effects(fitted, account, start),
-            section("Torques", picture(draw_torques(None, final, fitted.cell), "Measured and predicted joint torques")),
+            *sections,
+            section("Torques", torques),
             _gains(fitted, account),
             *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
-            section("What these data can and cannot show", listed(_limits(fitted))),
+            _limits(fitted),
             _origin(calibration),
         ),
     )
 
 
-def _error_table(axes: tuple[str, ...], rows: tuple[ErrorRow, ...]) -> str:
-    return table(
-        "Relative error ‖e‖/‖v‖ [%]",
-        ("", *axes, "total"),
-        [(name, *map(percent_text, (*error.axes, error.total))) for name, error in rows],
-    )
-
-
-def _effects(fitted: Fit, account: Account, start: Evidence) -> list[str]:
-    sections, before = [], start
-    for step, turn in zip(fitted.steps, account.turns, strict=True):
-        if turn is not None:
-            sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
-        before = step.after
-    return sections
-
-
 def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed: PlacedEffect) -> str:
     axes = fitted.cell.axis_names
+    axis, final = axes[placed.axis], fitted.steps[-1].after
+    kept = placed in final.effects
     settings = ", ".join(f"{name} {value:.4g}" for name, value in placed.effect.settings.items())
     rivals = () if step.accepted is None else step.accepted.ambiguity
-    final = fitted.steps[-1].after
-    kept = placed in final.effects
-    known = final if kept else step.after
-    replaced = "" if kept else " A later turn removed it again, because it no longer reduced the error."
     ambiguous = ", ".join(placed_name(rival, axes) for rival in rivals)
+    sentences = (
+        f"Effect {placed_name(placed, axes)}" + (f" ({settings})." if settings else "."),
+        f"These data cannot distinguish it from: {ambiguous}."
+        if ambiguous
+        else "Every other candidate is clearly worse.",
+        *(() if kept else ("A later turn removed it again, because it no longer reduced the error.",)),
+    )
     pairs = (
         ("fit", turn.before.in_sample, turn.after.in_sample),
         ("moves left out", turn.before.cross_validated, turn.after.cross_validated),
         ("held out", turn.before.holdout, turn.after.holdout),
     )
+    errors = [
+        (name, percent_text(first.axes[placed.axis]), percent_text(second.axes[placed.axis]))
+        for name, first, second in pairs
+        if first is not None and second is not None
+    ]
+    found = coefficients(final if kept else step.after, placed)
+    sizes = [(one.name, with_deviation(one.value, one.std), one.unit) for one in found]
     return section(
-        f"{axes[placed.axis]}: {effect_text(placed.effect, axes)}",
-        paragraph(
-            f"Effect {placed_name(placed, axes)}"
-            + (f" ({settings})." if settings else ".")
-            + (
-                f" These data cannot distinguish it from: {ambiguous}."
-                if ambiguous
-                else " Every other candidate is clearly worse."
-            )
-            + replaced
-        ),
-        table(
-            "Identified coefficients",
-            ("coefficient", "value ± σ", "unit"),
-            [(c.name, with_deviation(c.value, c.std), c.unit) for c in coefficients(known, placed)],
-        ),
-        table(
-            f"Relative error of {axes[placed.axis]} [%]",
-            ("", *WHEN),
-            [
-                (name, percent_text(first.axes[placed.axis]), percent_text(second.axes[placed.axis]))
-                for name, first, second in pairs
-                if first is not None and second is not None
-            ],
-        ),
+        f"{axis}: {effect_text(placed.effect, axes)}",
+        paragraph(" ".join(sentences)),
+        table("Identified coefficients", ("coefficient", "value ± σ", "unit"), sizes),
+        table(f"Relative error of {axis} [%]", ("", *WHEN), errors),
         picture(
-            draw_effect(None, before, step.after, placed, fitted.cell),
-            f"Residual of {axes[placed.axis]} over time and against {variable_text(placed.effect, axes)}, "
-            "without and with the effect. A mean away from zero is torque that the model still lacks.",
+            draw_effect(before, step.after, placed, fitted.cell),
+            f"Residual of {axis} over time and against {variable_text(placed.effect, axes)}, without and with the "
+            "effect. A mean away from zero is torque that the model still lacks.",
         ),
     )
 
@@ -272,7 +221,7 @@ def _gains(fitted: Fit, account: Account) -> str:
         "Drive gains",
         table("Before and after", ("axis", *WHEN, "change ± σ [%]", "more than noise", "unit"), rows),
         picture(
-            plot_gain_changes(None, changes, axes, title=f"Drive gains of {fitted.cell.name}"),
+            plot_gain_changes(changes, axes, title=f"Drive gains of {fitted.cell.name}"),
             "Gains with their intervals, before and after, in per cent of the gain before; * changed by more than "
             "noise. Both estimates share their noise, so overlapping intervals do not exclude a change.",
         ),
@@ -280,42 +229,26 @@ def _gains(fitted: Fit, account: Account) -> str:
 
 
 def _turn(fitted: Fit, number: int, step: Step) -> str:
-    axes = fitted.cell.axis_names
-    shown = (*step.findings[:SHOWN], *(finding for finding in step.structures[:SHOWN] if finding.passed))
-    best = step.accepted or next(iter(step.findings), None)
-    rivals = set() if best is None else {(rival.effect.name, rival.axis) for rival in best.ambiguity}
-    bars = [
-        Bar(
-            _finding_name(finding, axes),
-            finding.held_out_fall,
-            finding.passed,
-            rival=(finding.effect.name, finding.axis) in rivals,
-        )
-        for finding in sorted(shown, key=lambda finding: -finding.held_out_fall)
-    ]
-    outcome = (
-        "Nothing passed every gate and nothing was added."
-        if step.accepted is None
-        else f"Added: {_finding_name(step.accepted, axes)}."
-    )
-    ranking = (
-        picture(
-            plot_ranking(None, bars, title=f"Turn {number}: the best candidates"),
+    axes, added = fitted.cell.axis_names, step.accepted
+    shown = (*step.findings[:_SHOWN], *(finding for finding in step.structures[:_SHOWN] if finding.passed))
+    best = added or next(iter(step.findings), None)
+    outcome = "Nothing passed every gate and nothing was added."
+    if added is not None:
+        outcome = f"Added: {placed_name(PlacedEffect(added.effect, added.axis), axes)}."
+    ranking = paragraph("No candidate could be tried.")
+    if shown:
+        ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
+        rivals = () if best is None else best.ambiguity
+        ranking = picture(
+            plot_ranking(ranked, rivals, axes, title=f"Turn {number}: the best candidates"),
             "Candidates by how much they reduce the error of left-out moves.",
         )
-        if bars
-        else paragraph("No candidate could be tried.")
-    )
     return section(f"Turn {number}: what was tried", paragraph(outcome), ranking)
 
 
-def _finding_name(finding: Finding, axes: tuple[str, ...]) -> str:
-    return placed_name(PlacedEffect(finding.effect, finding.axis), axes)
-
-
-def _limits(fitted: Fit) -> tuple[str, ...]:
+def _limits(fitted: Fit) -> str:
     held = fitted.estimate.gains_fixed
-    return (
+    limits = (
         *identifiability_notes(fitted),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect that is the same at "
         "every speed, load and position is part of the parameters: neither leaves a residual.",
@@ -325,6 +258,7 @@ def _limits(fitted: Fit) -> tuple[str, ...]:
         "same dependence would get the same name. Indistinguishable effects are listed with each effect.",
         "The noise floor is that of standstill, a lower bound: an error above it need not be an effect.",
     )
+    return section("What these data can and cannot show", listed(limits))
 
 
 def _origin(calibration: Calibration) -> str:

@@ -31,14 +31,7 @@ def terminal_lines(text: str) -> str:
 def plain_table(
     headings: Iterable[str], *, title: str | None = None, left: Collection[int] = (0,), wrap: Collection[int] = ()
 ) -> Table:
-    """Table without a frame.
-
-    Args:
-        headings: of the columns.
-        title: above the table.
-        left: indices of the columns of words; the others hold numbers and are aligned to the right.
-        wrap: indices of the columns whose cells may be broken into lines.
-    """
+    """Table without a frame; columns of words are aligned to the left, and cells of `wrap` may be broken into lines."""
     heading = None if title is None else terminal_text(title)
     table = Table(title=heading, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
     for index, name in enumerate(headings):
@@ -54,6 +47,11 @@ def percent_text(percent: float) -> str:
 def json_text(document: Any) -> str:
     """JSON document; numbers that JSON lacks become null, bytes of file names that are not UTF-8 are spelled out."""
     return spelled_bytes(json.dumps(_json_safe(document), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def picked(thing: object, *names: str) -> dict[str, Any]:
+    """Copy attributes into a document under their own names."""
+    return {name: getattr(thing, name) for name in names}
 
 
 def spelled_bytes(text: str) -> str:

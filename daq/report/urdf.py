@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from daq.report.text import plain_table, printable, terminal_text
@@ -27,14 +26,15 @@ def urdf_view(
 ) -> Iterator[RenderableType]:
     """Bodies by link, the change of torque, and the identified parameters that a URDF cannot hold.
 
-    Args:
-        calibration: that was exported.
-        robot: the nearest physical robot.
-        updates: by joint.
-        updated: the new URDF.
-        same_configuration: whether the cell file is that of the fit; None without a cell file.
+    `same_configuration` says whether the cell file is that of the fit; None without a cell file.
     """
-    yield _link_table(updates, updated)
+    headings = ("joint", "link", "mass kg", "centre of mass m", "damping", "friction")
+    table = plain_table(headings, left=(0, 1))
+    for name, update in updates.items():
+        centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
+        figures = f"{update.body.mass_kg:.3g}", centre, f"{update.damping:.3g}", f"{update.friction:.3g}"
+        table.add_row(terminal_text(name), terminal_text(updated.links[name]), *figures)
+    yield table
     change, joints = robot.parameters.torque_change_percent, robot.parameters.model.robot.joints
     if robot.parameters.exact:
         yield "The torque of these bodies is exactly the identified one."
@@ -68,7 +68,7 @@ def urdf_document(
     out: Path,
     same_configuration: bool | None,
 ) -> dict[str, Any]:
-    """Build the object of `export urdf --json`; arguments as of `urdf_view`."""
+    """Build the object of `export urdf --json`."""
     parameters = robot.parameters
     change = parameters.torque_change_percent
     joints = parameters.model.robot.joints
@@ -112,20 +112,3 @@ def urdf_document(
         ],
         "effects_left_out": [f"{effect.name} on {effect.axis}" for effect in calibration.effects],
     }
-
-
-def _link_table(updates: dict[str, JointUpdate], updated: Updated) -> Table:
-    """Mass and centre of mass of each link, friction of its joint."""
-    headings = ("joint", "link", "mass kg", "centre of mass m", "damping", "friction")
-    table = plain_table(headings, left=(0, 1))
-    for name, update in updates.items():
-        centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
-        table.add_row(
-            terminal_text(name),
-            terminal_text(updated.links[name]),
-            f"{update.body.mass_kg:.3g}",
-            centre,
-            f"{update.damping:.3g}",
-            f"{update.friction:.3g}",
-        )
-    return table

@@ -9,49 +9,50 @@ from typing import Any
 
 import numpy as np
 from rich.console import RenderableType
-from rich.table import Table
 from rich.text import Text
 
+from daq.files import replace_file
 from daq.report import paper_tables
+from daq.report.fit import error_document
 from daq.report.plots import plot_torques
-from daq.report.text import percent_text, plain_table, printable, terminal_text
-from daq.workflow.cross_validation import CheckedRun, CrossValidation, Failure, WeighedRun
+from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
+from daq.workflow.cross_validation import CrossValidation, Failure, WeighedRun
 from daq.workflow.fit import DOUBTFUL_PERCENT
 from daq.workflow.validate import DataUse, Validation, conditioning_of, together
 from ident.calibration import Calibration
-from ident.estimators.estimate import RelativeError
 
 
 def validation_view(calibration: Calibration, found: CrossValidation) -> Iterator[RenderableType]:
     """Relative errors, doubts about the logs, and the paper's tables."""
     validations = found.validations
-    yield _error_table(calibration, validations)
+    headings = ("log", *(gain.axis for gain in calibration.gains), "total", "")
+    table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
+    errors = [(validation.run, validation.error, validation.data_use.value) for validation in validations]
+    errors += [("together", together(validations), "")] if len(validations) > 1 else []
+    for name, error, use in (*errors, ("fit", calibration.relative_error_percent, "")):
+        table.add_row(terminal_text(name), *map(percent_text, (*error.axes, error.total)), use)
+    yield table
     filter_ = conditioning_of(calibration)
     yield (
         f"Position filter {filter_.position_cutoff_hz:g} Hz, decimation {filter_.decimation_cutoff_hz:g} Hz, as in the "
         "fit. Compare relative errors only under the same filters."
     )
-    for validation in validations:
-        if not validation.same_configuration:
-            yield _bold(
-                f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
-            )
-    for validation in validations:
-        if validation.error.total > DOUBTFUL_PERCENT:
-            yield _bold(
-                f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the "
-                "torque. Was the payload mounted as the log says, and is it the same robot?"
-            )
-    for run in found.runs:
-        if run.left_out:
-            yield _bold(f"{run.run}: {run.left_out}")
-    for table in validation_tables(found, complete=False):
+    doubts = [
+        f"{validation.log} carries another cell configuration than the logs of the fit; check the difference."
+        for validation in validations
+        if not validation.same_configuration
+    ]
+    doubts += [
+        f"{validation.run} contradicts the calibration: it leaves {validation.error.total:.3g} % of the torque. "
+        "Was the payload mounted as the log says, and is it the same robot?"
+        for validation in validations
+        if validation.error.total > DOUBTFUL_PERCENT
+    ]
+    doubts += [f"{run.run}: {run.left_out}" for run in found.runs if run.left_out]
+    yield from (Text(printable(doubt), style="bold") for doubt in doubts)
+    for paper_table in validation_tables(found, complete=False):
         yield ""
-        yield from table.view()
-
-
-def _bold(text: str) -> Text:
-    return Text(printable(text), style="bold")
+        yield from paper_table.view()
 
 
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
@@ -73,7 +74,7 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
     axes = tuple(gain.axis for gain in calibration.gains)
     forces = tuple("N" if gain.unit.startswith("N/") else "Nm" for gain in calibration.gains)
     logs_of = Counter(validation.run for validation in validations)
-    drawn = {}
+    pictures = {}
     for validation in validations:
         # Logs in different folders may have the same name.
         stem = validation.run if logs_of[validation.run] == 1 else f"{validation.run}-{validation.digest[:8]}"
@@ -84,9 +85,10 @@ def draw_validations(calibration: Calibration, validations: tuple[Validation, ..
         )
         title = f"{validation.run}, {validation.data_use.value}: torque of {calibration.cell}"
         folder.mkdir(parents=True, exist_ok=True)
-        plot_torques(path, validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
-        drawn[validation.log] = path
-    return drawn
+        drawn = plot_torques(validation.time_s, measured_nm, predicted_nm, axes, title=title, forces=forces)
+        replace_file(path, drawn)
+        pictures[validation.log] = path
+    return pictures
 
 
 def validation_document(
@@ -97,7 +99,7 @@ def validation_document(
         "cell": calibration.cell,
         "axes": [gain.axis for gain in calibration.gains],
         "filter": calibration.filter,
-        "fit_relative_error_percent": _error(calibration.relative_error_percent),
+        "fit_relative_error_percent": error_document(calibration.relative_error_percent),
         "logs": [
             {
                 "log": str(validation.log),
@@ -105,14 +107,13 @@ def validation_document(
                 "seen_by_fit": validation.data_use is DataUse.FIT,
                 "partial": validation.partial,
                 "held_out": validation.data_use is DataUse.HOLDOUT,
-                "same_configuration": validation.same_configuration,
-                "rows": validation.rows,
-                "relative_error_percent": _error(validation.error),
+                **picked(validation, "same_configuration", "rows"),
+                "relative_error_percent": error_document(validation.error),
                 "picture": str(drawn[validation.log]) if validation.log in drawn else None,
             }
             for validation in validations
         ],
-        "together": {"relative_error_percent": _error(together(validations))} if validations else None,
+        "together": {"relative_error_percent": error_document(together(validations))} if validations else None,
     }
 
 
@@ -120,18 +121,17 @@ def cross_document(found: CrossValidation) -> dict[str, Any]:
     """Build the part of `validate --json` that Tables 5 to 8 show."""
     return {
         "calibrations": list(found.calibrations),
-        "runs": [_checked(run) for run in found.runs],
+        "runs": [
+            {
+                "log": str(run.log),
+                "condition": run.condition,
+                "relative_error_percent": {label: error_document(error) for label, error in run.errors.items()},
+                "left_out": run.left_out or None,
+                "seen_by": list(run.seen_by),
+            }
+            for run in found.runs
+        ],
         "payloads": [_weighed(run, found) for run in found.weighed],
-    }
-
-
-def _checked(run: CheckedRun) -> dict[str, Any]:
-    return {
-        "log": str(run.log),
-        "condition": run.condition,
-        "relative_error_percent": {label: _error(error) for label, error in run.errors.items()},
-        "left_out": run.left_out or None,
-        "seen_by": list(run.seen_by),
     }
 
 
@@ -145,34 +145,7 @@ def _weighed(run: WeighedRun, found: CrossValidation) -> dict[str, Any]:
         "masses": {
             label: {"reason": mass.reason}
             if isinstance(mass, Failure)
-            else {
-                "mass_kg": mass.mass_kg,
-                "std_percent": mass.std_percent,
-                "std_with_gains_percent": mass.std_with_gains_percent,
-                "error_percent": mass.error_percent,
-            }
+            else picked(mass, "mass_kg", "std_percent", "std_with_gains_percent", "error_percent")
             for label, mass in run.masses.items()
         },
     }
-
-
-def _error(error: RelativeError) -> dict[str, Any]:
-    return {"axes": error.axes, "total": error.total}
-
-
-def _error_table(calibration: Calibration, validations: tuple[Validation, ...]) -> Table:
-    """Relative error of each log, axis by axis."""
-    axes = [gain.axis for gain in calibration.gains]
-    headings = ("log", *axes, "total", "")
-    table = plain_table(headings, title="Relative error ‖ρ‖/‖Y‖ [%]", left=(0, len(headings) - 1), wrap=(0,))
-    for validation in validations:
-        name = terminal_text(validation.run)
-        table.add_row(name, *_error_cells(validation.error), validation.data_use.value)
-    if len(validations) > 1:
-        table.add_row("together", *_error_cells(together(validations)))
-    table.add_row("fit", *_error_cells(calibration.relative_error_percent))
-    return table
-
-
-def _error_cells(error: RelativeError) -> list[str]:
-    return [percent_text(value) for value in (*error.axes, error.total)]

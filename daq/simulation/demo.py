@@ -33,7 +33,6 @@ from drivers.canopen.bus import open_bus
 from drivers.canopen.scan import FoundNode
 from drivers.simulation.spec import CellSpec
 from ident.calibration import Calibration
-from ident.estimators.identify import Identification
 
 MARK = ".drivegain-demo"
 RETRIES = 2  #: Of a run that came out invalid
@@ -99,7 +98,9 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     logs = tuple(out / f"{name}.mcap" for name, _, _ in RUNS)
     _make_room(out, logs)
     reporter.step("scan the bus")
-    nodes = _scan(settings, cell)
+    with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
+        nodes = network.scan()
+        network.check_identities()
     reporter.step("plan exciting moves")
     plans = tuple(_plan(settings, cell, index, reporter) for index in range(len(PLANS)))
     recorded = tuple(_record_valid(settings, cell_file, cell, plans, index, reporter) for index in range(len(RUNS)))
@@ -110,7 +111,12 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     calibration = calibration_of(fitted, now())
     save(calibration, out / "calibration.yaml")
     reporter.step("write the calibration to a copy of the controller file")
-    proposal, written = _write_back(cell, calibration, out, now())
+    if cell.controller_path is None:
+        raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
+    target = out / "controller.yaml"
+    shutil.copyfile(cell.controller_path, target)
+    proposal = propose(FileTarget.of(cell, target), Request(calibration, now()))
+    written = None if proposal.refusals else apply(proposal, now(), audit=out / "audit.jsonl", who="demo")
     reporter.step("draw the pictures")
     spec = load_simulation(settings.simulation)
     truth = {axis.name: true.gain_nm_per_a for axis, true in zip(cell.axes, spec.axes, strict=True)}
@@ -121,8 +127,10 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
 def summary(outcome: Outcome) -> dict[str, Any]:
     """The outcome as `summary.json` holds it."""
     before, after = outcome.fitted.identification, outcome.fitted.final
-    effects = outcome.calibration.effects
-    first = effects[0] if effects else None
+    errors = before.holdout_error, after.holdout_error
+    totals = [None if error is None else error.total for error in errors]
+    axes = [None if error is None else list(error.axes) for error in errors]
+    first = next(iter(outcome.calibration.effects), None)
     paper = outcome.fitted.paper
     return {
         "gains": [
@@ -139,10 +147,10 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         ],
         "effect": None if first is None else {"name": first.name, "axis": first.axis},
         "effects": as_document(outcome.calibration)["effects"],
-        "error_before_percent": _total(before),
-        "error_after_percent": _total(after),
-        "error_before_percent_axes": _axes(before),
-        "error_after_percent_axes": _axes(after),
+        "error_before_percent": totals[0],
+        "error_after_percent": totals[1],
+        "error_before_percent_axes": axes[0],
+        "error_after_percent_axes": axes[1],
         "plans": [
             {
                 "moves": len(plan.moves),
@@ -196,13 +204,6 @@ def _simulated(cell: Cell, spec: CellSpec) -> Iterator[None]:
         bus.shutdown()
 
 
-def _scan(settings: Settings, cell: Cell) -> tuple[FoundNode, ...]:
-    with _simulated(cell, load_simulation(settings.simulation)), network_of(cell) as network:
-        nodes = network.scan()
-        network.check_identities()
-        return nodes
-
-
 def _plan(settings: Settings, cell: Cell, index: int, reporter: ProgressReporter) -> Plan:
     exchanges = 800
     made = plan(
@@ -253,25 +254,3 @@ def _record(
             run_id=f"demo-{settings.seed}-{name}",
             progress=lambda done, total: reporter.progress(done, total, "moves"),
         )
-
-
-def _write_back(
-    cell: Cell, calibration: Calibration, out: Path, now: datetime
-) -> tuple[Proposal[FileEdit], Written | None]:
-    source = cell.controller_path
-    if source is None:
-        raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")
-    target = out / "controller.yaml"
-    shutil.copyfile(source, target)
-    proposal = propose(FileTarget.of(cell, target), Request(calibration, now))
-    return proposal, None if proposal.refusals else apply(proposal, now, audit=out / "audit.jsonl", who="demo")
-
-
-def _total(identification: Identification) -> float | None:
-    error = identification.holdout_error
-    return None if error is None else error.total
-
-
-def _axes(identification: Identification) -> list[float] | None:
-    error = identification.holdout_error
-    return None if error is None else list(error.axes)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -16,13 +16,9 @@ from daq.config.yaml_file import Document, Fault, StrictModel, describe, parse_y
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing, UsageError
 from drivers.simulation.faults import FaultKind, FaultSpec
-from drivers.simulation.spec import AxisSpec, Body, CellSpec, Dialect, UndeclaredEffect
-
-# What goes wrong in a simulated cell, and when: `faults` of a simulation file, or a scenario file of faults alone.
-
+from drivers.simulation.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
 
 AxisName = Annotated[str, Field(pattern=r"^J[1-9][0-9]?$")] | Annotated[int, Field(ge=1)]  #: J3, or 3
-
 
 LONGEST_S = 1e6
 LAST_CYCLE = 10**12  #: No simulated cell runs for that long; beyond 2⁶³ periods nothing could count them
@@ -96,44 +92,6 @@ def axis_index(axis: str | int) -> int:
     return number - 1
 
 
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
-
-
-class AxisSpecModel(StrictModel):
-    """The fields of drivers.simulated.spec.AxisSpec; of a prismatic joint N for Nm, m for rad and kg for kg m²."""
-
-    node_id: Annotated[int, Field(ge=1, le=127)]
-    vendor_id: U32
-    product_code: U32
-    revision: U32
-    serial: U32
-    counts_per_revolution: Annotated[int, Field(gt=0)]
-    rated_current_a: Positive
-    peak_current_a: Positive
-    gain_nm_per_a: float
-    motor_inertia_kg_m2: NotNegative
-    viscous_nm_s_rad: NotNegative
-    coulomb_nm: NotNegative
-    motor_viscous_nm_s_rad: NotNegative
-    motor_coulomb_nm: NotNegative
-    offset_nm: float
-    current_noise_a: NotNegative
-    noise_correlation_s: NotNegative
-    dialect: Dialect = Dialect.CIA402
-    toggle_bit: Literal[8, 14, 15] | None = None
-    entered_gain_nm_per_a: float = 0.0
-
-
-class BodyModel(StrictModel):
-    """A payload's true inertia."""
-
-    mass_kg: Positive
-    centre_m: tuple[float, float, float]
-    inertia_kg_m2: tuple[float, float, float, float, float, float]
-
-
 class EffectModel(StrictModel):
     """An undeclared effect."""
 
@@ -153,8 +111,8 @@ class SimulationModel(StrictModel):
     seed: Annotated[int, Field(ge=0)]
     start_deg: tuple[float | None, ...] = ()
     start_mm: tuple[float | None, ...] = ()
-    axes: Annotated[tuple[AxisSpecModel, ...], Field(min_length=1, max_length=32)]
-    payloads: dict[str, BodyModel] = Field(default_factory=dict)
+    axes: Annotated[tuple[AxisSpec, ...], Field(min_length=1, max_length=32)]
+    payloads: dict[str, Body] = Field(default_factory=dict)
     effects: tuple[EffectModel, ...] = ()
     faults: tuple[FaultModel, ...] = ()
 
@@ -200,14 +158,14 @@ def load_simulation(path: Path, payload: str | None = None) -> CellSpec:
         urdf=read_bytes(path.parent / model.urdf).decode("utf-8", errors="replace"),
         gravity_m_s2=model.gravity_m_s2,
         ratio=np.array(model.ratio, dtype=np.float64),
-        axes=tuple(AxisSpec(**axis.model_dump()) for axis in model.axes),
+        axes=model.axes,
         start_rad=np.array(
             [
                 MILLIMETRE.si * (millimetres or 0.0) if degrees is None else DEGREE.si * degrees
                 for degrees, millimetres in _starts(model)
             ]
         ),
-        payload=None if payload is None else Body(**model.payloads[payload].model_dump()),
+        payload=None if payload is None else model.payloads[payload],
         effects=tuple(UndeclaredEffect(e.name, axis_index(e.axis), dict(e.parameters)) for e in model.effects),
         sync_period_us=model.sync_period_us,
         substeps=model.substeps,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.simulation.effects import Lag
-from drivers.simulation.friction import compiled
+from drivers.simulation.dynamics import compiled
+from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.plant import Plant, reduction
 from drivers.simulation.spec import CellSpec
 
@@ -241,32 +241,63 @@ def _watch(axis: np.void, error: float, arrived: bool, step_s: float) -> None:
         axis["reached"] = 0
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis."""
+
+    position: list[int]  #: 6064h [counts]
+    demand: list[int]  #: 6062h [counts]
+    velocity: list[int]  #: 606Ch [counts/s]
+    current_demand: list[int]  #: 6074h [per mille of rated current]
+    current: list[int]  #: 6077h and 6078h [per mille of rated current]
+    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+
+
+@compiled
+def _fill(
+    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
+) -> None:
+    """Fill one row for each field of Readings, in their order, shape (8, n)."""
+    for i in range(len(loops)):
+        axis = loops[i]
+        # int32 as the bus carries it: an endless axis wraps around.
+        readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
+        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
+        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
+        per_mille = 1000.0 / rated_current_a[i]
+        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
+        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
+        readings[5, i] = axis["reached"]
+        readings[6, i] = axis["limited"]
+        readings[7, i] = axis["following_error"]
+
+
 class AmplifierSet:
-    """Loops of the n amplifiers of one cell, and the currents that they report.
+    """Loops of the n amplifiers of one cell, at rest where the plant is, and the currents that they report."""
 
-    Attributes:
-        loops: LOOP records, shape (n,).
-        reported_a: current reference with its noise, as in 6074h [A], shape (n,); renewed once a SYNC.
-        actual_a: current of the motor at the same moment [A], shape (n,).
-    """
-
-    def __init__(self, spec: CellSpec, inertia_a_s2: FloatArray, lags: tuple[Lag, ...]) -> None:
+    def __init__(self, spec: CellSpec, plant: Plant) -> None:
         n = len(spec.axes)
         period_s = spec.sync_period_us * 1e-6
         self.step_s = period_s / spec.substeps
-        self.loops: NDArray[np.void] = np.zeros(n, dtype=LOOP)
-        self.loops["inertia_a_s2"] = inertia_a_s2
+        self.loops: NDArray[np.void] = np.zeros(n, dtype=LOOP)  #: shape (n,)
+        self.loops["inertia_a_s2"] = tuned_inertia_a_s2(spec, plant)
         self.loops["position_1_s"] = POSITION_BANDWIDTH_RAD_S
         self.loops["velocity_1_s"] = VELOCITY_BANDWIDTH_RAD_S
         self.loops["integral_1_s"] = INTEGRAL_BANDWIDTH_RAD_S
         self.loops["filter"] = -np.expm1(-self.step_s / VELOCITY_FILTER_S)
         self.loops["limit_a"] = [axis.peak_current_a for axis in spec.axes]
         self.loops["piece"] = SEGMENTS
-        self.reported_a = np.zeros(n)
-        self.actual_a = np.zeros(n)
+        self.reported_a = np.zeros(n)  #: current reference with its noise, as in 6074h [A]; renewed once a SYNC
+        self.actual_a = np.zeros(n)  #: current of the motor at the same moment [A]
         self._counts_per_rad = counts_per_rad(spec)
+        # Read the encoders at power-on, so that the position of a resting axis does not jump.
+        for state in ("counts", "demand", "target"):
+            self.loops[state] = np.rint(plant.motor_rad * self._counts_per_rad)
         self._piece_s, self._piece_acceleration = np.zeros((n, SEGMENTS)), np.zeros((n, SEGMENTS))
-        self._lags = lags
+        built = (build_effect(effect, n) for effect in spec.effects)
+        self._lags = tuple(effect for effect in built if isinstance(effect, Lag))
         self._lagged_a = np.zeros(n)
         # A random stream for each axis: its noise does not depend on the other axes.
         self._random = [np.random.default_rng(np.random.SeedSequence(spec.seed, spawn_key=(i,))) for i in range(n)]
@@ -278,12 +309,8 @@ class AmplifierSet:
         self._noise_a = sigma * [stream.standard_normal() for stream in self._random]
         self._block = np.zeros((0, n))
         self._used = 0
-
-    def prime(self, motor_rad: FloatArray) -> None:
-        """Read the encoders at power-on, so that the position of a resting axis does not jump."""
-        self.loops["counts"] = np.rint(motor_rad * self._counts_per_rad)
-        self.loops["demand"] = self.loops["counts"]
-        self.loops["target"] = self.loops["counts"]
+        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
+        self.readings = self._read()  #: renewed once a SYNC
 
     def control(self, motor_rad: FloatArray) -> None:
         """Run one substep; ``loops["current_a"]`` then holds the currents for the next one."""
@@ -294,7 +321,7 @@ class AmplifierSet:
                 lag.report(self._lagged_a, self.step_s)
 
     def report(self) -> None:
-        """Renew the reported currents, once a SYNC."""
+        """Renew the reported currents and the readings, once a SYNC."""
         self.actual_a[:] = self.loops["current_a"]
         if self._used == len(self._block):
             self._block = np.stack([stream.standard_normal(1024) for stream in self._random], axis=1)
@@ -303,19 +330,12 @@ class AmplifierSet:
         self._noise_a = self._memory * self._noise_a + self._drive_a * self._block[self._used]
         self._used += 1
         np.add(self._lagged_a if self._lags else self.loops["current_a"], self._noise_a, out=self.reported_a)
+        self.readings = self._read()
 
-    def enable(self, index: int, on: bool) -> None:
-        """Switch the power stage on or off; the set-point then holds the present position."""
-        axis = self.loops[index]
-        axis["enabled"] = int(on)
-        axis["reached"] = 0
-        axis["inside_for_s"] = 0.0
-        axis["following_error"] = 0
-        axis["current_a"] = 0.0
-        axis["demand"] = axis["target"] = axis["counts"]
-        axis["demand_velocity"] = axis["demand_acceleration"] = 0.0
-        axis["piece"] = SEGMENTS
-        axis["integral_a"] = 0.0
+    def _read(self) -> Readings:
+        readings = np.empty((8, len(self.loops)), dtype=np.int64)
+        _fill(self.loops, self.reported_a, self._rated_a, readings)
+        return Readings(*readings.tolist())
 
     def move(self, index: int, move: ProfileMove) -> None:
         """Begin a move from the present set-point."""
@@ -326,12 +346,3 @@ class AmplifierSet:
         axis["piece_time_s"] = 0.0
         axis["reached"] = 0
         axis["inside_for_s"] = 0.0
-
-    def stop(self, index: int, deceleration: float) -> None:
-        """Stop with a deceleration [counts/s²]."""
-        axis = self.loops[index]
-        self.move(index, ramp_down(float(axis["demand"]), float(axis["demand_velocity"]), deceleration))
-
-    def moving(self, index: int) -> bool:
-        """Return whether the set-point still moves."""
-        return bool(self.loops[index]["piece"] < SEGMENTS)

@@ -13,9 +13,8 @@ import numpy as np
 
 from drivers.canopen.bus import SocketcandBus
 from drivers.errors import BusError
-from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
-from drivers.simulation.drive import ErrorCode, PowerState, Readings, take
-from drivers.simulation.effects import Lag, build_effect
+from drivers.simulation.amplifier import AmplifierSet
+from drivers.simulation.drive import ErrorCode, PowerState
 from drivers.simulation.faults import ERROR_FRAMES, FOREIGN_SDO, Disturbance, FaultKind, FaultSpec
 from drivers.simulation.node import NmtCommand, Node
 from drivers.simulation.plant import Plant
@@ -30,6 +29,16 @@ IDLE_S = 0.02  #: Longest wait for a frame [s]; it limits the punctuality of hea
 PATIENCE = 3  #: SYNCs of one bus that may wait for another bus: a busy machine delivers some of one bus first
 
 Cycles = tuple[frozenset[int], ...]  #: Cycles to run now, each given by the buses whose nodes take part
+
+
+POWERED = (
+    PowerState.SWITCHED_ON,
+    PowerState.OPERATION_ENABLED,
+    PowerState.QUICK_STOP_ACTIVE,
+    PowerState.FAULT_REACTION_ACTIVE,
+)
+
+Mounted = Callable[[], CellSpec | None]  #: Return the cell with its present payload, or None if unchanged
 
 
 class SyncGate:
@@ -81,23 +90,26 @@ class SimulatedCell:
     all of them, and each node receives its own bus only.
 
     As a context manager it answers in a thread of its own; ``serve_forever`` answers in the caller's thread.
-
-    Attributes:
-        plant: its mechanics (read it when the cell is closed, or between answers).
-        nodes: in the order of the axes.
-        cycles: SYNCs since power-on.
     """
 
-    def __init__(self, spec: CellSpec, bus: can.BusABC, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        spec: CellSpec,
+        bus: can.BusABC,
+        clock: Callable[[], float] = time.monotonic,
+        mounted: Mounted | None = None,
+    ) -> None:
         """Build the cell; it is powered on when it begins to serve.
 
         Args:
             spec: description of the cell.
             bus: any python-can bus that does not receive its own messages, or a split bus; the caller shuts it down.
             clock: seconds, for heartbeats while no SYNC comes.
+            mounted: exchanges the payload while no axis has power; called after each wait for a frame, so it must be
+                fast, and another object is another payload. The loops keep their tuning, as those of real drives do.
 
         Raises:
-            SpecInvalid, EffectUnknown: the description is wrong, or a node is on none of the buses.
+            SpecInvalid: the description is wrong, or a node is on none of the buses.
         """
         ids = [axis.node_id for axis in spec.axes]
         if len(set(ids)) < len(ids) or not all(1 <= node_id <= 127 for node_id in ids):
@@ -106,20 +118,18 @@ class SimulatedCell:
             raise SpecInvalid(
                 f"sync period {spec.sync_period_us} us in {spec.substeps} substeps; both must be at least 1"
             )
-        _compile(spec)
-        self.plant = Plant(spec)
-        self.cycles = 0
-        lags = tuple(e for e in (build_effect(effect, len(ids)) for effect in spec.effects) if isinstance(e, Lag))
-        self._amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, self.plant), lags)
-        self._amplifiers.prime(self.plant.motor_rad)
-        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
-        self._readings = take(self._amplifiers, self._rated_a)
+        self._spec, self._mounted = spec, mounted
+        self.plant = Plant(spec)  #: its mechanics (read it when the cell is closed, or between answers)
+        self.cycles = 0  #: SYNCs since power-on
+        self._amplifiers = AmplifierSet(spec, self.plant)
+        # Compile with numba on copies: the first SYNC must not wait for it.
+        Plant(spec).step(np.zeros(len(ids)))
+        AmplifierSet(spec, self.plant).control(self.plant.motor_rad)
         self._enabled = np.zeros(len(ids), dtype=np.int64)
         self._substeps, self._period_us = spec.substeps, spec.sync_period_us
         self._bus, self._clock = bus, clock
         self.nodes = tuple(
-            Node(index, axis, self._amplifiers, self._current_readings, partial(self._send_of, index))
-            for index, axis in enumerate(spec.axes)
+            Node(index, axis, self._amplifiers, partial(self._send_of, index)) for index, axis in enumerate(spec.axes)
         )
         self._wires, there = _wires(bus, ids)
         self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
@@ -177,7 +187,8 @@ class SimulatedCell:
             ):
                 self._receive(message)
             elif message is None and self._gate.open:
-                self._run(self._gate.close())
+                for wires in self._gate.close():
+                    self._advance(wires)
             wall_s, now_us = self._clock(), self.time_us
             for node in self.nodes:
                 node.watch(wall_s)
@@ -186,12 +197,18 @@ class SimulatedCell:
                 self._interfere()  # other masters do not wait for our SYNC
 
     def _next_frame(self) -> can.Message | None:
+        message = None
         try:
-            return self._bus.recv(IDLE_S)
+            message = self._bus.recv(IDLE_S)
         except BusError:
             if not self._goes_on():
                 raise
-            return None
+        if self._mounted is not None and not any(node.drive.state in POWERED for node in self.nodes):
+            spec = self._mounted()
+            if spec is not None and spec is not self._spec:
+                self._spec = spec
+                self.plant.mount(spec)
+        return message
 
     def _goes_on(self) -> bool:
         """Return whether another bus works after one has failed."""
@@ -211,7 +228,9 @@ class SimulatedCell:
     def _receive(self, message: can.Message) -> None:
         can_id, data = message.arbitration_id, bytes(message.data)
         wire = self._wires.index(str(message.channel)) if len(self._wires) > 1 else 0
-        hearing = self._hearing(wire)
+        hearing = self._on_wire[wire]
+        if self._disturbance:
+            hearing = tuple(node for node in hearing if not self._disturbance.cut_off(self.nodes.index(node)))
         if can_id == SYNC_ID:
             self._receive_sync(wire)
         elif can_id == NMT_ID:
@@ -230,26 +249,13 @@ class SimulatedCell:
             for node in hearing:
                 node.receive_pdo(can_id, data)
 
-    def _hearing(self, wire: int) -> tuple[Node, ...]:
-        """Return the nodes that receive a frame on one of the buses."""
-        if not self._disturbance:
-            return self._on_wire[wire]
-        return tuple(
-            node
-            for index, node in enumerate(self.nodes)
-            if node in self._on_wire[wire] and not self._disturbance.cut_off(index)
-        )
-
     def _receive_sync(self, wire: int) -> None:
         if self._gate.late(wire):
             for node in self._on_wire[wire]:
                 node.begin_cycle()
                 node.send_sync(self.time_us)
             return
-        self._run(self._gate.arrive(wire))
-
-    def _run(self, cycles: Cycles) -> None:
-        for wires in cycles:
+        for wires in self._gate.arrive(wire):
             self._advance(wires)
 
     def _interfere(self) -> None:
@@ -263,27 +269,22 @@ class SimulatedCell:
 
     def _begin_faults(self) -> None:
         """Apply the faults that begin with this cycle, before the plant moves."""
+        strike: dict[FaultKind, Callable[[Node, FaultSpec], None]] = {
+            FaultKind.EMERGENCY: lambda node, fault: node.fail(fault.value),
+            FaultKind.FOLLOWING_ERROR: lambda node, _: node.fail(ErrorCode.FOLLOWING_ERROR),
+            FaultKind.FALLS_BACK: lambda node, _: node.fall_back(),
+            FaultKind.REBOOTS: lambda node, _: node.command_nmt(NmtCommand.RESET_NODE, self._clock()),
+            FaultKind.LOSES_POWER: lambda node, _: node.drive.reset(),
+        }
         for index, node in enumerate(self.nodes):
             node.drive.limited = self._disturbance.active(FaultKind.LIMIT, index)
         for fault in self._disturbance.beginning():
             for index, node in enumerate(self.nodes):
-                if fault.concerns(index):
-                    self._strike(fault, node)
+                if fault.kind in strike and fault.concerns(index):
+                    strike[fault.kind](node, fault)
             if fault.kind in ERROR_FRAMES:
                 error_class, data = ERROR_FRAMES[fault.kind]
                 self._bus.send(can.Message(is_error_frame=True, arbitration_id=error_class, data=data))
-
-    def _strike(self, fault: FaultSpec, node: Node) -> None:
-        if fault.kind is FaultKind.EMERGENCY:
-            node.fail(fault.value)
-        elif fault.kind is FaultKind.FOLLOWING_ERROR:
-            node.fail(ErrorCode.FOLLOWING_ERROR)
-        elif fault.kind is FaultKind.FALLS_BACK:
-            node.fall_back()
-        elif fault.kind is FaultKind.REBOOTS:
-            node.command_nmt(NmtCommand.RESET_NODE, self._clock())
-        elif fault.kind is FaultKind.LOSES_POWER:
-            node.drive.reset()
 
     def _advance(self, wires: Collection[int]) -> None:
         """Run one cycle; the nodes on these buses received a SYNC."""
@@ -309,15 +310,11 @@ class SimulatedCell:
             amplifiers.control(plant.motor_rad)
         self.cycles += 1
         amplifiers.report()
-        self._readings = take(amplifiers, self._rated_a)
         now_us = self.time_us
         for node in self.nodes:
             node.end_cycle()
         for node in synchronised:
             node.send_sync(now_us)
-
-    def _current_readings(self) -> Readings:
-        return self._readings
 
     def _send_of(self, index: int, can_id: int, data: bytes) -> None:
         if not self._disturbance:
@@ -358,44 +355,3 @@ def _refuse_error_frames(faults: Sequence[FaultSpec], bus: can.BusABC) -> None:
             f"the faults {', '.join(error_frame_faults)} are error frames, which the socketcand protocol does not "
             "have: leave them out (`silent` without an axis is bus-off without its error frame), or take another bus"
         )
-
-
-def _compile(spec: CellSpec) -> None:
-    """Compile with numba on a temporary cell: the first SYNC must not wait for it."""
-    plant = Plant(spec)
-    amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, plant), ())
-    plant.step(np.zeros(len(spec.axes)))
-    amplifiers.control(plant.motor_rad)
-
-
-POWERED = (
-    PowerState.SWITCHED_ON,
-    PowerState.OPERATION_ENABLED,
-    PowerState.QUICK_STOP_ACTIVE,
-    PowerState.FAULT_REACTION_ACTIVE,
-)
-
-Mounted = Callable[[], CellSpec | None]  #: Return the cell with its present payload, or None if unchanged
-
-
-class MountingCell(SimulatedCell):
-    """Simulated cell whose payload is exchanged between runs, while no axis has power.
-
-    `mounted` is called after each wait for a frame and must be fast; another object is another payload. The loops keep
-    their tuning, as those of real drives do.
-    """
-
-    def __init__(
-        self, spec: CellSpec, bus: can.BusABC, mounted: Mounted, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        super().__init__(spec, bus, clock)
-        self._mounted, self._spec = mounted, spec
-
-    def _next_frame(self) -> can.Message | None:
-        message = super()._next_frame()
-        if not any(node.drive.state in POWERED for node in self.nodes):
-            spec = self._mounted()
-            if spec is not None and spec is not self._spec:
-                self._spec = spec
-                self.plant.mount(spec)
-        return message

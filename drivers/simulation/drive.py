@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from enum import Enum, IntEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.simulation.amplifier import AmplifierSet, FloatArray, plan
-from drivers.simulation.friction import compiled
+from drivers.simulation.amplifier import SEGMENTS, AmplifierSet, plan, ramp_down
 
 
 class PowerState(Enum):
@@ -57,46 +53,6 @@ def next_state(state: PowerState, controlword: int, previous: int, stays_in_quic
     return after
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
-    """Values of all axes in the units of CiA 402, renewed once a SYNC; one integer an axis."""
-
-    position: list[int]  #: 6064h [counts]
-    demand: list[int]  #: 6062h [counts]
-    velocity: list[int]  #: 606Ch [counts/s]
-    current_demand: list[int]  #: 6074h [per mille of rated current]
-    current: list[int]  #: 6077h and 6078h [per mille of rated current]
-    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-
-
-def take(amplifiers: AmplifierSet, rated_current_a: FloatArray) -> Readings:
-    """Return the rounded and wrapped state of the loops."""
-    readings = np.empty((8, len(rated_current_a)), dtype=np.int64)
-    _fill(amplifiers.loops, amplifiers.reported_a, rated_current_a, readings)
-    return Readings(*readings.tolist())
-
-
-@compiled
-def _fill(
-    loops: NDArray[np.void], reported_a: FloatArray, rated_current_a: FloatArray, readings: NDArray[np.int64]
-) -> None:
-    """Fill one row for each field of Readings, in their order, shape (8, n)."""
-    for i in range(len(loops)):
-        axis = loops[i]
-        # int32 as the bus carries it: an endless axis wraps around.
-        readings[0, i] = (axis["counts"] + 2**31) % 2**32 - 2**31
-        readings[1, i] = (np.int64(np.rint(axis["demand"])) + 2**31) % 2**32 - 2**31
-        readings[2, i] = np.int64(min(max(np.rint(axis["velocity"]), -(2.0**31)), 2.0**31 - 1.0))
-        per_mille = 1000.0 / rated_current_a[i]
-        readings[3, i] = np.int64(min(max(np.rint(reported_a[i] * per_mille), -32768.0), 32767.0))
-        readings[4, i] = np.int64(min(max(np.rint(axis["current_a"] * per_mille), -32768.0), 32767.0))
-        readings[5, i] = axis["reached"]
-        readings[6, i] = axis["limited"]
-        readings[7, i] = axis["following_error"]
-
-
 class ErrorCode(IntEnum):
     """Error codes of CiA 402-2 and CiA 301 (603Fh, EMCY)."""
 
@@ -107,85 +63,58 @@ class ErrorCode(IntEnum):
     FOLLOWING_ERROR = 0x8611
 
 
-class QuickStop(IntEnum):
-    """Option code 605Ah."""
-
-    DISABLE = 0
-    SLOW_DOWN_AND_DISABLE = 1
-    QUICK_STOP_AND_DISABLE = 2
-    SLOW_DOWN_AND_STAY = 5
-    QUICK_STOP_AND_STAY = 6
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Objects that define how a drive moves, in counts, counts/s and counts/s²."""
-
-    mode: int
-    target: int
-    speed: int
-    acceleration: int
-    deceleration: int
-    quick_stop_deceleration: int
-    quick_stop: int
+Setpoint = tuple[float, float, float, float]
+"""Target, speed, acceleration and deceleration [counts, s]: objects 607Ah, 6081h, 6083h and 6084h when it was set."""
 
 
 class Drive:
-    """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet.
+    """Power state and profile position mode of one axis; the loops themselves are in the AmplifierSet."""
 
-    Attributes:
-        state: CiA 402 power state.
-        controlword: last value written.
-        error: code of the active fault.
-        limited: an injected limit is active, in addition to those of the loops.
-    """
-
-    def __init__(self, index: int, amplifiers: AmplifierSet) -> None:
-        self._index = index
-        self._amplifiers = amplifiers
-        self.state = PowerState.SWITCH_ON_DISABLED
-        self.controlword = 0
-        self.error: int = ErrorCode.NONE
-        self.limited = False
+    def __init__(self, index: int, amplifiers: AmplifierSet, number: Callable[[int], int]) -> None:
+        self._index, self._amplifiers = index, amplifiers
+        self._axis = amplifiers.loops[index]  # a view
+        self._number = number  # present value of an object
+        self.state = PowerState.SWITCH_ON_DISABLED  #: CiA 402 power state
+        self.controlword = 0  #: last value written
+        self.error: int = ErrorCode.NONE  #: code of the active fault
+        self.limited = False  #: an injected limit is active, in addition to those of the loops
         self._acknowledged = False
-        self._waiting: tuple[int, Settings] | None = None
+        self._waiting: Setpoint | None = None
 
     def reset(self) -> None:
         """Return to the power-on state; the brake closes."""
         self._enter(PowerState.SWITCH_ON_DISABLED)
         self.controlword, self.error = 0, ErrorCode.NONE
 
-    def command(self, controlword: int, settings: Settings, readings: Readings) -> None:
+    def command(self, controlword: int) -> None:
         """Obey a controlword."""
         previous, self.controlword = self.controlword, controlword
-        stays = settings.quick_stop >= QuickStop.SLOW_DOWN_AND_STAY
-        state = next_state(self.state, controlword, previous, stays)
+        state = next_state(self.state, controlword, previous, self._stays_in_quick_stop)
         if state is not self.state:
             if self.state is PowerState.FAULT:
                 self.error = ErrorCode.NONE
-            self._change(state, settings)
-        if self.state is not PowerState.OPERATION_ENABLED or settings.mode != 1:
+            self._change(state)
+        if self.state is not PowerState.OPERATION_ENABLED or self._number(0x6060) != 1:
             return
         if controlword & 0x100 and not previous & 0x100:  # halt
             self._waiting = None
-            self._amplifiers.stop(self._index, settings.deceleration)
+            self._stop(self._number(0x6084))
         if not controlword & 0x10:
             # The handshake ends when the master clears the request, unless a set-point still waits.
             self._acknowledged = self._waiting is not None
         elif not previous & 0x10 and not controlword & 0x100:
-            self._request(controlword, settings, readings)
+            self._request(controlword)
 
-    def monitor(self, readings: Readings, settings: Settings) -> ErrorCode:
+    def monitor(self) -> ErrorCode:
         """Update faults, quick stop and waiting set-point after a SYNC period; return the code of a new fault."""
         if self.state is PowerState.QUICK_STOP_ACTIVE:
-            if settings.quick_stop < QuickStop.SLOW_DOWN_AND_STAY and not self._amplifiers.moving(self._index):
+            if not self._stays_in_quick_stop and not self._moving:
                 self._enter(PowerState.SWITCH_ON_DISABLED)  # transition 12
-        elif self._waiting is not None and not self._amplifiers.moving(self._index):
-            target, waiting = self._waiting
-            self._waiting = None
+        elif self._waiting is not None and not self._moving:
+            waiting, self._waiting = self._waiting, None
             self._acknowledged = bool(self.controlword & 0x10)
-            self._start(target, waiting)
-        if readings.following_error[self._index] and self.powered:
+            self._start(waiting)
+        if self._amplifiers.readings.following_error[self._index] and self.powered:
             self.fail(ErrorCode.FOLLOWING_ERROR)
             return ErrorCode.FOLLOWING_ERROR
         return ErrorCode.NONE
@@ -200,13 +129,18 @@ class Drive:
         """Whether the loops control the axis."""
         return self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE)
 
-    def quick_stop(self, settings: Settings) -> None:
+    @property
+    def _stays_in_quick_stop(self) -> bool:
+        return self._number(0x605A) >= 5  # options 5 and 6: as 1 and 2, without leaving the state
+
+    def quick_stop(self) -> None:
         """Start a quick stop without a controlword."""
         if self.state is PowerState.OPERATION_ENABLED:
-            self._change(PowerState.QUICK_STOP_ACTIVE, settings)
+            self._change(PowerState.QUICK_STOP_ACTIVE)
 
-    def statusword(self, readings: Readings) -> int:
+    def statusword(self) -> int:
         """Return object 6041h."""
+        readings = self._amplifiers.readings
         word = self.state.value | 0x0210  # voltage present, remote
         if self.powered:
             word |= readings.reached[self._index] << 10 | (readings.limited[self._index] | self.limited) << 11
@@ -216,14 +150,14 @@ class Drive:
             word |= 0x2000
         return word
 
-    def _change(self, state: PowerState, settings: Settings) -> None:
+    def _change(self, state: PowerState) -> None:
         if state is PowerState.QUICK_STOP_ACTIVE:
-            if settings.quick_stop == QuickStop.DISABLE:
+            option = self._number(0x605A)
+            if option == 0:  # disable at once
                 self._enter(PowerState.SWITCH_ON_DISABLED)
                 return
-            slow = settings.quick_stop in (QuickStop.SLOW_DOWN_AND_DISABLE, QuickStop.SLOW_DOWN_AND_STAY)
             self._waiting, self._acknowledged = None, False
-            self._amplifiers.stop(self._index, settings.deceleration if slow else settings.quick_stop_deceleration)
+            self._stop(self._number(0x6084 if option in (1, 5) else 0x6085))  # slow down, or quick stop
             self.state = state
             return
         if state is PowerState.OPERATION_ENABLED and self.state is PowerState.QUICK_STOP_ACTIVE:
@@ -232,28 +166,43 @@ class Drive:
         self._enter(state)
 
     def _enter(self, state: PowerState) -> None:
-        self._amplifiers.enable(self._index, state is PowerState.OPERATION_ENABLED)
+        """Enter a state with the power stage on or off; the set-point then holds the present position."""
+        axis = self._axis
+        axis["enabled"] = int(state is PowerState.OPERATION_ENABLED)
+        axis["reached"] = axis["following_error"] = 0
+        axis["current_a"] = axis["integral_a"] = axis["inside_for_s"] = 0.0
+        axis["demand"] = axis["target"] = axis["counts"]
+        axis["demand_velocity"] = axis["demand_acceleration"] = 0.0
+        axis["piece"] = SEGMENTS
         self._waiting, self._acknowledged = None, False
         self.state = state
 
-    def _request(self, controlword: int, settings: Settings, readings: Readings) -> None:
-        moving = self._amplifiers.moving(self._index)
+    def _request(self, controlword: int) -> None:
+        moving = self._moving
         if moving and not controlword & 0x20 and self._waiting is not None:
             return  # no room: the request stays unacknowledged
-        target = settings.target
+        target = self._number(0x607A)
         if controlword & 0x40:
-            target += int(self._amplifiers.loops[self._index]["target"])
+            target += int(self._axis["target"])
         self._acknowledged = True
+        speed, acceleration, deceleration = (float(self._number(index)) for index in (0x6081, 0x6083, 0x6084))
+        setpoint = (float(target), speed, acceleration, deceleration)
         if moving and not controlword & 0x20:
-            self._waiting = (target, settings)
+            self._waiting = setpoint
             return
         self._waiting = None
-        self._start(target, settings)
+        self._start(setpoint)
         # Reported at once, so that a master does not take the end of the last move for the end of this one.
-        readings.reached[self._index] = 0
+        self._amplifiers.readings.reached[self._index] = 0
 
-    def _start(self, target: int, settings: Settings) -> None:
-        axis = self._amplifiers.loops[self._index]
-        demand, velocity = float(axis["demand"]), float(axis["demand_velocity"])
-        ramps = (float(settings.acceleration), float(settings.deceleration))
-        self._amplifiers.move(self._index, plan(demand, velocity, float(target), float(settings.speed), *ramps))
+    @property
+    def _moving(self) -> bool:
+        return bool(self._axis["piece"] < SEGMENTS)
+
+    def _start(self, setpoint: Setpoint) -> None:
+        move = plan(float(self._axis["demand"]), float(self._axis["demand_velocity"]), *setpoint)
+        self._amplifiers.move(self._index, move)
+
+    def _stop(self, deceleration: float) -> None:
+        move = ramp_down(float(self._axis["demand"]), float(self._axis["demand_velocity"]), deceleration)
+        self._amplifiers.move(self._index, move)

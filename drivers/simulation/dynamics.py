@@ -1,59 +1,148 @@
-"""One step of the equations of motion: speeds without dry friction, its response matrix, and the final update.
+"""One step of the equations of motion with dry friction that really sticks.
 
 With M the inertia of the links, P the motors' directions (τ = Pᵀ τ_m, Ia and motor friction act along its rows) and
 h the step:
 
     A = M + Pᵀ diag(Ia + h Fv_m) P + h diag(Fv),     A v_free = (M + Pᵀ diag(Ia) P) v + h (Pᵀ τ_m + τ − c(q, q̇)),
 
-that is semi-implicit Euler with implicit viscous friction. Dry friction adds A⁻¹ Dᵀ λ.
+that is semi-implicit Euler with implicit viscous friction; dry friction adds A⁻¹ Dᵀ λ. Along each direction d_k (a
+joint, or a motor that turns with several joints) it gives an impulse λ_k with
+
+    |λ_k| ≤ b_k,     w_k > 0 ⇒ λ_k = −b_k,     w_k < 0 ⇒ λ_k = +b_k,     w = w_free + W λ,     W = D A⁻¹ Dᵀ,
+
+where w = D v⁺ are the speeds at the end of the step and b_k is the bound [Nm] times the step [s]. This is the
+optimality condition of the convex problem min ½ λᵀ W λ + w_freeᵀ λ over the box |λ| ≤ b, so v⁺ is unique even where λ
+is not (dependent directions, eq. 25 of the seed paper), and no smoothing constant enters.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.simulation.friction import compiled
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def compiled(function: F) -> F:
+    """Compile with numba, cached in the ``__pycache__`` beside the function's file (NUMBA_CACHE_DIR overrides it).
+
+    numba invalidates a cached function when its own file changes, not when a function it calls in another file does:
+    so compiled functions call only compiled functions of their own file.
+    """
+    return cast(F, numba.njit(cache=True)(function))
+
 
 FloatArray = NDArray[np.float64]
 
+TOLERANCE_RAD_S = 1e-10  #: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
+
+MAX_SWEEPS = 2_000
+
+SWEEPS_A_ROUND = 10  #: Sweeps that find which directions stick, before these are solved for directly
+
+DEPENDENT = 1e-9  #: Relative pivot below which a sticking direction depends on those before it
+
+
+class Mechanics(NamedTuple):
+    """Constants of a plant with n motors, N coordinates and m directions of dry friction.
+
+    The coordinates are the n joints, then each motor behind a flexible drive.
+    """
+
+    motor_direction: FloatArray  #: P, how each motor turns with the coordinates, shape (n, N)
+    rotor_direction: FloatArray  #: the same for its rotor, shape (n, N)
+    motor_inertia: FloatArray  #: Ia along the rows of P, shape (n,)
+    motor_viscous: FloatArray  #: Fv_m along the rows of P, shape (n,)
+    directions: FloatArray  #: D of dry friction, shape (m, N); the first n are the joints
+    own_row: NDArray[np.int64]  #: direction that carries each motor's own dry friction and brake, shape (n,)
+    lone: NDArray[np.int64]  #: coordinate of each direction that has only one, else -1, shape (m,)
+    step_s: float  #: h
+
 
 @compiled
-def free_motion(
+def advance(
+    mechanics: Mechanics,
     mass: FloatArray,
     bias: FloatArray,
-    motor_direction: FloatArray,
-    motor_inertia: FloatArray,
-    motor_viscous: FloatArray,
+    viscous: FloatArray,
+    motor_torque: FloatArray,
+    torque: FloatArray,
+    bound: FloatArray,
+    impulse: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    load_torque: FloatArray,
+    motor_rad: FloatArray,
+) -> float:
+    """Advance by one step unless dry friction stays unsolved; return its certificate [rad/s].
+
+    A direction whose friction is inside its bound sticks: the solver left it at most its tolerance of speed. Where that
+    pins a coordinate, its speed becomes exactly zero here, so that a resting axis does not creep.
+
+    Args:
+        mechanics: constants of the plant.
+        mass, bias: M and c of the links, shapes (n, n) and (n,); the coordinates after the n-th have no link.
+        viscous, torque: on each coordinate, shape (N,).
+        motor_torque: along the rows of P, shape (n,).
+        bound: largest impulse of each direction [Nm s], shape (m,).
+        impulse: λ, of the step before and then of this one, shape (m,).
+        position, velocity: state, changed in place, shape (N,).
+        load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
+        motor_rad: rotor angles at the end of the step, shape (n,), output.
+    """
+    directions, step_s = mechanics.directions, mechanics.step_s
+    total = len(velocity)
+    inertia, free_velocity = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)
+    _factorise(inertia)
+    _substitute(inertia, free_velocity)
+    response, free_speed, delassus = _respond(inertia, free_velocity, directions)
+    residual = solve(delassus, free_speed, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS)
+    if not residual <= TOLERANCE_RAD_S:
+        return residual
+    change = np.empty(total)
+    for i in range(total):
+        v = free_velocity[i]
+        for k in range(len(impulse)):
+            v += response[i, k] * impulse[k]
+        change[i] = v - velocity[i]
+    resting = _resting(impulse, bound, directions, mechanics.lone)
+    for i in range(total):
+        if resting[i]:
+            # Written so that v + change is exactly zero.
+            change[i] = -velocity[i]
+    for i in range(len(bias)):
+        s = bias[i]
+        for j in range(len(bias)):
+            s += mass[i, j] * change[j] / step_s
+        load_torque[i] = s
+    for i in range(total):
+        velocity[i] += change[i]
+        position[i] += step_s * velocity[i]
+    for i in range(len(motor_rad)):
+        s = 0.0
+        for j in range(total):
+            s += mechanics.rotor_direction[i, j] * position[j]
+        motor_rad[i] = s
+    return residual
+
+
+@compiled
+def _assemble(
+    mechanics: Mechanics,
+    mass: FloatArray,
+    bias: FloatArray,
     viscous: FloatArray,
     motor_torque: FloatArray,
     torque: FloatArray,
     velocity: FloatArray,
-    directions: FloatArray,
-    step_s: float,
-    free_velocity: FloatArray,
-    response: FloatArray,
-    free_speed: FloatArray,
-    delassus: FloatArray,
-) -> None:
-    """Compute the motion without dry friction and write it to the last four arguments.
-
-    Args:
-        mass, bias: links, shapes (n, n) and (n,); coordinates after the n-th (motors of flexible drives) have no link.
-        motor_direction: P, shape (motors, N).
-        motor_inertia, motor_viscous, motor_torque: along the rows of P, shape (motors,).
-        viscous: on each coordinate, shape (N,).
-        torque: on each coordinate, shape (N,).
-        velocity: at the start of the step, shape (N,).
-        directions: D of dry friction, shape (m, N).
-        step_s: h.
-        free_velocity: v_free, shape (N,).
-        response: A⁻¹ Dᵀ, shape (N, m).
-        free_speed: D v_free, shape (m,).
-        delassus: D A⁻¹ Dᵀ, shape (m, m).
-    """
+) -> tuple[FloatArray, FloatArray]:
+    """Return A, shape (N, N), and the right side of A v_free, shape (N,)."""
+    direction, step_s = mechanics.motor_direction, mechanics.step_s
     total = len(velocity)
-    m = len(directions)
     inertia = np.zeros((total, total))
     momentum = np.zeros(total)
     for i in range(len(bias)):
@@ -64,52 +153,46 @@ def free_motion(
     for i in range(total):
         momentum[i] += step_s * torque[i]
         inertia[i, i] += step_s * viscous[i]
-    _add_motors(motor_direction, motor_inertia, motor_viscous, motor_torque, velocity, step_s, inertia, momentum)
-    _factorise(inertia)
-    _substitute(inertia, momentum)
-    column = np.empty(total)
-    for i in range(total):
-        free_velocity[i] = momentum[i]
-    for k in range(m):
-        column[:] = directions[k]
-        _substitute(inertia, column)
-        speed = 0.0
-        for i in range(total):
-            response[i, k] = column[i]
-            speed += directions[k, i] * momentum[i]
-        free_speed[k] = speed
-    for k in range(m):
-        for j in range(m):
-            s = 0.0
-            for i in range(total):
-                s += directions[k, i] * response[i, j]
-            delassus[k, j] = s
-
-
-@compiled
-def _add_motors(
-    direction: FloatArray,
-    motor_inertia: FloatArray,
-    motor_viscous: FloatArray,
-    motor_torque: FloatArray,
-    velocity: FloatArray,
-    step_s: float,
-    inertia: FloatArray,
-    momentum: FloatArray,
-) -> None:
-    total = len(velocity)
     for k in range(len(direction)):
         speed = 0.0
         for j in range(total):
             speed += direction[k, j] * velocity[j]
-        implicit = motor_inertia[k] + step_s * motor_viscous[k]
-        push = motor_inertia[k] * speed + step_s * motor_torque[k]
+        implicit = mechanics.motor_inertia[k] + step_s * mechanics.motor_viscous[k]
+        push = mechanics.motor_inertia[k] * speed + step_s * motor_torque[k]
         for i in range(total):
             p = direction[k, i]
             if p != 0.0:
                 momentum[i] += p * push
                 for j in range(total):
                     inertia[i, j] += p * implicit * direction[k, j]
+    return inertia, momentum
+
+
+@compiled
+def _respond(
+    lower: FloatArray, free_velocity: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A⁻¹ Dᵀ, shape (N, m), D v_free, shape (m,), and W, shape (m, m); A = L Lᵀ."""
+    m, total = directions.shape
+    response = np.empty((total, m))
+    free_speed = np.empty(m)
+    delassus = np.empty((m, m))
+    column = np.empty(total)
+    for k in range(m):
+        column[:] = directions[k]
+        _substitute(lower, column)
+        response[:, k] = column
+        s = 0.0
+        for i in range(total):
+            s += directions[k, i] * free_velocity[i]
+        free_speed[k] = s
+    for k in range(m):
+        for j in range(m):
+            s = 0.0
+            for i in range(total):
+                s += directions[k, i] * response[i, j]
+            delassus[k, j] = s
+    return response, free_speed, delassus
 
 
 @compiled
@@ -140,68 +223,6 @@ def _substitute(lower: FloatArray, vector: FloatArray) -> None:
 
 
 @compiled
-def finish_step(
-    mass: FloatArray,
-    bias: FloatArray,
-    free_velocity: FloatArray,
-    response: FloatArray,
-    impulse: FloatArray,
-    bound: FloatArray,
-    directions: FloatArray,
-    lone: NDArray[np.int64],
-    step_s: float,
-    motor: FloatArray,
-    position: FloatArray,
-    velocity: FloatArray,
-    load_torque: FloatArray,
-    motor_rad: FloatArray,
-) -> None:
-    """Apply the friction impulses and move (semi-implicit Euler).
-
-    A direction whose friction is inside its bound sticks: the solver left it at most its tolerance of speed. Where that
-    pins a coordinate, its speed becomes exactly zero here, so that a resting axis does not creep.
-
-    Args:
-        mass, bias: of the links at the start of the step.
-        free_velocity, response: from free_motion.
-        impulse, bound: of dry friction [Nm s], shape (m,).
-        directions: of dry friction, shape (m, N).
-        lone: coordinate of each direction that has only one, else -1, shape (m,).
-        step_s: h.
-        motor: rotor angles per coordinate, shape (n, N).
-        position, velocity: state, changed in place, shape (N,).
-        load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
-        motor_rad: rotor angles at the end of the step, shape (n,), output.
-    """
-    n = len(bias)
-    total = len(velocity)
-    change = np.empty(total)
-    for i in range(total):
-        v = free_velocity[i]
-        for k in range(len(impulse)):
-            v += response[i, k] * impulse[k]
-        change[i] = v - velocity[i]
-    resting = _resting(impulse, bound, directions, lone)
-    for i in range(total):
-        if resting[i]:
-            # Written so that v + change is exactly zero.
-            change[i] = -velocity[i]
-    for i in range(n):
-        s = bias[i]
-        for j in range(n):
-            s += mass[i, j] * change[j] / step_s
-        load_torque[i] = s
-    for i in range(total):
-        velocity[i] += change[i]
-        position[i] += step_s * velocity[i]
-    for i in range(len(motor_rad)):
-        s = 0.0
-        for j in range(total):
-            s += motor[i, j] * position[j]
-        motor_rad[i] = s
-
-
-@compiled
 def _resting(
     impulse: FloatArray, bound: FloatArray, directions: FloatArray, lone: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
@@ -212,18 +233,129 @@ def _resting(
             resting[lone[k]] = True
     for k in range(len(impulse)):
         if lone[k] < 0 and abs(impulse[k]) < bound[k]:
-            _rest_with(directions[k], resting)
+            # It holds its last moving coordinate: a coupled motor's brake while the other joint rests.
+            free = 0
+            last = 0
+            for i in range(directions.shape[1]):
+                if directions[k, i] != 0.0 and not resting[i]:
+                    free += 1
+                    last = i
+            if free == 1:
+                resting[last] = True
     return resting
 
 
 @compiled
-def _rest_with(direction: FloatArray, resting: NDArray[np.bool_]) -> None:
-    """Hold the last moving coordinate of a sticking direction (a coupled motor's brake while the other joint rests)."""
-    free = 0
-    last = 0
-    for i in range(len(direction)):
-        if direction[i] != 0.0 and not resting[i]:
-            free += 1
-            last = i
-    if free == 1:
-        resting[last] = True
+def solve(
+    delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, tolerance: float, sweeps: int
+) -> float:
+    """Solve for the impulses in place, starting from those of the step before.
+
+    Gauss-Seidel sweeps find which directions stick; where they converge slowly (ill-conditioned inertias), the sticking
+    ones are solved for directly, stopping at the first bound. Both only lower the convex cost, so together they end.
+
+    Args:
+        delassus: W, shape (m, m), symmetric, positive on the diagonal.
+        free: speeds without dry friction [rad/s], shape (m,).
+        bound: largest impulse of each direction [Nm s], shape (m,), not negative.
+        impulse: λ, start value in and solution out, shape (m,).
+        tolerance: largest accepted certificate [rad/s].
+        sweeps: largest number of Gauss-Seidel sweeps.
+
+    Returns:
+        the certificate: the largest |λ_k − clip(λ_k − w_k/W_kk, −b_k, b_k)| W_kk [rad/s], recomputed after the last
+        sweep. It is zero exactly at the solution; a direction inside its bound has |w_k| at most this.
+    """
+    for k in range(len(free)):
+        if not np.isfinite(free[k]):
+            return np.inf  # a comparison with NaN would pass for a solution
+        impulse[k] = min(max(impulse[k], -bound[k]), bound[k])
+    residual = np.inf
+    for sweep in range(sweeps):
+        change = 0.0
+        for k in range(len(free)):
+            if bound[k] > 0.0:
+                moved = _relaxed(delassus, free, bound, impulse, k)
+                change = max(change, abs(moved - impulse[k]) * delassus[k, k])
+                impulse[k] = moved
+        if change <= tolerance:
+            residual = 0.0
+            for k in range(len(free)):
+                moved = _relaxed(delassus, free, bound, impulse, k)
+                residual = max(residual, abs(moved - impulse[k]) * delassus[k, k])
+            if residual <= tolerance:
+                break
+        if sweep % SWEEPS_A_ROUND == SWEEPS_A_ROUND - 1:
+            _stick(delassus, free, bound, impulse)
+    return residual
+
+
+@compiled
+def _relaxed(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray, k: int) -> float:
+    """Return the impulse of direction k for given impulses of the others."""
+    w = free[k]
+    for j in range(len(free)):
+        w += delassus[k, j] * impulse[j]
+    return float(min(max(impulse[k] - w / delassus[k, k], -bound[k]), bound[k]))
+
+
+@compiled
+def _stick(delassus: FloatArray, free: FloatArray, bound: FloatArray, impulse: FloatArray) -> None:
+    """Bring the directions inside their bounds to rest by Cholesky, in as many pieces as bounds are met on the way."""
+    m = len(free)
+    lower = np.zeros((m, m))
+    step = np.zeros(m)
+    for _ in range(m):
+        # Factorise W over the free directions; a dependent one keeps its impulse, the others can stop it as well.
+        inside = np.abs(impulse) < bound
+        for i in range(m):
+            step[i] = 0.0
+            if not inside[i]:
+                continue
+            pivot = delassus[i, i]
+            step[i] = -free[i]
+            for j in range(m):
+                step[i] -= delassus[i, j] * impulse[j]
+            for j in range(i):
+                if inside[j]:
+                    s = delassus[i, j]
+                    for k in range(j):
+                        if inside[k]:
+                            s -= lower[i, k] * lower[j, k]
+                    lower[i, j] = s / lower[j, j]
+                    pivot -= lower[i, j] ** 2
+                    step[i] -= lower[i, j] * step[j]
+            if pivot <= DEPENDENT * delassus[i, i]:
+                inside[i] = False
+                step[i] = 0.0
+            else:
+                lower[i, i] = np.sqrt(pivot)
+                step[i] /= lower[i, i]
+        if not _step_to_bound(lower, inside, bound, impulse, step):
+            break
+
+
+@compiled
+def _step_to_bound(
+    lower: FloatArray, inside: NDArray[np.bool_], bound: FloatArray, impulse: FloatArray, step: FloatArray
+) -> bool:
+    """Finish the substitution, step as far as the bounds allow, and return whether a bound was met."""
+    m = len(step)
+    length = 1.0
+    blocking = -1
+    for i in range(m - 1, -1, -1):
+        if inside[i]:
+            for k in range(i + 1, m):
+                if inside[k]:
+                    step[i] -= lower[k, i] * step[k]
+            step[i] /= lower[i, i]
+            room = (bound[i] if step[i] > 0.0 else -bound[i]) - impulse[i]
+            if abs(step[i]) * length > abs(room):
+                length = room / step[i]
+                blocking = i
+    for i in range(m):
+        if inside[i]:
+            impulse[i] = min(max(impulse[i] + length * step[i], -bound[i]), bound[i])
+    if blocking >= 0:
+        impulse[blocking] = bound[blocking] if step[blocking] > 0.0 else -bound[blocking]
+    return blocking >= 0

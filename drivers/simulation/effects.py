@@ -1,17 +1,21 @@
 """Undeclared effects of a simulated plant: the physics that no configuration declares and `ident` has to discover.
 
-To add one, write a class with an `axis`, its parameters in SI units and an `act(moment)`, and a line in `EFFECTS`.
+To add one, write a function of the moment, the axis and its parameters in SI units, and a line in `UNDECLARED_EFFECTS`.
+An effect with a state, or one that adds to the plant, is a class that is called with the moment.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from inspect import Parameter, signature
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.simulation.spec import EffectUnknown, UndeclaredEffect
+from drivers.simulation.spec import SpecInvalid, UndeclaredEffect
 
 FloatArray = NDArray[np.float64]
 
@@ -38,73 +42,62 @@ class Moment:
     motor_torque_nm: FloatArray  #: of each motor, in joint units, shape (n,); may be changed
 
 
-@dataclass(frozen=True, slots=True)
-class Stribeck:
+Effect = Callable[[Moment], None]  #: Changes the moment; called once a substep
+
+
+def stribeck(moment: Moment, axis: int, rise_nm: float, speed_rad_s: float) -> None:
     """Stribeck friction Fs + rise·exp(−|v|/speed): larger near standstill than sliding (Bo and Pavelescu 1982)."""
-
-    axis: int
-    rise_nm: float
-    speed_rad_s: float
-
-    def act(self, moment: Moment) -> None:
-        """Raise the bound of dry friction."""
-        speed = abs(moment.velocity_rad_s[self.axis])
-        moment.bound_nm[self.axis] += self.rise_nm * math.exp(-speed / self.speed_rad_s)
+    moment.bound_nm[axis] += rise_nm * math.exp(-abs(moment.velocity_rad_s[axis]) / speed_rad_s)
 
 
-@dataclass(frozen=True, slots=True)
-class LoadFriction:
+def load_friction(moment: Moment, axis: int, coefficient: float) -> None:
     """Dry friction Fs + coefficient·|τ_L| of a loaded gear; τ_L is the torque of the links on the joint."""
-
-    axis: int
-    coefficient: float
-
-    def act(self, moment: Moment) -> None:
-        """Raise the bound of dry friction."""
-        moment.bound_nm[self.axis] += self.coefficient * abs(moment.load_torque_nm[self.axis])
+    moment.bound_nm[axis] += coefficient * abs(moment.load_torque_nm[axis])
 
 
-@dataclass(frozen=True, slots=True)
-class NonlinearViscous:
+def nonlinear_viscous(moment: Moment, axis: int, torque_at_1_rad_s_nm: float, exponent: float) -> None:
     """Friction c·|v|^η against the motion, v in rad/s, beside the linear one: lubricants, seals, churning.
 
     It joins the bound of dry friction, which can only dissipate: as an explicit torque |v|^(1/3) would chatter at zero.
     """
-
-    axis: int
-    torque_at_1_rad_s_nm: float
-    exponent: float
-
-    def act(self, moment: Moment) -> None:
-        """Raise the bound of dry friction."""
-        moment.bound_nm[self.axis] += self.torque_at_1_rad_s_nm * abs(moment.velocity_rad_s[self.axis]) ** self.exponent
+    moment.bound_nm[axis] += torque_at_1_rad_s_nm * abs(moment.velocity_rad_s[axis]) ** exponent
 
 
-@dataclass(frozen=True, slots=True)
-class AsymmetricViscous:
-    """Viscous friction Fv + c forwards and Fv − c backwards: a torque −c·|v| beside −Fv·v."""
-
-    axis: int
-    coefficient_nm_s_rad: float
-
-    def act(self, moment: Moment) -> None:
-        """Change the joint's viscous coefficient by the sign of its speed; it never becomes negative."""
-        change = self.coefficient_nm_s_rad if moment.velocity_rad_s[self.axis] >= 0.0 else -self.coefficient_nm_s_rad
-        moment.viscous_nm_s_rad[self.axis] = max(0.0, moment.viscous_nm_s_rad[self.axis] + change)
+def asymmetric_viscous(moment: Moment, axis: int, coefficient_nm_s_rad: float) -> None:
+    """Viscous friction Fv + c forwards and Fv − c backwards, never below zero: a torque −c·|v| beside −Fv·v."""
+    change = coefficient_nm_s_rad if moment.velocity_rad_s[axis] >= 0.0 else -coefficient_nm_s_rad
+    moment.viscous_nm_s_rad[axis] = max(0.0, moment.viscous_nm_s_rad[axis] + change)
 
 
-@dataclass(frozen=True, slots=True)
-class PositionFriction:
+def spring(moment: Moment, axis: int, stiffness_nm_per_rad: float, rest_rad: float) -> None:
+    """Torque −k·(q − rest) on the joint: a gravity compensator, a cable or hose."""
+    moment.torque_nm[axis] -= stiffness_nm_per_rad * (moment.position_rad[axis] - rest_rad)
+
+
+def position_friction(moment: Moment, axis: int, amplitude_nm: float, phase_rad: float) -> None:
     """Dry friction Fs + amplitude·cos(q − phase), never below zero: an eccentric gear, a bearing out of line."""
+    change = amplitude_nm * math.cos(moment.position_rad[axis] - phase_rad)
+    moment.bound_nm[axis] = max(0.0, moment.bound_nm[axis] + change)
 
-    axis: int
-    amplitude_nm: float
-    phase_rad: float
 
-    def act(self, moment: Moment) -> None:
-        """Change the bound of dry friction."""
-        change = self.amplitude_nm * math.cos(moment.position_rad[self.axis] - self.phase_rad)
-        moment.bound_nm[self.axis] = max(0.0, moment.bound_nm[self.axis] + change)
+def cogging(moment: Moment, axis: int, amplitude_nm: float, order: float, phase_rad: float = 0.0) -> None:
+    """Cogging torque −amplitude·sin(order·θ + phase) of the motor, θ its rotor angle; the amplitude in joint units."""
+    moment.motor_torque_nm[axis] -= amplitude_nm * math.sin(order * moment.motor_rad[axis] + phase_rad)
+
+
+def saturation(moment: Moment, axis: int, half_current_a: float) -> None:
+    """Magnetic saturation, torque g·i / (1 + (i / half_current)²): half the torque constant is left at half_current.
+
+    To first order the current that a torque needs is v = v₀ + v₀³/half_current², v₀ = τ/g.
+    """
+    moment.motor_torque_nm[axis] /= 1.0 + (moment.current_a[axis] / half_current_a) ** 2
+
+
+def warm_up(moment: Moment, axis: int, cold_fraction: float, time_constant_s: float) -> None:
+    """Friction of the joint times 1 + cold_fraction·exp(−t/time_constant), t since power-on: grease that warms up."""
+    factor = 1.0 + cold_fraction * math.exp(-moment.time_s / time_constant_s)
+    moment.bound_nm[axis] *= factor
+    moment.viscous_nm_s_rad[axis] *= factor
 
 
 @dataclass(slots=True)
@@ -117,9 +110,9 @@ class Presliding:
     axis: int  #: joint
     torque_nm: float  #: friction after a long distance in one direction
     distance_rad: float  #: over which 63 % of a change of z happens
-    bristle: float = 0.0  #: z, the state
+    bristle: float = field(default=0.0, init=False)  #: z, the state
 
-    def act(self, moment: Moment) -> None:
+    def __call__(self, moment: Moment) -> None:
         """Exchange dry friction for Dahl's; z is advanced by the exact solution over the distance of the step."""
         velocity = moment.velocity_rad_s[self.axis]
         if velocity != 0.0:
@@ -127,21 +120,6 @@ class Presliding:
             self.bristle = end + (self.bristle - end) * math.exp(-abs(velocity) * moment.step_s / self.distance_rad)
         moment.bound_nm[self.axis] = max(0.0, moment.bound_nm[self.axis] - self.torque_nm)
         moment.torque_nm[self.axis] -= self.torque_nm * self.bristle
-
-
-@dataclass(frozen=True, slots=True)
-class WarmUp:
-    """Friction of the joint times 1 + cold_fraction·exp(−t/time_constant), t since power-on: grease that warms up."""
-
-    axis: int
-    cold_fraction: float
-    time_constant_s: float
-
-    def act(self, moment: Moment) -> None:
-        """Scale the joint's friction."""
-        factor = 1.0 + self.cold_fraction * math.exp(-moment.time_s / self.time_constant_s)
-        moment.bound_nm[self.axis] *= factor
-        moment.viscous_nm_s_rad[self.axis] *= factor
 
 
 @dataclass(slots=True)
@@ -159,69 +137,12 @@ class Coupling:
         """Index of the other joint, from 0."""
         return int(self.other_axis) - 1
 
-    def act(self, moment: Moment) -> None:
+    def __call__(self, moment: Moment) -> None:
         """Set the bound of the shared friction and add its viscous part."""
         moment.bound_nm[self.direction] += self.coulomb_nm
         shared = self.viscous_nm_s_rad * (moment.velocity_rad_s[self.axis] + moment.velocity_rad_s[self.other])
         moment.torque_nm[self.axis] -= shared
         moment.torque_nm[self.other] -= shared
-
-
-@dataclass(frozen=True, slots=True)
-class Spring:
-    """Torque −k·(q − rest) on the joint: a gravity compensator, a cable or hose."""
-
-    axis: int
-    stiffness_nm_per_rad: float
-    rest_rad: float
-
-    def act(self, moment: Moment) -> None:
-        """Add the torque."""
-        moment.torque_nm[self.axis] -= self.stiffness_nm_per_rad * (moment.position_rad[self.axis] - self.rest_rad)
-
-
-@dataclass(frozen=True, slots=True)
-class Cogging:
-    """Cogging torque −amplitude·sin(order·θ + phase) of the motor, θ its rotor angle; the amplitude in joint units."""
-
-    axis: int
-    amplitude_nm: float
-    order: float
-    phase_rad: float = 0.0
-
-    def act(self, moment: Moment) -> None:
-        """Subtract the ripple from the motor's torque."""
-        ripple = math.sin(self.order * moment.motor_rad[self.axis] + self.phase_rad)
-        moment.motor_torque_nm[self.axis] -= self.amplitude_nm * ripple
-
-
-@dataclass(frozen=True, slots=True)
-class Saturation:
-    """Magnetic saturation, torque g·i / (1 + (i / half_current)²): half the torque constant is left at half_current.
-
-    To first order the current that a torque needs is v = v₀ + v₀³/half_current², v₀ = τ/g.
-    """
-
-    axis: int
-    half_current_a: float
-
-    def act(self, moment: Moment) -> None:
-        """Lower the motor's torque."""
-        moment.motor_torque_nm[self.axis] /= 1.0 + (moment.current_a[self.axis] / self.half_current_a) ** 2
-
-
-@dataclass(slots=True)
-class Lag:
-    """First-order lag of the reported current reference; the current itself is not delayed."""
-
-    axis: int  #: motor
-    time_constant_s: float  #: of the lag
-    value_a: float = 0.0  #: of the filter, the state
-
-    def report(self, reported_a: NDArray[np.float64], step_s: float) -> None:
-        """Replace this axis' reference by the filtered one; called once a substep (exact for a held input)."""
-        self.value_a += (float(reported_a[self.axis]) - self.value_a) * -np.expm1(-step_s / self.time_constant_s)
-        reported_a[self.axis] = self.value_a
 
 
 @dataclass(slots=True)
@@ -231,118 +152,89 @@ class Elasticity:
     axis: int  #: motor
     stiffness_nm_per_rad: float  #: in joint units
     damping_nm_s_per_rad: float  #: in joint units
+    gap_rad: float = field(default=0.0, init=False)  #: free play between the flanks, in joint units
     #: The motor's coordinate and its row r of the drive train, filled in by the plant.
     coordinate: int = field(default=-1, init=False)
-    row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), init=False)  #: see `coordinate`
+    row: FloatArray = field(default_factory=lambda: np.zeros(0), init=False)  #: see `coordinate`
 
-    def act(self, moment: Moment) -> None:
+    def __call__(self, moment: Moment) -> None:
         """Add the drive's torque to the links and subtract it from the motor."""
-        _transmit(self, moment, 0.0)
+        n, half_gap_rad = len(self.row), self.gap_rad / 2.0
+        twist = float(moment.position_rad[self.coordinate] - self.row @ moment.position_rad[:n])
+        rate = float(moment.velocity_rad_s[self.coordinate] - self.row @ moment.velocity_rad_s[:n])
+        deflection = twist - min(max(twist, -half_gap_rad), half_gap_rad)
+        if half_gap_rad > 0.0 and deflection == 0.0:
+            return
+        torque = self.stiffness_nm_per_rad * deflection + self.damping_nm_s_per_rad * rate
+        if half_gap_rad > 0.0:
+            # A flank pushes and never pulls, however fast it is left.
+            torque = max(torque, 0.0) if deflection > 0.0 else min(torque, 0.0)
+        moment.torque_nm[self.coordinate] -= torque
+        moment.torque_nm[:n] += self.row * torque
 
 
 @dataclass(slots=True)
-class Backlash:
+class Backlash(Elasticity):
     """Elasticity with a gap: the drive transmits only where the teeth touch, and there it only pushes."""
 
-    axis: int
-    gap_rad: float  #: free play between the flanks, in joint units; the others as in Elasticity
-    stiffness_nm_per_rad: float
-    damping_nm_s_per_rad: float
-    coordinate: int = field(default=-1, init=False)
-    row: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0), init=False)
-
-    def act(self, moment: Moment) -> None:
-        """Add the drive's torque to the links and subtract it from the motor."""
-        _transmit(self, moment, self.gap_rad / 2.0)
+    gap_rad: float
 
 
-def _transmit(drive: Elasticity | Backlash, moment: Moment, half_gap_rad: float) -> None:
-    n = len(drive.row)
-    twist = float(moment.position_rad[drive.coordinate] - drive.row @ moment.position_rad[:n])
-    rate = float(moment.velocity_rad_s[drive.coordinate] - drive.row @ moment.velocity_rad_s[:n])
-    deflection = twist - min(max(twist, -half_gap_rad), half_gap_rad)
-    if half_gap_rad > 0.0 and deflection == 0.0:
-        return
-    torque = drive.stiffness_nm_per_rad * deflection + drive.damping_nm_s_per_rad * rate
-    if half_gap_rad > 0.0:
-        # A flank pushes and never pulls, however fast it is left.
-        torque = max(torque, 0.0) if deflection > 0.0 else min(torque, 0.0)
-    moment.torque_nm[drive.coordinate] -= torque
-    moment.torque_nm[:n] += drive.row * torque
+@dataclass(slots=True)
+class Lag:
+    """First-order lag of the reported current reference; the current itself is not delayed."""
+
+    axis: int  #: motor
+    time_constant_s: float  #: of the lag
+    value_a: float = field(default=0.0, init=False)  #: of the filter, the state
+
+    def report(self, reported_a: FloatArray, step_s: float) -> None:
+        """Replace this axis' reference by the filtered one; called once a substep (exact for a held input)."""
+        self.value_a += (float(reported_a[self.axis]) - self.value_a) * -np.expm1(-step_s / self.time_constant_s)
+        reported_a[self.axis] = self.value_a
 
 
-Effect = (
-    Stribeck
-    | LoadFriction
-    | NonlinearViscous
-    | AsymmetricViscous
-    | Spring
-    | PositionFriction
-    | Cogging
-    | Saturation
-    | Lag
-    | WarmUp
-    | Presliding
-    | Backlash
-    | Elasticity
-    | Coupling
-)
-
-EFFECTS: tuple[tuple[str, type[Effect]], ...] = (
-    ("stribeck", Stribeck),
-    ("load-friction", LoadFriction),
-    ("nonlinear-viscous", NonlinearViscous),
-    ("asymmetric-viscous", AsymmetricViscous),
-    ("spring", Spring),
-    ("position-friction", PositionFriction),
-    ("cogging", Cogging),
-    ("saturation", Saturation),
-    ("lag", Lag),
-    ("warm-up", WarmUp),
-    ("presliding", Presliding),
-    ("backlash", Backlash),
-    ("elasticity", Elasticity),
-    ("coupling", Coupling),
-)
-"""Name in a simulation file, and the physics."""
-
-STATE_FIELDS = frozenset({"axis", "bristle", "value_a"})
-"""Fields of an effect that are its place or its state, not its parameters."""
+UNDECLARED_EFFECTS: dict[str, Callable[..., None] | type[Presliding | Coupling | Elasticity | Lag]] = {
+    "stribeck": stribeck,
+    "load-friction": load_friction,
+    "nonlinear-viscous": nonlinear_viscous,
+    "asymmetric-viscous": asymmetric_viscous,
+    "spring": spring,
+    "position-friction": position_friction,
+    "cogging": cogging,
+    "saturation": saturation,
+    "lag": Lag,
+    "warm-up": warm_up,
+    "presliding": Presliding,
+    "backlash": Backlash,
+    "elasticity": Elasticity,
+    "coupling": Coupling,
+}
+"""Physics by its name in a simulation file; their arguments beside the moment and the axis are the parameters."""
 
 
-def build_effect(effect: UndeclaredEffect, axes: int) -> Effect:
-    """Build the physics of an undeclared effect.
-
-    Args:
-        effect: name, joint and parameters.
-        axes: number of joints of the cell.
+def build_effect(effect: UndeclaredEffect, axes: int) -> Effect | Lag:
+    """Build the physics of an undeclared effect for a cell with a number of axes.
 
     Raises:
-        EffectUnknown: the name, a parameter or the axis does not exist, or a parameter is missing.
+        SpecInvalid: the name, a parameter or the axis does not exist, or a parameter is missing.
     """
-    kinds = dict(EFFECTS)
-    kind = kinds.get(effect.name)
-    if kind is None:
-        raise EffectUnknown(f"undeclared effect {effect.name!r} does not exist; there are {', '.join(kinds)}")
+    physics = UNDECLARED_EFFECTS.get(effect.name)
+    if physics is None:
+        names = ", ".join(UNDECLARED_EFFECTS)
+        raise SpecInvalid(f"undeclared effect {effect.name!r} does not exist; there are {names}")
     if not 0 <= effect.axis < axes:
-        raise EffectUnknown(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
-    known = {f.name: f.default is MISSING for f in fields(kind) if f.init and f.name not in STATE_FIELDS}
+        raise SpecInvalid(f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}")
+    known = {p.name: p.default for p in signature(physics).parameters.values() if p.name not in ("moment", "axis")}
     unknown = sorted(set(effect.parameters) - set(known))
-    missing = [name for name, needed in known.items() if needed and name not in effect.parameters]
-    if unknown or missing:
-        raise EffectUnknown(
-            f"{effect.name}: "
-            + "; ".join(
-                text
-                for text in (
-                    f"unknown parameter {', '.join(unknown)}" if unknown else "",
-                    f"missing parameter {', '.join(missing)}" if missing else "",
-                )
-                if text
-            )
-            + f"; its parameters are {', '.join(known)}"
-        )
-    built: Effect = kind(axis=effect.axis, **effect.parameters)
+    missing = [name for name, default in known.items() if default is Parameter.empty and name not in effect.parameters]
+    wrong = [f"unknown parameter {', '.join(unknown)}"] if unknown else []
+    wrong += [f"missing parameter {', '.join(missing)}"] if missing else []
+    if wrong:
+        raise SpecInvalid(f"{effect.name}: {'; '.join(wrong)}; its parameters are {', '.join(known)}")
+    if not isinstance(physics, type):
+        return partial(physics, axis=effect.axis, **effect.parameters)
+    built: Presliding | Coupling | Elasticity | Lag = physics(axis=effect.axis, **effect.parameters)
     if isinstance(built, Coupling) and (not 0 <= built.other < axes or built.other == built.axis):
-        raise EffectUnknown(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
+        raise SpecInvalid(f"{effect.name}: other_axis {built.other_axis:g} is not another axis from 1 to {axes}")
     return built

@@ -8,22 +8,20 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from drivers.simulation.amplifier import AmplifierSet
-from drivers.simulation.drive import Drive, ErrorCode, Readings, Settings
+from drivers.simulation.drive import Drive, ErrorCode
 from drivers.simulation.faults import FaultKind
 from drivers.simulation.objects import (
     LOAD,
+    NO_OBJECT,
     READ_ONLY,
     SAVE,
-    WRITE_ONLY,
     Kind,
     SdoServer,
-    Value,
     amplifier_dictionary,
-    current_objects,
     find,
-    translated,
+    vendor,
 )
-from drivers.simulation.pdo import NO_SUCH_OBJECT, Pdo, PdoParameters, TransmitTrigger, default_pdos
+from drivers.simulation.pdo import Pdo, PdoParameters, default_pdos
 from drivers.simulation.spec import AxisSpec, SdoAbort
 
 Send = Callable[[int, bytes], None]
@@ -56,40 +54,29 @@ class NmtCommand(IntEnum):
 class Stored:
     """Parameters stored by 1010h: every value and the parameters of every PDO."""
 
-    values: dict[tuple[int, int], Value]
+    values: dict[tuple[int, int], int]
     pdos: tuple[PdoParameters, ...]
 
 
 class Node:
-    """Node and its object dictionary; all methods are called from the cell's one thread.
+    """Node and its object dictionary; all methods are called from the cell's one thread."""
 
-    Attributes:
-        saved: parameters that become valid with the next power-on.
-    """
-
-    def __init__(
-        self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, readings: Callable[[], Readings], send: Send
-    ) -> None:
+    def __init__(self, index: int, axis: AxisSpec, amplifiers: AmplifierSet, send: Send) -> None:
         self.node_id = axis.node_id
         self.nmt = NmtState.INITIALISING
-        self.drive = Drive(index, amplifiers)
+        self.drive = Drive(index, amplifiers, self._number)
         self._index = index
         self._axis = axis
-        self._loop = amplifiers.loops[index]
-        self._readings = readings
+        self._amplifiers = amplifiers
         self._send = send
-        self._dictionary = translated(amplifier_dictionary(axis), axis)
-        self._signals = {
-            current_object.key: current_object.source(amplifiers, index) for current_object in current_objects(axis)
-        }
-        self._values: dict[tuple[int, int], Value] = {key: entry.default for key, entry in self._dictionary.items()}
-        self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary)
-        self._triggers = tuple(TransmitTrigger(pdo, self._source) for pdo in self._transmit)
-        self.saved = self._stored()
+        self._dictionary = amplifier_dictionary(axis)
+        self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
+        self._values = {key: entry.default for key, entry in self._dictionary.items()}
+        self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary, self._source)
+        self.saved = self._stored()  #: parameters that become valid with the next power-on
         self._defaults = self.saved
         self._pending: dict[int, bytes] = {}
         self._history: list[int] = []
-        self._kept_settings: Settings | None = None
         self._sdo = SdoServer(self.read, self.write)
         self._now_us = 0
         self._beat_us, self._beat_wall_s = 0, 0.0
@@ -113,8 +100,8 @@ class Node:
         if command == NmtCommand.START and self.nmt is not NmtState.OPERATIONAL:
             self.nmt = NmtState.OPERATIONAL
             self._pending.clear()
-            for trigger in self._triggers:
-                trigger.reset()
+            for pdo in self._transmit:
+                pdo.reset()
             self.send_events()
         elif command == NmtCommand.STOP:
             self._connection_lost()
@@ -179,7 +166,7 @@ class Node:
         """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
         self._now_us = now_us
         period_ms = self._values[0x1017, 0]
-        if not isinstance(period_ms, int) or period_ms == 0 or self.nmt is NmtState.INITIALISING:
+        if period_ms == 0 or self.nmt is NmtState.INITIALISING:
             return
         if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
             self._beat_us, self._beat_wall_s = now_us, wall_s
@@ -209,25 +196,25 @@ class Node:
     def end_cycle(self) -> None:
         """Update faults, waiting set-points and the toggle bit after the plant has moved."""
         self._toggle ^= self._toggle_mask
-        fault = self.drive.monitor(self._readings(), self._settings())
+        fault = self.drive.monitor()
         if fault is not ErrorCode.NONE:
             self._emergency(fault)
 
     def send_sync(self, now_us: int) -> None:
         """Send the transmit PDOs of this SYNC."""
         self._now_us = now_us
-        self._transmit_pdos(TransmitTrigger.on_sync)
+        self._transmit_pdos(Pdo.on_sync)
 
     def send_events(self) -> None:
         """Send the event-driven transmit PDOs whose values changed."""
-        self._transmit_pdos(TransmitTrigger.on_event)
+        self._transmit_pdos(Pdo.on_event)
 
-    def _transmit_pdos(self, due: Callable[[TransmitTrigger, int], bytes | None]) -> None:
+    def _transmit_pdos(self, due: Callable[[Pdo, int], bytes | None]) -> None:
         if self.nmt is NmtState.OPERATIONAL:
-            for trigger in self._triggers:
-                data = due(trigger, self._now_us) if trigger.pdo.valid else None
+            for pdo in self._transmit:
+                data = due(pdo, self._now_us) if pdo.valid else None
                 if data is not None:
-                    self._send(trigger.pdo.can_id, data)
+                    self._send(pdo.can_id, data)
 
     def request(self, data: bytes) -> None:
         """Answer an SDO request; a stopped node is silent."""
@@ -250,7 +237,7 @@ class Node:
         if (index, subindex) == (0x1003, 1) and not self._history:
             raise SdoAbort(0x08000024)  # no data available
         if entry.kind is Kind.TEXT:
-            return entry.encode(self._values[index, subindex])
+            return entry.text.encode("ascii")
         return entry.encode(self._source((index, subindex))())
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
@@ -265,9 +252,6 @@ class Node:
                 pdo.write_mapping(subindex, data)
             else:
                 pdo.write_communication(subindex, data)
-                for trigger in self._triggers:
-                    if trigger.pdo is pdo:
-                        trigger.reset()
             return
         entry = find(self._dictionary, index, subindex)
         if not entry.writable:
@@ -277,17 +261,14 @@ class Node:
         if index in self._refused or (index == STORE and self.drive.powered):
             raise SdoAbort(NOT_IN_THIS_STATE)
         if index in (STORE, LOAD_DEFAULTS):
-            self._store(index, value)
+            if value != (SAVE if index == STORE else LOAD):
+                raise SdoAbort(NOT_STORED)
+            # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
+            self.saved = self._stored() if index == STORE else self._defaults
         elif index == 0x1003:
             self._history.clear()
         else:
             self._set((index, subindex), value)
-
-    def _store(self, index: int, value: Value) -> None:
-        if value != (SAVE if index == STORE else LOAD):
-            raise SdoAbort(NOT_STORED)
-        # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
-        self.saved = self._stored() if index == STORE else self._defaults
 
     def _pdo(self, index: int) -> Pdo | None:
         if not 0x1400 <= index <= 0x1BFF:
@@ -295,26 +276,26 @@ class Node:
         side = self._transmit if index >= 0x1800 else self._receive
         number = index & 0x1FF
         if number >= len(side):
-            raise SdoAbort(NO_SUCH_OBJECT)
+            raise SdoAbort(NO_OBJECT)
         return side[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:
-        i, drive, readings = self._index, self.drive, self._readings
+        i, drive, amplifiers = self._index, self.drive, self._amplifiers
         live: dict[int, Callable[[], int]] = {
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
-            0x2240: lambda: readings().position[i],
-            0x6041: lambda: drive.statusword(readings()) | self._toggle,
+            0x2240: lambda: amplifiers.readings.position[i],
+            0x6041: lambda: drive.statusword() | self._toggle,
             0x6061: lambda: self._number(0x6060),
-            0x6062: lambda: readings().demand[i],
-            0x6063: lambda: readings().position[i],
-            0x6064: lambda: readings().position[i],
-            0x606C: lambda: readings().velocity[i],
-            0x6074: lambda: readings().current_demand[i],
-            0x6077: lambda: readings().current[i],
-            0x6078: lambda: readings().current[i],
-            0x60F4: lambda: readings().demand[i] - readings().position[i],
+            0x6062: lambda: amplifiers.readings.demand[i],
+            0x6063: lambda: amplifiers.readings.position[i],
+            0x6064: lambda: amplifiers.readings.position[i],
+            0x606C: lambda: amplifiers.readings.velocity[i],
+            0x6074: lambda: amplifiers.readings.current_demand[i],
+            0x6077: lambda: amplifiers.readings.current[i],
+            0x6078: lambda: amplifiers.readings.current[i],
+            0x60F4: lambda: amplifiers.readings.demand[i] - amplifiers.readings.position[i],
         }
         index, subindex = key
         if index == 0x1003:
@@ -322,10 +303,7 @@ class Node:
         return self._signals.get(key) or live.get(index, lambda: self._number(index, subindex))
 
     def _number(self, index: int, subindex: int = 0) -> int:
-        value = self._values[index, subindex]
-        if not isinstance(value, int):
-            raise SdoAbort(WRITE_ONLY)
-        return value
+        return self._values[index, subindex]
 
     def _unpack(self, pdo: Pdo, data: bytes) -> None:
         """Set the values of a receive PDO; a controlword last, so that it acts on its companions."""
@@ -336,39 +314,25 @@ class Node:
             if (entry.lowest is None or value >= entry.lowest) and (entry.highest is None or value <= entry.highest):
                 self._set(key, value)
 
-    def _set(self, key: tuple[int, int], value: Value) -> None:
+    def _set(self, key: tuple[int, int], value: int) -> None:
         self._values[key] = value
-        self._kept_settings = None
-        if key == (0x6040, 0) and isinstance(value, int):
+        if key == (0x6040, 0):
             fault = self.drive.error
-            self.drive.command(value, self._settings(), self._readings())
+            self.drive.command(value)
             if fault is not ErrorCode.NONE and self.drive.error is ErrorCode.NONE:
                 self._send(0x80 + self.node_id, struct.pack("<HB5x", ErrorCode.NONE, 0))
         elif 0x6065 <= key[0] <= 0x6073:
             self._apply_settings()
 
-    def _settings(self) -> Settings:
-        if self._kept_settings is None:
-            number = self._number
-            self._kept_settings = Settings(
-                mode=number(0x6060),
-                target=number(0x607A),
-                speed=number(0x6081),
-                acceleration=number(0x6083),
-                deceleration=number(0x6084),
-                quick_stop_deceleration=number(0x6085),
-                quick_stop=number(0x605A),
-            )
-        return self._kept_settings
-
     def _apply_settings(self) -> None:
-        self._loop["error_window"] = self._number(0x6065)
-        self._loop["error_time_s"] = self._number(0x6066) * 1e-3
-        self._loop["target_window"] = self._number(0x6067)
-        self._loop["target_time_s"] = self._number(0x6068) * 1e-3
+        loop = self._amplifiers.loops[self._index]
+        loop["error_window"] = self._number(0x6065)
+        loop["error_time_s"] = self._number(0x6066) * 1e-3
+        loop["target_window"] = self._number(0x6067)
+        loop["target_time_s"] = self._number(0x6068) * 1e-3
         # An amplifier without 6073h keeps its peak current.
         if (0x6073, 0) in self._dictionary:
-            self._loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
+            loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
 
     def _connection_lost(self) -> None:
         """React by the abort connection option code 6007h."""
@@ -379,9 +343,9 @@ class Node:
             self.drive.fail(ErrorCode.COMMUNICATION_LOST)
             self._emergency(ErrorCode.COMMUNICATION_LOST)
         elif option == 2:
-            self.drive.command(0x0000, self._settings(), self._readings())
+            self.drive.command(0x0000)
         else:
-            self.drive.quick_stop(self._settings())
+            self.drive.quick_stop()
 
     def _emergency(self, code: int) -> None:
         self._history.insert(0, int(code))
@@ -396,9 +360,6 @@ class Node:
         for key, value in stored.values.items():
             if first <= key[0] <= last:
                 self._values[key] = value
-        self._kept_settings = None
         for pdo, parameters in zip(self._receive + self._transmit, stored.pdos, strict=True):
             pdo.restore(parameters)
         self._pending.clear()
-        for trigger in self._triggers:
-            trigger.reset()

@@ -11,11 +11,11 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.spec import AxisSpec, Dialect, SdoAbort
 
-WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
 NO_OBJECT = 0x06020000
 TOO_LONG = 0x06070012
@@ -49,34 +49,28 @@ class Mappable(Enum):
     RECEIVE = "r"
 
 
-Value = int | str
-
-
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One entry of the dictionary."""
 
     kind: Kind  #: data type
-    default: Value = 0  #: at power-on, if the node does not compute it
+    default: int = 0  #: at power-on, if the node does not compute it
     writable: bool = False  #: by SDO
     mappable: Mappable = Mappable.NO  #: into PDOs
     lowest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
     highest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
+    text: str = ""  #: value of an entry of kind TEXT
 
-    def encode(self, value: Value) -> bytes:
+    def encode(self, value: int) -> bytes:
         """Return the bytes for the bus."""
-        if isinstance(value, str):
-            return value.encode("ascii")
         return struct.pack("<" + self.kind.value, value)
 
-    def decode(self, data: bytes) -> Value:
+    def decode(self, data: bytes) -> int:
         """Return the value of bytes from the bus.
 
         Raises:
             SdoAbort: wrong length, or outside the range of values.
         """
-        if self.kind is Kind.TEXT:
-            return data.decode("ascii", errors="replace")
         size = self.kind.bits // 8
         if len(data) != size:
             raise SdoAbort(TOO_LONG if len(data) > size else TOO_SHORT)
@@ -94,8 +88,7 @@ SAVE = int.from_bytes(b"save", "little")
 LOAD = int.from_bytes(b"load", "little")
 
 
-def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
-    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh), which are in pdo.py."""
+def _cia402(axis: AxisSpec) -> Dictionary:
     counts = axis.counts_per_revolution
     peak_per_mille = round(1000 * axis.peak_current_a / axis.rated_current_a)
     transmit, receive = Mappable.TRANSMIT, Mappable.RECEIVE
@@ -105,9 +98,9 @@ def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
         (0x1003, 0): Entry(Kind.U8, writable=True, highest=0),  # writing zero clears the history
         (0x1003, 1): Entry(Kind.U32),
         (0x1005, 0): Entry(Kind.U32, 0x80),
-        (0x1008, 0): Entry(Kind.TEXT, "drivegain simulated CiA 402 amplifier"),
-        (0x1009, 0): Entry(Kind.TEXT, "1.0"),
-        (0x100A, 0): Entry(Kind.TEXT, "1.0"),
+        (0x1008, 0): Entry(Kind.TEXT, text="drivegain simulated CiA 402 amplifier"),
+        (0x1009, 0): Entry(Kind.TEXT, text="1.0"),
+        (0x100A, 0): Entry(Kind.TEXT, text="1.0"),
         (0x1010, 0): Entry(Kind.U8, 1),
         (0x1010, 1): Entry(Kind.U32, 1, writable=True),
         (0x1011, 0): Entry(Kind.U8, 1),
@@ -195,51 +188,43 @@ class SdoServer:
         if len(request) < 8:
             return None
         command = request[0] >> 5
-        if command == 4:
-            self._upload = self._download = None
-            return None
         if command in (1, 2):
             _, index, subindex = _HEAD.unpack_from(request)
             self._entry = (index, subindex)
+        if command in (1, 2, 4):  # a new transfer or an abort of the client ends the present one
+            self._upload = self._download = None
+        if command == 4:
+            return None
+        serve = {
+            0: self._continue_download,
+            1: self._start_download,
+            2: self._start_upload,
+            3: self._continue_upload,
+        }.get(command, self._refuse)
         try:
-            return self._serve(command, request)
+            return serve(request)
         except SdoAbort as abort:
             self._upload = self._download = None
             return _HEAD.pack(0x80, *self._entry) + struct.pack("<I", abort.code)
 
-    def _serve(self, command: int, request: bytes) -> bytes:
-        if command == 0:
-            return self._continue_download(request)
-        if command == 1:
-            return self._start_download(request)
-        if command == 2:
-            return self._start_upload()
-        if command == 3:
-            return self._continue_upload(request[0])
-        raise SdoAbort(UNKNOWN_COMMAND)
-
-    def _start_upload(self) -> bytes:
+    def _start_upload(self, _: bytes) -> bytes:
         data = self._read(*self._entry)
-        self._upload = self._download = None
         if len(data) <= 4:
             return _HEAD.pack(0x43 | (4 - len(data)) << 2, *self._entry) + data.ljust(4, b"\0")
         self._upload, self._toggle = data, 0
         return _HEAD.pack(0x41, *self._entry) + struct.pack("<I", len(data))
 
-    def _continue_upload(self, command: int) -> bytes:
+    def _continue_upload(self, request: bytes) -> bytes:
         if self._upload is None:
             raise SdoAbort(UNKNOWN_COMMAND)
-        self._check_toggle(command)
-        part, self._upload = self._upload[:7], self._upload[7:]
-        last = not self._upload
-        answer = bytes([self._toggle | (7 - len(part)) << 1 | last]) + part.ljust(7, b"\0")
+        self._check_toggle(request)
+        part, rest = self._upload[:7], self._upload[7:]
+        answer = bytes([self._toggle | (7 - len(part)) << 1 | (not rest)]) + part.ljust(7, b"\0")
         self._toggle ^= 0x10
-        if last:
-            self._upload = None
+        self._upload = rest or None
         return answer
 
     def _start_download(self, request: bytes) -> bytes:
-        self._upload = self._download = None
         if request[0] & 0x02:
             size = 4 - (request[0] >> 2 & 3) if request[0] & 0x01 else 4
             self._write(*self._entry, request[4 : 4 + size])
@@ -250,7 +235,7 @@ class SdoServer:
     def _continue_download(self, request: bytes) -> bytes:
         if self._download is None:
             raise SdoAbort(UNKNOWN_COMMAND)
-        self._check_toggle(request[0])
+        self._check_toggle(request)
         self._download += request[1 : 8 - (request[0] >> 1 & 7)]
         answer = bytes([0x20 | self._toggle]) + bytes(7)
         self._toggle ^= 0x10
@@ -259,81 +244,76 @@ class SdoServer:
             self._write(*self._entry, data)
         return answer
 
-    def _check_toggle(self, command: int) -> None:
-        if command & 0x10 != self._toggle:
+    def _refuse(self, _: bytes) -> bytes:
+        raise SdoAbort(UNKNOWN_COMMAND)
+
+    def _check_toggle(self, request: bytes) -> None:
+        if request[0] & 0x10 != self._toggle:
             raise SdoAbort(TOGGLE_NOT_ALTERNATED)
 
 
-_LIMITS = {Kind.I16: (-(2**15), 2**15 - 1), Kind.I32: (-(2**31), 2**31 - 1)}
-
-
-class Signal(Enum):
-    """Signal of the current loop."""
-
-    REFERENCE = "reference"
-    ACTUAL = "actual"
-
-
-@dataclass(frozen=True, slots=True)
-class CurrentObject:
+class CurrentObject(NamedTuple):
     """Object that reports a current in units of `step_a`, rounded and limited to its data type."""
 
     key: tuple[int, int]
     kind: Kind
     step_a: float
-    signal: Signal
+    is_reference: bool  #: the current reference with its noise, not the current of the motor
 
     def source(self, amplifiers: AmplifierSet, index: int) -> Callable[[], int]:
         """Return a function that reads the value of one amplifier."""
-        lowest, highest = _LIMITS[self.kind]
-        signal_a = amplifiers.reported_a if self.signal is Signal.REFERENCE else amplifiers.actual_a
-
-        def value() -> int:
-            return max(lowest, min(highest, round(float(signal_a[index]) / self.step_a)))
-
-        return value
+        highest = 2 ** (self.kind.bits - 1) - 1
+        signal_a = amplifiers.reported_a if self.is_reference else amplifiers.actual_a
+        return lambda: max(-highest - 1, min(highest, round(float(signal_a[index]) / self.step_a)))
 
 
-def current_objects(axis: AxisSpec) -> tuple[CurrentObject, ...]:
-    """Return the current objects in addition to, or in place of, 6074h, 6077h and 6078h of CiA 402."""
-    reference, actual = Signal.REFERENCE, Signal.ACTUAL
-    by_dialect: dict[Dialect, tuple[CurrentObject, ...]] = {
-        Dialect.CIA402: (),
-        Dialect.EPOS4: (
-            CurrentObject((0x30D0, 0), Kind.I32, 1e-3, reference),  # mA
-            CurrentObject((0x30D1, 1), Kind.I32, 1e-3, actual),
-            CurrentObject((0x30D1, 2), Kind.I32, 1e-3, actual),
+class Vendor(NamedTuple):
+    """Differences of a vendor's amplifiers from the CiA 402 dictionary."""
+
+    absent: frozenset[int] = frozenset()  #: objects that they lack
+    currents: tuple[CurrentObject, ...] = ()  #: in addition to, or in place of, 6074h, 6077h and 6078h
+    others: tuple[tuple[tuple[int, int], Entry], ...] = ()  #: further objects
+
+
+def vendor(axis: AxisSpec) -> Vendor:
+    """Return the differences of an axis' amplifier."""
+    by_dialect = {
+        Dialect.CIA402: Vendor(),
+        Dialect.EPOS4: Vendor(
+            frozenset({0x6073, 0x6074, 0x6075, 0x6078}),
+            (
+                CurrentObject((0x30D0, 0), Kind.I32, 1e-3, is_reference=True),  # mA
+                CurrentObject((0x30D1, 1), Kind.I32, 1e-3, is_reference=False),
+                CurrentObject((0x30D1, 2), Kind.I32, 1e-3, is_reference=False),
+            ),
+            (((0x3001, 1), Entry(Kind.U32, round(1000 * axis.rated_current_a), writable=True)),),
         ),
-        Dialect.COPLEY: (
-            CurrentObject((0x221D, 0), Kind.I16, 0.01, reference),  # 10 mA
-            CurrentObject((0x221C, 0), Kind.I16, 0.01, actual),
+        Dialect.COPLEY: Vendor(
+            frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6078}),
+            (
+                CurrentObject((0x221D, 0), Kind.I16, 0.01, is_reference=True),  # 10 mA
+                CurrentObject((0x221C, 0), Kind.I16, 0.01, is_reference=False),
+            ),
+            (((0x2240, 0), Entry(Kind.I32, mappable=Mappable.TRANSMIT)),),  # the motor's encoder
         ),
-        # 65520 internal units are twice the peak current.
-        Dialect.IPOS: (CurrentObject((0x6077, 0), Kind.I16, 2.0 * axis.peak_current_a / 65520.0, actual),),
-        # 3280 digits are the peak current.
-        Dialect.AX2000: (CurrentObject((0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, reference),),
+        Dialect.IPOS: Vendor(
+            frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6078}),
+            # 65520 internal units are twice the peak current.
+            (CurrentObject((0x6077, 0), Kind.I16, 2.0 * axis.peak_current_a / 65520.0, is_reference=False),),
+        ),
+        Dialect.AX2000: Vendor(
+            frozenset({0x6073, 0x6075, 0x6076, 0x6078}),
+            # 3280 digits are the peak current.
+            (CurrentObject((0x6074, 0), Kind.I16, axis.peak_current_a / 3280.0, is_reference=True),),
+            (((0x3529, 1), Entry(Kind.I32, round(1000 * axis.peak_current_a))),),
+        ),
     }
     return by_dialect[axis.dialect]
 
 
-_ABSENT: dict[Dialect, frozenset[int]] = {
-    Dialect.CIA402: frozenset(),
-    Dialect.EPOS4: frozenset({0x6073, 0x6074, 0x6075, 0x6078}),
-    Dialect.COPLEY: frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6078}),
-    Dialect.IPOS: frozenset({0x6073, 0x6074, 0x6075, 0x6076, 0x6078}),
-    Dialect.AX2000: frozenset({0x6073, 0x6075, 0x6076, 0x6078}),
-}
-
-
-def translated(dictionary: Dictionary, axis: AxisSpec) -> Dictionary:
-    """Return a CiA 402 dictionary with the objects of the vendor added and those that it lacks removed."""
-    objects = {key: entry for key, entry in dictionary.items() if key[0] not in _ABSENT[axis.dialect]}
-    for current_object in current_objects(axis):
-        objects[current_object.key] = Entry(current_object.kind, mappable=Mappable.TRANSMIT)
-    if axis.dialect is Dialect.EPOS4:
-        objects[0x3001, 1] = Entry(Kind.U32, round(1000 * axis.rated_current_a), writable=True)
-    if axis.dialect is Dialect.COPLEY:
-        objects[0x2240, 0] = Entry(Kind.I32, mappable=Mappable.TRANSMIT)  # the motor's encoder
-    if axis.dialect is Dialect.AX2000:
-        objects[0x3529, 1] = Entry(Kind.I32, round(1000 * axis.peak_current_a))
-    return objects
+def amplifier_dictionary(axis: AxisSpec) -> Dictionary:
+    """Return all entries of an amplifier except the PDO parameters (1400h-1BFFh), which are in pdo.py."""
+    make = vendor(axis)
+    objects = {key: entry for key, entry in _cia402(axis).items() if key[0] not in make.absent}
+    currents = {current.key: Entry(current.kind, mappable=Mappable.TRANSMIT) for current in make.currents}
+    return objects | currents | dict(make.others)

@@ -5,22 +5,21 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
+from typing import Any
 
 from drivers.simulation.objects import (
     INVALID_VALUE,
+    NO_OBJECT,
     NO_SUBINDEX,
     READ_ONLY,
-    TOO_LONG,
-    TOO_SHORT,
     Dictionary,
+    Entry,
     Kind,
     Mappable,
 )
 from drivers.simulation.spec import SdoAbort
 
 UNSUPPORTED_ACCESS = 0x06010000
-NO_SUCH_OBJECT = 0x06020000
 NOT_MAPPABLE = 0x06040041
 PDO_TOO_LONG = 0x06040042
 
@@ -33,11 +32,7 @@ MAX_ENTRIES = 8
 EVENT_DRIVEN = 254  #: First transmission type that is sent on a change, not on SYNC
 
 
-class Direction(Enum):
-    """Direction, seen from the node."""
-
-    RECEIVE = Mappable.RECEIVE
-    TRANSMIT = Mappable.TRANSMIT
+Source = Callable[[tuple[int, int]], Callable[[], int]]  #: Finds the reader of a mapped value
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +48,7 @@ class PdoParameters:
 
 
 class Pdo:
-    """One PDO; its parameters can be changed only in the order that CiA 301 allows.
+    """One PDO; its parameters can be changed only in the order that CiA 301 allows, and decide when it is sent.
 
     Attributes:
         parameters: last values written.
@@ -62,13 +57,13 @@ class Pdo:
         locked: the mapping cannot be written.
     """
 
-    def __init__(self, direction: Direction, parameters: PdoParameters, dictionary: Dictionary) -> None:
-        self._direction = direction
-        self._dictionary = dictionary
+    def __init__(self, direction: Mappable, parameters: PdoParameters, dictionary: Dictionary, source: Source) -> None:
+        self._direction, self._dictionary, self._source = direction, dictionary, source
         self.parameters = parameters
         self.layout = struct.Struct("<")
         self.mapped: tuple[tuple[int, int], ...] = ()
         self.locked = False
+        self._getters: tuple[Callable[[], int], ...] = ()
         self.restore(parameters)
 
     @property
@@ -83,113 +78,24 @@ class Pdo:
 
     def restore(self, parameters: PdoParameters) -> None:
         """Replace all parameters by defaults or saved ones."""
+        self.reset()
+        self._map(parameters)
+
+    def reset(self) -> None:
+        """Forget the last data sent (the node enters OPERATIONAL, or the PDO was changed)."""
+        self._syncs, self._last = 0, b""
+        self._last_us: int | None = None
+
+    def _map(self, parameters: PdoParameters) -> None:
         self.parameters = parameters
         entries = parameters.entries[: parameters.count]
         self.mapped = tuple((entry >> 16, entry >> 8 & 0xFF) for entry in entries)
         self.layout = struct.Struct("<" + "".join(self._dictionary[key].kind.value for key in self.mapped))
-
-    def read_communication(self, subindex: int) -> bytes:
-        """Return an entry of 1400h or 1800h."""
-        values: dict[int, tuple[str, int]] = {
-            0: ("<B", 5 if self._direction is Direction.TRANSMIT else 2),
-            1: ("<I", self.parameters.cob_id),
-            2: ("<B", self.parameters.transmission),
-        }
-        if self._direction is Direction.TRANSMIT:
-            values |= {3: ("<H", self.parameters.inhibit_100us), 5: ("<H", self.parameters.event_timer_ms)}
-        if subindex not in values:
-            raise SdoAbort(NO_SUBINDEX)
-        return struct.pack(*values[subindex])
-
-    def read_mapping(self, subindex: int) -> bytes:
-        """Return an entry of 1600h or 1A00h."""
-        if subindex == 0:
-            return bytes([self.parameters.count])
-        if subindex > MAX_ENTRIES:
-            raise SdoAbort(NO_SUBINDEX)
-        return struct.pack("<I", self.parameters.entries[subindex - 1])
-
-    def write_communication(self, subindex: int, data: bytes) -> None:
-        """Write an entry of 1400h or 1800h."""
-        old = self.parameters
-        if subindex == 0:
-            raise SdoAbort(READ_ONLY)
-        if subindex == 1:
-            cob_id = _unsigned(data, Kind.U32)
-            if cob_id & (1 << 29) or not 0x180 < (cob_id & 0x7FF) < 0x580 or cob_id >> 11 & 0x3FFFF:
-                raise SdoAbort(INVALID_VALUE)  # base frames alone, and no identifier that CiA 301 restricts
-            if self.valid and not cob_id & INVALID and (cob_id ^ old.cob_id) & 0x7FF:
-                raise SdoAbort(INVALID_VALUE)  # the identifier shall not change while the PDO exists
-            self.parameters = replace(old, cob_id=cob_id)
-        elif subindex == 2:
-            transmission = _unsigned(data, Kind.U8)
-            if 241 <= transmission <= 253:
-                raise SdoAbort(INVALID_VALUE)  # reserved, or on remote request, which these nodes do not serve
-            self.parameters = replace(old, transmission=transmission)
-        elif subindex == 3 and self._direction is Direction.TRANSMIT:
-            if self.valid:
-                raise SdoAbort(UNSUPPORTED_ACCESS)  # the inhibit time shall not change while the PDO exists
-            self.parameters = replace(old, inhibit_100us=_unsigned(data, Kind.U16))
-        elif subindex == 5 and self._direction is Direction.TRANSMIT:
-            self.parameters = replace(old, event_timer_ms=_unsigned(data, Kind.U16))
-        else:
-            raise SdoAbort(NO_SUBINDEX)
-
-    def write_mapping(self, subindex: int, data: bytes) -> None:
-        """Write an entry of 1600h or 1A00h; the order is COB-ID invalid, count 0, entries, count, COB-ID valid."""
-        if self.locked:
-            raise SdoAbort(READ_ONLY)
-        if self.valid:
-            raise SdoAbort(UNSUPPORTED_ACCESS)
-        if subindex == 0:
-            count = _unsigned(data, Kind.U8)
-            if count > MAX_ENTRIES:
-                raise SdoAbort(INVALID_VALUE)
-            used = self.parameters.entries[:count]
-            for entry in used:
-                self._check(entry)
-            if sum(entry & 0xFF for entry in used) > 64:
-                raise SdoAbort(PDO_TOO_LONG)
-            self.restore(replace(self.parameters, count=count))
-            return
-        if subindex > MAX_ENTRIES:
-            raise SdoAbort(NO_SUBINDEX)
-        if self.parameters.count:
-            raise SdoAbort(UNSUPPORTED_ACCESS)
-        entry = _unsigned(data, Kind.U32)
-        if entry:
-            self._check(entry)
-        entries = list(self.parameters.entries)
-        entries[subindex - 1] = entry
-        self.parameters = replace(self.parameters, entries=tuple(entries))
-
-    def _check(self, mapping: int) -> None:
-        entry = self._dictionary.get((mapping >> 16, mapping >> 8 & 0xFF))
-        if entry is None:
-            raise SdoAbort(NO_SUCH_OBJECT)
-        if entry.mappable is not self._direction.value or entry.kind.bits != mapping & 0xFF:
-            raise SdoAbort(NOT_MAPPABLE)
-
-
-class TransmitTrigger:
-    """Decides when a transmit PDO is sent."""
-
-    def __init__(self, pdo: Pdo, sources: Callable[[tuple[int, int]], Callable[[], int]]) -> None:
-        self.pdo = pdo
-        self._sources = sources
-        self._compiled: tuple[tuple[int, int], ...] = ()
-        self._getters: tuple[Callable[[], int], ...] = ()
-        self._syncs = 0
-        self._last = b""
-        self._last_us: int | None = None
-
-    def reset(self) -> None:
-        """Forget the last data sent (the node enters OPERATIONAL, or the PDO was changed)."""
-        self._syncs, self._last, self._last_us = 0, b"", None
+        self._getters = tuple(self._source(key) for key in self.mapped)
 
     def on_sync(self, now_us: int) -> bytes | None:
         """Return the data to send on this SYNC, or None."""
-        kind = self.pdo.parameters.transmission
+        kind = self.parameters.transmission
         if kind >= EVENT_DRIVEN:
             return self.on_event(now_us)
         data = self._data()
@@ -206,7 +112,7 @@ class TransmitTrigger:
 
     def on_event(self, now_us: int) -> bytes | None:
         """Return the data of an event-driven PDO to send after a possible change, or None."""
-        parameters = self.pdo.parameters
+        parameters = self.parameters
         if parameters.transmission < EVENT_DRIVEN:
             return None
         data = self._data()
@@ -220,30 +126,106 @@ class TransmitTrigger:
         return data
 
     def _data(self) -> bytes:
-        if self.pdo.mapped is not self._compiled:
-            self._compiled = self.pdo.mapped
-            self._getters = tuple(self._sources(key) for key in self._compiled)
-        return self.pdo.layout.pack(*[get() for get in self._getters])
+        return self.layout.pack(*[get() for get in self._getters])
+
+    @property
+    def _fields(self) -> dict[int, tuple[Kind, str]]:
+        """Entries of 1400h or 1800h: data type and parameter."""
+        fields = {1: (Kind.U32, "cob_id"), 2: (Kind.U8, "transmission")}
+        if self._direction is Mappable.TRANSMIT:
+            fields |= {3: (Kind.U16, "inhibit_100us"), 5: (Kind.U16, "event_timer_ms")}
+        return fields
+
+    def read_communication(self, subindex: int) -> bytes:
+        """Return an entry of 1400h or 1800h."""
+        if subindex == 0:
+            return bytes([max(self._fields)])
+        if subindex not in self._fields:
+            raise SdoAbort(NO_SUBINDEX)
+        kind, name = self._fields[subindex]
+        return Entry(kind).encode(getattr(self.parameters, name))
+
+    def read_mapping(self, subindex: int) -> bytes:
+        """Return an entry of 1600h or 1A00h."""
+        if subindex == 0:
+            return bytes([self.parameters.count])
+        if subindex > MAX_ENTRIES:
+            raise SdoAbort(NO_SUBINDEX)
+        return struct.pack("<I", self.parameters.entries[subindex - 1])
+
+    def write_communication(self, subindex: int, data: bytes) -> None:
+        """Write an entry of 1400h or 1800h."""
+        if subindex == 0:
+            raise SdoAbort(READ_ONLY)
+        if subindex not in self._fields:
+            raise SdoAbort(NO_SUBINDEX)
+        kind, name = self._fields[subindex]
+        if name == "inhibit_100us" and self.valid:
+            raise SdoAbort(UNSUPPORTED_ACCESS)  # the inhibit time shall not change while the PDO exists
+        value = _unsigned(data, kind)
+        if name == "cob_id":
+            if value & (1 << 29) or not 0x180 < (value & 0x7FF) < 0x580 or value >> 11 & 0x3FFFF:
+                raise SdoAbort(INVALID_VALUE)  # base frames alone, and no identifier that CiA 301 restricts
+            if self.valid and not value & INVALID and (value ^ self.parameters.cob_id) & 0x7FF:
+                raise SdoAbort(INVALID_VALUE)  # the identifier shall not change while the PDO exists
+        elif name == "transmission" and 241 <= value <= 253:
+            raise SdoAbort(INVALID_VALUE)  # reserved, or on remote request, which these nodes do not serve
+        change: dict[str, Any] = {name: value}
+        self.parameters = replace(self.parameters, **change)
+        self.reset()
+
+    def write_mapping(self, subindex: int, data: bytes) -> None:
+        """Write an entry of 1600h or 1A00h; the order is COB-ID invalid, count 0, entries, count, COB-ID valid."""
+        if self.locked:
+            raise SdoAbort(READ_ONLY)
+        if self.valid:
+            raise SdoAbort(UNSUPPORTED_ACCESS)
+        if subindex == 0:
+            count = _unsigned(data, Kind.U8)
+            if count > MAX_ENTRIES:
+                raise SdoAbort(INVALID_VALUE)
+            used = self.parameters.entries[:count]
+            for entry in used:
+                self._check(entry)
+            if sum(entry & 0xFF for entry in used) > 64:
+                raise SdoAbort(PDO_TOO_LONG)
+            self._map(replace(self.parameters, count=count))
+            return
+        if subindex > MAX_ENTRIES:
+            raise SdoAbort(NO_SUBINDEX)
+        if self.parameters.count:
+            raise SdoAbort(UNSUPPORTED_ACCESS)
+        entry = _unsigned(data, Kind.U32)
+        if entry:
+            self._check(entry)
+        entries = list(self.parameters.entries)
+        entries[subindex - 1] = entry
+        self.parameters = replace(self.parameters, entries=tuple(entries))
+
+    def _check(self, mapping: int) -> None:
+        entry = self._dictionary.get((mapping >> 16, mapping >> 8 & 0xFF))
+        if entry is None:
+            raise SdoAbort(NO_OBJECT)
+        if entry.mappable is not self._direction or entry.kind.bits != mapping & 0xFF:
+            raise SdoAbort(NOT_MAPPABLE)
 
 
-def default_pdos(node_id: int, dictionary: Dictionary) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
+def default_pdos(node_id: int, dictionary: Dictionary, source: Source) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
     """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
+
+    def default(direction: Mappable, cob_id: int, mapping: tuple[int, ...]) -> Pdo:
+        entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
+        return Pdo(direction, PdoParameters(cob_id, 255, 0, 0, entries, len(mapping)), dictionary, source)
+
     receive = ((0x60400010,), (0x60400010, 0x60600008), (0x60400010, 0x607A0020), (0x60400010,))
     transmit = ((0x60410010,), (0x60410010, 0x60610008), (0x60410010, 0x60640020), (0x60410010, 0x606C0020))
+    first = (node_id + 0x180) | NO_RTR
+    offsets = [0x100 * number | (INVALID if number else 0) for number in range(4)]
     return (
-        tuple(_default(Direction.RECEIVE, k, 0x200 + node_id, m, dictionary) for k, m in enumerate(receive)),
-        tuple(_default(Direction.TRANSMIT, k, 0x180 + node_id, m, dictionary) for k, m in enumerate(transmit)),
+        tuple(default(Mappable.RECEIVE, 0x200 + node_id + k, m) for k, m in zip(offsets, receive, strict=True)),
+        tuple(default(Mappable.TRANSMIT, first + k, m) for k, m in zip(offsets, transmit, strict=True)),
     )
 
 
-def _default(direction: Direction, number: int, first_id: int, mapping: tuple[int, ...], dictionary: Dictionary) -> Pdo:
-    cob_id = first_id + 0x100 * number | (NO_RTR if direction is Direction.TRANSMIT else 0) | (INVALID if number else 0)
-    entries = mapping + (0,) * (MAX_ENTRIES - len(mapping))
-    return Pdo(direction, PdoParameters(cob_id, 255, 0, 0, entries, len(mapping)), dictionary)
-
-
 def _unsigned(data: bytes, kind: Kind) -> int:
-    size = kind.bits // 8
-    if len(data) != size:
-        raise SdoAbort(TOO_LONG if len(data) > size else TOO_SHORT)
-    return int.from_bytes(data, "little")
+    return Entry(kind).decode(data)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from drivers.simulation import dynamics, friction
-from drivers.simulation.effects import Backlash, Coupling, Effect, Elasticity, Lag, Moment, build_effect
+from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance
+from drivers.simulation.effects import Coupling, Effect, Elasticity, Lag, Moment, build_effect
 from drivers.simulation.spec import Body, CellSpec, FrictionUnsolved, SpecInvalid
 
 FloatArray = NDArray[np.float64]
@@ -18,30 +17,17 @@ FloatArray = NDArray[np.float64]
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Coordinates of a plant: n motors, N coordinates, m directions of dry friction."""
-
-    motor_direction: FloatArray  #: how each motor turns with the coordinates, shape (n, N)
-    directions: FloatArray  #: of dry friction, shape (m, N); the first n are the joints
-    own_row: NDArray[np.int64]  #: the direction that carries each motor's own dry friction and brake, shape (n,)
-    lone: NDArray[np.int64]  #: coordinate of each direction that has only one, else -1, shape (m,)
-    #: Drives between a motor and its joints, in the order of their coordinates.
-    flexible: tuple[Elasticity | Backlash, ...]
-
-
-def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
+def lay_out(spec: CellSpec, effects: Sequence[Effect | Lag]) -> tuple[Mechanics, tuple[Elasticity, ...]]:
     """Assign coordinates and directions, and set them in the effects that add some.
 
-    Args:
-        rows: r_i of the drive train, shape (n, n).
-        effects: effects of the plant.
+    Returns:
+        the mechanics, and the drives between a motor and its joints in the order of their coordinates.
 
     Raises:
-        SpecInvalid: two flexible drives are given for one motor.
+        SpecInvalid: the drive train is wrong, or two flexible drives are given for one motor, or one is too stiff.
     """
-    n = len(rows)
-    flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity | Backlash))
+    n, rows, step_s = len(spec.axes), motor_rows(spec.ratio), spec.sync_period_us * 1e-6 / spec.substeps
+    flexible = tuple(effect for effect in effects if isinstance(effect, Elasticity))
     if len({drive.axis for drive in flexible}) < len(flexible):
         raise SpecInvalid("two flexible drives on one motor; give elasticity and gap in one backlash effect")
     total = n + len(flexible)
@@ -49,6 +35,13 @@ def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
     for coordinate, drive in enumerate(flexible, start=n):
         drive.coordinate, drive.row = coordinate, rows[drive.axis]
         motor_direction[drive.axis] = np.eye(total)[coordinate]
+        # A quarter of the stability bound of the explicit spring, stiffness h² = 4 inertia.
+        inertia = spec.axes[drive.axis].motor_inertia_kg_m2
+        if (drive.stiffness_nm_per_rad * step_s + drive.damping_nm_s_per_rad) * step_s > inertia:
+            raise SpecInvalid(
+                f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us and a "
+                f"motor inertia of {inertia:g} kg m²; lower stiffness or damping"
+            )
     directions = list(np.eye(n, total))
     own_row = np.zeros(n, dtype=np.int64)
     for motor, row in enumerate(motor_direction):
@@ -66,7 +59,17 @@ def lay_out(rows: FloatArray, effects: Sequence[Effect]) -> Layout:
             shared[[effect.axis, effect.other]] = 1.0
             directions.append(shared)
     lone = [np.flatnonzero(row)[0] if np.count_nonzero(row) == 1 else -1 for row in directions]
-    return Layout(motor_direction, np.array(directions), own_row, np.array(lone, dtype=np.int64), flexible)
+    mechanics = Mechanics(
+        motor_direction=motor_direction,
+        rotor_direction=motor_direction * reduction(spec.ratio)[:, None],
+        motor_inertia=np.array([axis.motor_inertia_kg_m2 for axis in spec.axes]),
+        motor_viscous=np.array([axis.motor_viscous_nm_s_rad for axis in spec.axes]),
+        directions=np.array(directions),
+        own_row=own_row,
+        lone=np.array(lone, dtype=np.int64),
+        step_s=step_s,
+    )
+    return mechanics, flexible
 
 
 def reduction(ratio: FloatArray) -> FloatArray:
@@ -106,8 +109,8 @@ class Plant:
         """Build the equations of motion.
 
         Raises:
-            SpecInvalid: URDF, drive train, axes and start position do not fit together.
-            EffectUnknown: an undeclared effect or its parameters do not exist.
+            SpecInvalid: URDF, drive train, axes and start position do not fit together, or an undeclared effect or its
+                parameters do not exist.
         """
         model = link_model(spec.urdf, spec.gravity_m_s2, spec.payload)
         n = len(spec.axes)
@@ -117,41 +120,30 @@ class Plant:
                 f"position of shape {spec.start_rad.shape}; all must have the same number of axes"
             )
         effects = [build_effect(effect, n) for effect in spec.effects]
-        step_s = spec.sync_period_us * 1e-6 / spec.substeps
-        layout = lay_out(motor_rows(spec.ratio), effects)
-        for drive in layout.flexible:
-            _check_stiffness(drive, spec.axes[drive.axis].motor_inertia_kg_m2, step_s)
-        m, total = layout.directions.shape
-        axes, added = spec.axes, [0.0] * len(layout.flexible)
+        self._mechanics, flexible = lay_out(spec, effects)
+        m, total = self._mechanics.directions.shape
+        axes, added = spec.axes, [0.0] * len(flexible)
         self.time_s = 0.0
-        self.position_rad = np.concatenate([spec.start_rad, [drive.row @ spec.start_rad for drive in layout.flexible]])
+        self.position_rad = np.concatenate([spec.start_rad, [drive.row @ spec.start_rad for drive in flexible]])
         self.velocity_rad_s = np.zeros(total)
         self.load_torque_nm = np.zeros(n)
+        self.motor_rad = self._mechanics.rotor_direction @ self.position_rad
         self._model, self._data = model, model.createData()
-        self._step_s = step_s
         self._acting = tuple(e for e in effects if not isinstance(e, Lag))
         self._rows = motor_rows(spec.ratio)
-        self._motor_direction = layout.motor_direction
-        self._motor = layout.motor_direction * reduction(spec.ratio)[:, None]
-        self.motor_rad = self._motor @ self.position_rad
         self._gain = np.array([a.gain_nm_per_a for a in axes])
-        self._motor_inertia = np.array([a.motor_inertia_kg_m2 for a in axes])
-        self._motor_viscous = np.array([a.motor_viscous_nm_s_rad for a in axes])
         self._viscous = np.array([a.viscous_nm_s_rad for a in axes] + added)
         # The paper's offset is on the motor's side of eq. 1, so it acts against the joint.
         self._torque = np.array([-a.offset_nm for a in axes] + added)
-        self._directions = layout.directions
-        self._own_row = layout.own_row
-        self._lone = layout.lone
         self._free_bound = np.zeros(m)
         self._free_bound[:n] = [a.coulomb_nm for a in axes]
-        for row, axis in zip(layout.own_row, axes, strict=True):
+        for row, axis in zip(self._mechanics.own_row, axes, strict=True):
             self._free_bound[row] += axis.motor_coulomb_nm
         self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
             time_s=0.0,
-            step_s=step_s,
+            step_s=self._mechanics.step_s,
             position_rad=self.position_rad,
             velocity_rad_s=self.velocity_rad_s,
             motor_rad=self.motor_rad,
@@ -162,21 +154,13 @@ class Plant:
             torque_nm=np.zeros(total),
             motor_torque_nm=np.zeros(n),
         )
-        self._mass, self._bias = np.zeros((n, n)), np.zeros(n)
-        self._free_velocity, self._response = np.zeros(total), np.zeros((total, m))
-        self._free_speed, self._delassus = np.zeros(m), np.zeros((m, m))
-        self._impulse, self._impulse_bound = np.zeros(m), np.zeros(m)
+        self._impulse = np.zeros(m)
         self.set_brakes(np.ones(n, dtype=np.bool_))
-
-    @property
-    def friction_nm(self) -> FloatArray:
-        """Torque of dry friction and brakes on each coordinate in the last step [Nm], shape (N,)."""
-        return np.asarray(self._directions.T @ self._impulse / self._step_s)
 
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
         """Close or open the brake of each motor, shape (n,)."""
         self._bound[:] = self._free_bound
-        for row, brake_nm, shut in zip(self._own_row, self._brake_nm, closed, strict=True):
+        for row, brake_nm, shut in zip(self._mechanics.own_row, self._brake_nm, closed, strict=True):
             if shut:
                 self._bound[row] += brake_nm
 
@@ -192,8 +176,10 @@ class Plant:
         """
         angles = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
         lower, upper = self._model.lowerPositionLimit, self._model.upperPositionLimit
+        # Pinocchio has a joint type for each sliding axis, as JointModelPX, or JointModelPrismaticUnaligned.
+        sliding = [str(joint.shortname()).startswith("JointModelP") for joint in self._model.joints[1:]]
         return tuple(
-            np.linspace(lower[joint], upper[joint], count) if _is_prismatic(self._model, joint) else start + angles
+            np.linspace(lower[joint], upper[joint], count) if sliding[joint] else start + angles
             for joint, start in enumerate(start_rad)
         )
 
@@ -201,7 +187,7 @@ class Plant:
         """Return the inertia seen by each motor with the others at rest, in joint units [kg m²], shape (n,)."""
         to_joint = np.linalg.inv(self._rows)
         links = np.array(pin.crba(self._model, self._data, position_rad))
-        return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._motor_inertia)
+        return np.asarray(np.diag(to_joint.T @ links @ to_joint) + self._mechanics.motor_inertia)
 
     def step(self, current_a: FloatArray) -> None:
         """Advance by one substep with the motor currents, shape (n,).
@@ -209,10 +195,8 @@ class Plant:
         Raises:
             FrictionUnsolved: dry friction was not solved to its tolerance.
         """
-        n, step_s, moment = len(self._gain), self._step_s, self._moment
+        n, moment = len(self._gain), self._moment
         position = self.position_rad[:n]
-        self._mass[...] = pin.crba(self._model, self._data, position)
-        self._bias[...] = pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n])
         moment.bound_nm[...] = self._bound
         np.multiply(self._gain, current_a, out=moment.motor_torque_nm)
         moment.viscous_nm_s_rad[...] = self._viscous
@@ -220,69 +204,29 @@ class Plant:
         if self._acting:
             moment.time_s = self.time_s
             moment.current_a[...] = current_a
-            for effect in self._acting:
-                effect.act(moment)
-        np.multiply(moment.bound_nm, step_s, out=self._impulse_bound)
-        dynamics.free_motion(
-            self._mass,
-            self._bias,
-            self._motor_direction,
-            self._motor_inertia,
-            self._motor_viscous,
+            for act in self._acting:
+                act(moment)
+        residual = advance(
+            self._mechanics,
+            np.ascontiguousarray(pin.crba(self._model, self._data, position)),
+            pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n]),
             moment.viscous_nm_s_rad,
             moment.motor_torque_nm,
             moment.torque_nm,
-            self.velocity_rad_s,
-            self._directions,
-            step_s,
-            self._free_velocity,
-            self._response,
-            self._free_speed,
-            self._delassus,
-        )
-        residual = friction.solve(
-            self._delassus,
-            self._free_speed,
-            self._impulse_bound,
+            moment.bound_nm * self._mechanics.step_s,
             self._impulse,
-            friction.TOLERANCE_RAD_S,
-            friction.MAX_SWEEPS,
-        )
-        if not residual <= friction.TOLERANCE_RAD_S:
-            raise FrictionUnsolved(self.time_s, residual, friction.TOLERANCE_RAD_S)
-        dynamics.finish_step(
-            self._mass,
-            self._bias,
-            self._free_velocity,
-            self._response,
-            self._impulse,
-            self._impulse_bound,
-            self._directions,
-            self._lone,
-            step_s,
-            self._motor,
             self.position_rad,
             self.velocity_rad_s,
             self.load_torque_nm,
             self.motor_rad,
         )
-        self.time_s += step_s
-
-
-def _is_prismatic(model: pin.Model, joint: int) -> bool:
-    """Return whether a joint, counted from 0, is prismatic: Pinocchio has a joint type for each sliding axis."""
-    kind = str(model.joints[joint + 1].shortname())
-    return "Prismatic" in kind or kind.startswith("JointModelP")
-
-
-def _check_stiffness(drive: Elasticity | Backlash, motor_inertia_kg_m2: float, step_s: float) -> None:
-    """Require a quarter of the stability bound of the explicit spring, stiffness h² = 4 inertia."""
-    stiff = (drive.stiffness_nm_per_rad * step_s + drive.damping_nm_s_per_rad) * step_s
-    if stiff > motor_inertia_kg_m2:
-        raise SpecInvalid(
-            f"the flexible drive of axis {drive.axis + 1} is too stiff for steps of {step_s * 1e6:g} us and a motor "
-            f"inertia of {motor_inertia_kg_m2:g} kg m²; lower stiffness or damping"
-        )
+        if not residual <= TOLERANCE_RAD_S:
+            raise FrictionUnsolved(
+                f"dry friction at {self.time_s:.6f} s: residual {residual:.3g} rad/s, expected at most "
+                f"{TOLERANCE_RAD_S:.3g}; check the inertias and friction of the cell for values that differ by many "
+                "orders of magnitude"
+            )
+        self.time_s += self._mechanics.step_s
 
 
 def link_model(urdf: str, gravity_m_s2: tuple[float, float, float], payload: Body | None) -> pin.Model:

@@ -1,5 +1,7 @@
 """Description of a simulated cell, its true values and its errors. The identification never reads it.
 
+The limits in the annotations are checked where a simulation file is read.
+
 For a prismatic joint read N for Nm, m for rad and kg for kg m².
 """
 
@@ -7,21 +9,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Interval
 from numpy.typing import NDArray
 
 from drivers.errors import DriverError
 from drivers.simulation.faults import FaultSpec
 
 FloatArray = NDArray[np.float64]
+Positive = Annotated[float, Gt(0)]
+ToggleBit = Literal[8, 14, 15]
+NotNegative = Annotated[float, Ge(0)]
+U32 = Annotated[int, Interval(ge=0, le=0xFFFFFFFF)]
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
     """A rigid body in the frame of the last joint."""
 
-    mass_kg: float  #: its mass [kg]
+    mass_kg: Positive  #: its mass [kg]
     centre_m: tuple[float, float, float]  #: centre of mass [m], (x, y, z)
     #: About the centre of mass [kg m²], (Ixx, Ixy, Ixz, Iyy, Iyz, Izz).
     inertia_kg_m2: tuple[float, float, float, float, float, float]
@@ -41,25 +49,25 @@ class Dialect(Enum):
 class AxisSpec:
     """One motor, its amplifier, and the joint of the same number."""
 
-    node_id: int  #: CANopen node id
-    vendor_id: int  #: object 1018h
-    product_code: int  #: object 1018h
-    revision: int  #: object 1018h
-    serial: int  #: object 1018h
-    counts_per_revolution: int  #: encoder counts a motor revolution
-    rated_current_a: float  #: object 6075h (written there in mA); the current reference 6074h is in per mille of it
-    peak_current_a: float  #: the amplifier's limit; the reference saturates there and statusword bit 11 is set
+    node_id: Annotated[int, Interval(ge=1, le=127)]  #: CANopen node id
+    vendor_id: U32  #: object 1018h
+    product_code: U32  #: object 1018h
+    revision: U32  #: object 1018h
+    serial: U32  #: object 1018h
+    counts_per_revolution: Annotated[int, Gt(0)]  #: encoder counts a motor revolution
+    rated_current_a: Positive  #: object 6075h (written there in mA); the current reference 6074h is in per mille of it
+    peak_current_a: Positive  #: the amplifier's limit; the reference saturates there and statusword bit 11 is set
     gain_nm_per_a: float  #: the true joint drive gain g = N·Gt·Kt [Nm at the joint per A]; may be negative
-    motor_inertia_kg_m2: float  #: of the rotor, seen at the joint (Ia = N²·J)
-    viscous_nm_s_rad: float  #: friction on the joint side
-    coulomb_nm: float  #: friction on the joint side
-    motor_viscous_nm_s_rad: float  #: friction on the motor side, in joint units (divided by N, see eq. 25).
-    motor_coulomb_nm: float  #: friction on the motor side, in joint units (divided by N, see eq. 25).
+    motor_inertia_kg_m2: NotNegative  #: of the rotor, seen at the joint (Ia = N²·J)
+    viscous_nm_s_rad: NotNegative  #: friction on the joint side
+    coulomb_nm: NotNegative  #: friction on the joint side
+    motor_viscous_nm_s_rad: NotNegative  #: friction on the motor side, in joint units (divided by N, see eq. 25).
+    motor_coulomb_nm: NotNegative  #: friction on the motor side, in joint units (divided by N, see eq. 25).
     offset_nm: float  #: constant torque at the joint
-    current_noise_a: float  #: standard deviation of the noise of the current reference [A]
-    noise_correlation_s: float  #: correlation time of that noise (first-order); 0 is white
+    current_noise_a: NotNegative  #: standard deviation of the noise of the current reference [A]
+    noise_correlation_s: NotNegative  #: correlation time of that noise (first-order); 0 is white
     dialect: Dialect = Dialect.CIA402  #: vendor objects that report its current
-    toggle_bit: int | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
+    toggle_bit: ToggleBit | None = None  #: bit of statusword 6041h that is inverted with every SYNC, or None
     #: Gain entered in 2003h (:01 in mNm/A, :02 in Nm/A as REAL32); the loops do not use it.
     entered_gain_nm_per_a: float = 0.0
 
@@ -96,25 +104,11 @@ class SimulationError(DriverError):
 
 
 class SpecInvalid(SimulationError):
-    """The cell cannot be built from its description."""
-
-
-class EffectUnknown(SimulationError):
-    """An undeclared effect or a parameter of it does not exist."""
+    """The cell cannot be built from its description, or an undeclared effect of it does not exist."""
 
 
 class FrictionUnsolved(SimulationError):
     """The dry-friction problem was not solved to its tolerance."""
-
-    def __init__(self, time_s: float, residual_rad_s: float, tolerance_rad_s: float) -> None:
-        super().__init__(
-            f"dry friction at {time_s:.6f} s: residual {residual_rad_s:.3g} rad/s, "
-            f"expected at most {tolerance_rad_s:.3g}; "
-            "check the inertias and friction of the cell for values that differ by many orders of magnitude"
-        )
-        self.time_s = time_s
-        self.residual_rad_s = residual_rad_s
-        self.tolerance_rad_s = tolerance_rad_s
 
 
 class SdoAbort(Exception):

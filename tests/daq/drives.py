@@ -11,8 +11,7 @@ from pathlib import Path
 
 import can
 
-from daq.cli.apply import apply_to
-from daq.cli.writing import Applier, drives_on_the_bus
+from daq.cli.apply import Applier, apply_to, drives_on_the_bus
 from daq.config.bus import drive_axes
 from daq.config.cell import Bus, Cell
 from daq.config.cell_file import load_cell

@@ -7,7 +7,7 @@ import pwd
 
 import pytest
 
-from daq.cli.writing import applier
+from daq.cli.apply import applier
 from daq.environment import login
 
 

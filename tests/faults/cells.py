@@ -22,7 +22,7 @@ from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
 from drivers.simulation.node import Node
-from drivers.simulation.spec import SdoAbort
+from drivers.simulation.spec import SdoAbort, ToggleBit
 from drivers.stream.answers import StreamStatistics
 from drivers.stream.sample import CellEvent, EventKind
 from drivers.stream.stream import SyncStream
@@ -113,7 +113,11 @@ def _value(node: Node, index: int, subindex: int) -> bytes:
 
 
 def run(
-    name: str, *faults: FaultSpec, guard_ms: int = 60_000, afterwards: int = 0, toggle_bit: int | None = None
+    name: str,
+    *faults: FaultSpec,
+    guard_ms: int = 60_000,
+    afterwards: int = 0,
+    toggle_bit: ToggleBit | None = None,
 ) -> Outcome:
     """One move of all axes there and back in a cell with these faults.
 

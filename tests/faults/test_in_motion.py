@@ -15,6 +15,7 @@ from drivers.errors import (
 )
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultKind, FaultSpec
+from drivers.simulation.spec import ToggleBit
 from drivers.stream.sample import EventKind
 from tests.faults.cells import STRIKE, Outcome, run
 
@@ -42,7 +43,7 @@ class Promise:
     text: str
     event: EventKind
     within_cycles: int
-    toggle_bit: int | None = None
+    toggle_bit: ToggleBit | None = None
 
 
 def at(kind: FaultKind, value: int = 0, cycles: int | None = None, axis: int | None = AXIS) -> FaultSpec:

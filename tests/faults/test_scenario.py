@@ -122,7 +122,7 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
     built: list[CellSpec] = []
 
     class Cell:
-        def __init__(self, spec: CellSpec, _bus: can.BusABC) -> None:
+        def __init__(self, spec: CellSpec, _bus: can.BusABC, **_: object) -> None:
             built.append(spec)
 
         def serve_forever(self) -> None:

@@ -33,11 +33,8 @@ from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
 from drivers.motion.execute import execute
 from drivers.motion.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
-from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
-from drivers.simulation.drive import Readings, take
-from drivers.simulation.effects import Lag, build_effect
+from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.node import NmtCommand, Node
-from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec
 from drivers.stream.sample import CellEvent, Sample
 from drivers.stream.stream import SyncStream
@@ -86,7 +83,7 @@ def simulate_run(
 
     Raises:
         DriverError: the moves leave the limits, or an axis did not follow.
-        FrictionUnsolved, SpecInvalid, EffectUnknown: from the simulated cell.
+        FrictionUnsolved, SpecInvalid: from the simulated cell.
     """
     stream = DirectStream(cell, spec, began_s)
     scale = _scaling(cell, stream.ampere_per_unit)
@@ -155,28 +152,16 @@ class DirectStream:
     def __init__(self, cell: Cell, spec: CellSpec, began_s: float = 0.0) -> None:
         if cell.sync is None or cell.sync.period_us != spec.sync_period_us:
             raise ValueError(f"cell {cell.name}: its sync period is not the simulated one, {spec.sync_period_us} us")
-        n = len(spec.axes)
         self.pacing = LockstepSync(spec.sync_period_us * 1000)
         self.max_missing_cycles = 0
         self.silent = False
         self.events: list[CellEvent] = []
         self.time_ns = 0
         self._cycle = 0
-        self._plant = Plant(spec)
-        self._plant.time_s = began_s
-        built = (build_effect(effect, n) for effect in spec.effects)
-        lags = tuple(effect for effect in built if isinstance(effect, Lag))
-        self._amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, self._plant), lags)
-        self._amplifiers.prime(self._plant.motor_rad)
-        self._rated_a = np.array([axis.rated_current_a for axis in spec.axes])
-        self._readings = take(self._amplifiers, self._rated_a)
-        self._enabled = np.zeros(n, dtype=np.int64)
-        self._substeps = spec.substeps
+        # Its nodes answer on a bus without readers.
+        self._cell = SimulatedCell(spec, cast(can.BusABC, SimpleNamespace(send=lambda _message: None)))
+        self._cell.plant.time_s = began_s
         self._outgoing: list[can.Message] = []
-        self._nodes = tuple(
-            Node(index, axis, self._amplifiers, self._current_readings, lambda _can_id, _data: None)
-            for index, axis in enumerate(spec.axes)
-        )
         axes = drive_axes(cell)
         # No bus between this recorder and its amplifiers can fail: they need not be guarded.
         self.network = cast(
@@ -190,7 +175,7 @@ class DirectStream:
                 find_silent=lambda _axes: None,
             ),
         )
-        accesses = [_DirectAccess(node) for node in self._nodes]
+        accesses = [_DirectAccess(node) for node in self._cell.nodes]
         for access in accesses:
             access.prepare()
         self.ampere_per_unit = tuple(
@@ -220,37 +205,23 @@ class DirectStream:
         self.events.append(event)
 
     def advance(self) -> Sample:
-        """One SYNC period, in the order of drivers.simulated.cell.SimulatedCell."""
+        """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
         outgoing, self._outgoing = self._outgoing, []
+        nodes = self._cell.nodes
         for message in outgoing:
-            for node in self._nodes:
+            for node in nodes:
                 node.receive_pdo(message.arbitration_id, bytes(message.data))
-        for node in self._nodes:
+        for node in nodes:
             node.begin_cycle()
-        plant, amplifiers = self._plant, self._amplifiers
-        loops = amplifiers.loops
-        loops["limited"] = 0
-        if not np.array_equal(loops["enabled"], self._enabled):
-            self._enabled = loops["enabled"].copy()
-            plant.set_brakes(self._enabled == 0)
-        current_a = loops["current_a"]
-        for _ in range(self._substeps):
-            plant.step(current_a)
-            amplifiers.control(plant.motor_rad)
-        amplifiers.report()
-        readings = self._readings = take(amplifiers, self._rated_a)
-        for node in self._nodes:
-            node.end_cycle()
+        self._cell._advance(())
+        readings = self._cell._amplifiers.readings
         self.time_ns = self._cycle * self.pacing.period_ns
-        statuswords = tuple(node.drive.statusword(readings) for node in self._nodes)
+        statuswords = tuple(node.drive.statusword() for node in nodes)
         sample = Sample(
             self._cycle, self.time_ns, tuple(readings.position), tuple(readings.current_demand), statuswords
         )
         self._cycle += 1
         return sample
-
-    def _current_readings(self) -> Readings:
-        return self._readings
 
 
 @dataclass(frozen=True, slots=True)

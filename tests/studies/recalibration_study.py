@@ -33,7 +33,7 @@ from daq.errors import DaqError
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.canopen.bus import open_bus
 from drivers.errors import DriverError
-from drivers.simulation.cell import MountingCell
+from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.spec import CellSpec
 from ident.drift.change import DISPERSION, decide
@@ -62,7 +62,7 @@ def one_job(rig: Rig, factor: float, seed: int, *faults: FaultSpec) -> str:
     spec = replace(mounted.at_power_on(), faults=faults, seed=seed)
     bus = open_bus(bus_address(rig.cell))
     try:
-        with MountingCell(spec, bus, mounted):
+        with SimulatedCell(spec, bus, mounted=mounted):
             return rig.job().outcome.value
     except (DaqError, DriverError, IdentificationError) as error:
         return type(error).__name__

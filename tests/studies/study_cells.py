@@ -56,7 +56,7 @@ class Truth:
         noise_factor: of the current noise, against the clean cell.
         gains_nm_per_a: true joint drive gains, by axis.
         payloads: by name.
-        axes: everything true of each axis (drivers.simulated.spec.AxisSpec).
+        axes: everything true of each axis (drivers.simulation.spec.AxisSpec).
     """
 
     seed: int

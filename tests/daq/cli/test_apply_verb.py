@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shlex
@@ -12,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from daq.cli.app import main
 from daq.cli.apply import entered_masses, tightened
@@ -21,9 +23,9 @@ from daq.environment import login
 from daq.errors import ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.judgement import Known
+from daq.ledger.judgement import NOTHING, Known
 from daq.ledger.store import HistoryStore
-from daq.report.proposal import significant
+from daq.report.proposal import change_table
 from daq.workflow.calibration_file import decode, encode, save
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
@@ -333,16 +335,23 @@ def _change(axis: str, old: float, new: float, std: float) -> GainChange:
     return GainChange(axis, axis, 1, old, new, std, "Nm/A", old, "")
 
 
+def significant(changes: tuple[GainChange, ...], known: Known = NOTHING) -> set[str]:
+    """Axes whose change is marked as more than noise in the table that the operator reads."""
+    shown = io.StringIO()
+    Console(file=shown, width=120).print(change_table(changes, known))
+    return {line.split()[0] for line in shown.getvalue().splitlines() if " * " in line}
+
+
 def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     large = _change("J1", 30.0, 33.0, 3.0)  # 10 %, 1 σ
     small = _change("J2", 30.0, 30.3, 0.03)  # 1 %, 10 σ
     broken = _change("J3", 30.0, float("nan"), 0.1)
     assert significant((large, small, broken)) == {"J2"}
-    assert significant((broken,)) == frozenset()
+    assert significant((broken,)) == set()
     # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
-    assert significant((middle,), Known({"J4": 0.07})) == frozenset()
+    assert significant((middle,), Known({"J4": 0.07})) == set()
 
 
 def test_the_number_in_the_file_has_the_sigma_of_its_calibration(

@@ -18,7 +18,7 @@ from rich.console import Console
 from daq.cli import main
 from daq.cli.app import VERBS
 from daq.cli.terminal import say_written
-from daq.cli.verb import Listed, VerbGroup
+from daq.cli.verb import Listed
 from daq.config.cell import Pacing
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
@@ -33,7 +33,7 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
 ) -> None:
     verb = listed.load()
     assert verb.name == listed.name
-    kinds = verb.kinds if isinstance(verb, VerbGroup) else ()
+    kinds = verb.kinds
     for command in ([verb.name], *([verb.name, kind.name] for kind in kinds)):
         assert main([*command, "--help"]) == 0
         output = capsys.readouterr().out

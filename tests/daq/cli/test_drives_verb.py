@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from daq.cli.rollback import rollback_drives
-from daq.cli.writing import saving_of
+from daq.cli.apply import rollback_drives, saving_of
 from daq.config.cell import Cell
 from daq.errors import BusTaken, CalibrationRefused, UsageError
 from daq.ledger.audit import AuditAction, read
@@ -171,5 +170,5 @@ def test_the_two_options_of_saving() -> None:
         Saving.RAM,
         Saving.ANY,
     ]
-    with pytest.raises(UsageError, match="one at most"):
+    with pytest.raises(UsageError, match="one of them"):
         saving_of(True, True)

@@ -21,10 +21,9 @@ NUMERICS = ("scipy.signal", "scipy.stats", "pinocchio", "numba", "matplotlib")
 HELP = """
 import contextlib, io
 from daq.cli.app import VERBS, main
-from daq.cli.verb import VerbGroup
 for listed in VERBS:
     verb = listed.load()
-    for kind in ((), *((kind.name,) for kind in (verb.kinds if isinstance(verb, VerbGroup) else ()))):
+    for kind in ((), *((kind.name,) for kind in verb.kinds)):
         with contextlib.redirect_stdout(io.StringIO()) as shown:
             assert main([verb.name, *kind, "--help"]) == 0, verb.name
         assert "Usage" in shown.getvalue()

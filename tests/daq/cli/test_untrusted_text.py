@@ -98,10 +98,9 @@ def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:
     ],
 )
 def test_a_history_that_ends_with_the_calendar_is_drawn(times: tuple[datetime, ...], tmp_path: Path) -> None:
-    out = tmp_path / "history.svg"
     with warnings.catch_warnings(action="error"):
-        plot_history(out, _watched(tmp_path, times)[:1], title="demo")
-    assert out.read_bytes().startswith(b"<?xml")
+        drawn = plot_history(_watched(tmp_path, times)[:1], "svg", title="demo")
+    assert drawn.startswith(b"<?xml")
 
 
 def _proposal(folder: Path, unit: str) -> Proposal[FileEdit]:

@@ -32,10 +32,10 @@ from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan
 from daq.workflow.record import Clocks, record
 from drivers.canopen.bus import open_bus
-from drivers.simulation.cell import MountingCell, SimulatedCell
+from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import PowerState
 from drivers.simulation.faults import FaultSpec
-from drivers.simulation.spec import CellSpec
+from drivers.simulation.spec import CellSpec, ToggleBit
 
 BEGAN = datetime(2026, 1, 5, 2, 0, tzinfo=UTC)
 WHO = "the test's job"
@@ -180,7 +180,11 @@ def make_rig(folder: Path, plan_file: Path, *, policy: dict[str, Any] | None = N
 
 @contextmanager
 def serving(
-    rig: Rig, *faults: FaultSpec, toggle_bit: int | None = None, seed: int = 1, spec: CellSpec | None = None
+    rig: Rig,
+    *faults: FaultSpec,
+    toggle_bit: ToggleBit | None = None,
+    seed: int = 1,
+    spec: CellSpec | None = None,
 ) -> Iterator[SimulatedCell]:
     """The simulated cell of a rig, powered on, with what its mount command has mounted."""
     mounted = MountedFile(rig.cells / "mounted", _truth, lambda error: None)
@@ -188,7 +192,7 @@ def serving(
     truth = replace(truth, axes=tuple(replace(axis, toggle_bit=toggle_bit) for axis in truth.axes))
     bus = open_bus(bus_address(rig.cell))
     try:
-        with MountingCell(truth, bus, mounted) as cell:
+        with SimulatedCell(truth, bus, mounted=mounted) as cell:
             yield cell
     finally:
         bus.shutdown()

@@ -12,7 +12,7 @@ from daq.cli.app import main
 from daq.cli.simulate import MountedFile
 from daq.errors import ExitCode, UsageError
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
-from drivers.simulation.cell import MountingCell
+from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import CellSpec
 from tests.daq.jobs.rig import make_rig, serving
 from tests.drivers.scripted import FakeClock, ScriptedBus
@@ -69,7 +69,7 @@ def test_a_cell_without_the_section_names_what_it_lacks(
         assert "recalibration" in capsys.readouterr().err
 
 
-def masses(cell: MountingCell) -> float:
+def masses(cell: SimulatedCell) -> float:
     return float(sum(inertia.mass for inertia in cell.plant._model.inertias))
 
 
@@ -85,7 +85,7 @@ def test_the_simulated_payload_changes_with_the_file_but_never_under_power(
     mounted = MountedFile(file, load, complaints.append)
     bus = ScriptedBus((), FakeClock())
     request.addfinalizer(bus.shutdown)
-    cell = MountingCell(mounted.at_power_on(), bus, mounted)
+    cell = SimulatedCell(mounted.at_power_on(), bus, mounted=mounted)
     bare = masses(cell)
 
     def frame() -> float:

@@ -30,8 +30,7 @@ from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, logs_of
 from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
-from daq.report.history import COLUMNS
-from daq.report.history_view import describe_actions
+from daq.report.history import COLUMNS, describe_actions
 from daq.workflow.calibration_file import save
 from daq.writeback.drive_record import drives_of
 from daq.writeback.formats.document import decode as read_controller

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from daq.cli.app import main
-from daq.cli.residual import check_report
+from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputFailed, UsageError
 from daq.report.effect_names import WORDS, effect_text, other_axis, placed_name
-from daq.report.residual import error_change_text, summary
-from daq.report.residual_document import residual_document
+from daq.report.plots import draw_fit
+from daq.report.residual import error_change_text, residual_document, summary
 from daq.report.residual_page import DOCUMENT, PAGE, page, paragraph, residual_page, save_report, table
 from daq.report.text import json_text
 from daq.workflow import fit as fit_module
@@ -347,6 +347,26 @@ def test_a_disk_that_fails_leaves_the_old_report(
     with pytest.raises(OutputFailed, match="no space"):
         save_report(closed.fitted, closed.account, calibration, tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == old
+
+
+def test_a_disk_that_fails_leaves_the_old_pictures(
+    closed: Closed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = tmp_path / "torques.png"
+    old.write_bytes(b"the old one")
+
+    def fail(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    calibration = calibration_of(closed.fitted, CREATED)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", fail)
+        with pytest.raises(OSError, match="No space"):
+            draw_fit(closed.fitted, calibration, None, tmp_path)
+    assert old.read_bytes() == b"the old one"
+    assert list(tmp_path.iterdir()) == [old]
+    draw_fit(closed.fitted, calibration, None, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"torques.png", "gains.png", "residual-J3-spring.png"}
 
 
 def test_the_verb_writes_the_report_and_says_the_same(

@@ -5,16 +5,16 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import can
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from daq.simulation.simulation_file import load_simulation
 from drivers.simulation.cell import SimulatedCell
-from drivers.simulation.spec import AxisSpec, Body, CellSpec, UndeclaredEffect
+from drivers.simulation.spec import CellSpec, UndeclaredEffect
 
 FloatArray = NDArray[np.float64]
 
@@ -25,20 +25,7 @@ STOPPED_CLOCK: Callable[[], float] = lambda: 0.0  # noqa: E731 - a clock that ne
 
 def clean_cell(payload: str | None = None, effects: tuple[UndeclaredEffect, ...] = ()) -> CellSpec:
     """The cell of configs/simulation/clean.yaml."""
-    content = yaml.safe_load(CLEAN.read_text(encoding="utf-8"))
-    body = content["payloads"][payload] if payload else None
-    return CellSpec(
-        urdf=(CLEAN.parent / content["urdf"]).read_text(encoding="utf-8"),
-        gravity_m_s2=tuple(content["gravity_m_s2"]),
-        ratio=np.array(content["ratio"], dtype=np.float64),
-        axes=tuple(AxisSpec(**axis) for axis in content["axes"]),
-        start_rad=np.deg2rad(content["start_deg"]),
-        payload=Body(body["mass_kg"], tuple(body["centre_m"]), tuple(body["inertia_kg_m2"])) if body else None,
-        effects=effects,
-        sync_period_us=content["sync_period_us"],
-        substeps=content["substeps"],
-        seed=content["seed"],
-    )
+    return replace(load_simulation(CLEAN, payload), effects=effects)
 
 
 @dataclass

@@ -9,7 +9,7 @@ import can
 import numpy as np
 import pytest
 
-from drivers.simulation.amplifier import AmplifierSet, tuned_inertia_a_s2
+from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.plant import Plant
 from drivers.simulation.spec import CellSpec, FrictionUnsolved, SpecInvalid, UndeclaredEffect
@@ -206,7 +206,7 @@ def test_nmt_stop_while_enabled_is_a_fault_and_the_brake_holds(request: pytest.F
 def test_noise_of_the_reference_is_as_declared_and_on_nothing_else() -> None:
     spec = clean_cell()
     plant = Plant(spec)
-    amplifiers = AmplifierSet(spec, tuned_inertia_a_s2(spec, plant), ())
+    amplifiers = AmplifierSet(spec, plant)
     reported = []
     for _ in range(20_000):
         amplifiers.report()

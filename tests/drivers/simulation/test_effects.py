@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.simulation.effects import EFFECTS, Lag, Moment, Presliding, build_effect
+from drivers.simulation.effects import UNDECLARED_EFFECTS, Lag, Moment, Presliding, build_effect
 from drivers.simulation.plant import Plant, link_model, motor_rows
-from drivers.simulation.spec import EffectUnknown, SpecInvalid, UndeclaredEffect
+from drivers.simulation.spec import SpecInvalid, UndeclaredEffect
 from tests.drivers.simulation.cells import FloatArray, clean_cell
 
 STEP_S = 0.25e-3
@@ -141,13 +141,14 @@ def test_warm_up_fades_with_time() -> None:
 
 
 def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
-    effect = Presliding(axis=0, torque_nm=3.0, distance_rad=0.01, bristle=-1.0)
+    effect = Presliding(axis=0, torque_nm=3.0, distance_rad=0.01)
+    effect.bristle = -1.0
     moment = Moment(0.0, STEP_S, *(np.zeros(1) for _ in range(9)))
     moment.velocity_rad_s[0] = 0.4
     travelled, torque = 0.0, []
     while travelled < 0.05:
         moment.bound_nm[0], moment.torque_nm[0] = 5.0, 0.0
-        effect.act(moment)
+        effect(moment)
         travelled += 0.4 * STEP_S
         torque.append(float(moment.torque_nm[0]))
         assert moment.bound_nm[0] == 2.0
@@ -221,24 +222,24 @@ def test_bounds_of_dry_friction_never_become_negative(speed: float, load: float,
         moment.velocity_rad_s[0], moment.position_rad[0] = speed, angle
         effect = build_effect(UndeclaredEffect(name, 0, parameters), 1)
         assert not isinstance(effect, Lag)
-        effect.act(moment)
+        effect(moment)
         assert moment.bound_nm[0] >= 0.0
 
 
 def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
-    with pytest.raises(EffectUnknown, match="stribeck, load-friction"):
+    with pytest.raises(SpecInvalid, match="stribeck, load-friction"):
         build_effect(UndeclaredEffect("striebeck", 0, {}), 6)
     with pytest.raises(
-        EffectUnknown, match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, speed_rad_s"
+        SpecInvalid, match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, speed_rad_s"
     ):
         build_effect(UndeclaredEffect("stribeck", 0, {"rise": 1.0, "speed_rad_s": 0.1}), 6)
-    with pytest.raises(EffectUnknown, match="axis 7"):
+    with pytest.raises(SpecInvalid, match="axis 7"):
         build_effect(UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6)
-    with pytest.raises(EffectUnknown, match="other_axis"):
+    with pytest.raises(SpecInvalid, match="other_axis"):
         build_effect(UndeclaredEffect("coupling", 3, {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}), 6)
-    with pytest.raises(EffectUnknown, match="unknown parameter bristle"):
+    with pytest.raises(SpecInvalid, match="unknown parameter bristle"):
         build_effect(UndeclaredEffect("presliding", 0, {"torque_nm": 1.0, "distance_rad": 0.1, "bristle": 1.0}), 6)
-    assert len(dict(EFFECTS)) == len(EFFECTS) == 14
+    assert len(UNDECLARED_EFFECTS) == 14
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:

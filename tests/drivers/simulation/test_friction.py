@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from drivers.simulation.friction import MAX_SWEEPS, TOLERANCE_RAD_S, solve
+from drivers.simulation.dynamics import MAX_SWEEPS, TOLERANCE_RAD_S, solve
 
 
 def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
