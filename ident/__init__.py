@@ -46,9 +46,8 @@ if TYPE_CHECKING:
     from ident.estimators.identify import Identification, identify
     from ident.estimators.method import Method
     from ident.model.bodies import Payload
-    from ident.model.kinematics import Motion
     from ident.model.model import DriveTrain, Model
-    from ident.model.robot import Robot, robot_from_urdf
+    from ident.model.robot import Motion, Robot, robot_from_urdf
     from ident.prediction import measured_torque, predict_current, predict_torque
 
 __all__ = [
@@ -89,31 +88,22 @@ __all__ = [
 
 # Importing the package stays light: a name brings its module along when it is first used.
 _MODULES = {
-    "ident.calibration": ("Calibration", "calibration_of"),
-    "ident.data.conditioning": ("Conditioning",),
-    "ident.data.dataset": ("Dataset", "differentiate", "planned"),
-    "ident.data.run": ("Run",),
-    "ident.discovery.loop": ("Evidence", "Step", "find_effects", "gather"),
-    "ident.errors": (
-        "DataUnfit",
-        "EffectRefused",
-        "IdentificationError",
-        "ModelError",
-        "NotConverged",
-        "PayloadUnseen",
-        "RankDeficient",
-        "TooFewMoves",
-    ),
-    "ident.estimators.estimate": ("Estimate", "RelativeError"),
-    "ident.estimators.identify": ("Identification", "identify"),
-    "ident.estimators.method": ("Method",),
-    "ident.model.bodies": ("Payload",),
-    "ident.model.kinematics": ("Motion",),
-    "ident.model.model": ("DriveTrain", "Model"),
-    "ident.model.robot": ("Robot", "robot_from_urdf"),
-    "ident.prediction": ("measured_torque", "predict_current", "predict_torque"),
+    "ident.calibration": "Calibration calibration_of",
+    "ident.data.conditioning": "Conditioning",
+    "ident.data.dataset": "Dataset differentiate planned",
+    "ident.data.run": "Run",
+    "ident.discovery.loop": "Evidence Step find_effects gather",
+    "ident.errors": "DataUnfit EffectRefused IdentificationError ModelError NotConverged PayloadUnseen RankDeficient "
+    "TooFewMoves",
+    "ident.estimators.estimate": "Estimate RelativeError",
+    "ident.estimators.identify": "Identification identify",
+    "ident.estimators.method": "Method",
+    "ident.model.bodies": "Payload",
+    "ident.model.model": "DriveTrain Model",
+    "ident.model.robot": "Motion Robot robot_from_urdf",
+    "ident.prediction": "measured_torque predict_current predict_torque",
 }
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 
 if not TYPE_CHECKING:  # a type checker knows the names from above, and no others

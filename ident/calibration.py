@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ident.arrays import FloatArray
 from ident.data.run import Recording
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError
@@ -135,12 +133,14 @@ class Calibration:
 def calibration_of(
     found: Identification,
     axes: Sequence[str],
-    nameplate: Sequence[float] | NDArray[np.float64],
+    nameplate: Sequence[float] | FloatArray,
     *,
     units: Sequence[str] = (),
     robot: str = "robot",
 ) -> Calibration:
     """Calibration that an identification amounts to, without effects and without the logs that it came from.
+
+    Its sources name the payloads with their masses and no file.
 
     Args:
         found: by `ident.identify`.
@@ -178,7 +178,10 @@ def calibration_of(
         condition=estimate.condition,
         rows=estimate.rows,
         filter=found.conditioning.document(),
-        sources=(),
+        sources=tuple(
+            Source(", ".join(found.system.runs), "", "fit", payload=payload.name, mass_kg=payload.known.get("m"))
+            for payload in found.system.payloads
+        ),
         configuration_sha256="",
         created="",
         software="",

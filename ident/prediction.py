@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import Effect, PlacedEffect, check_settings
-from ident.effects.placement import at_joints
+from ident.effects.effect import PlacedEffect, at_joints, check_settings
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 
-FloatArray = NDArray[np.float64]
+SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 
 def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> FloatArray:
@@ -27,11 +26,11 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
         data: the motion, and what is mounted.
 
     Returns:
-        joint torque [Nm; N for a prismatic joint] at full rate, shape (k, n).
+        joint torque [Nm; N for a prismatic joint] at full rate, shape (n_samples, n_axes).
 
     Raises:
         ModelError: the calibration is of another robot.
-        DataUnfit: it does not know how the run's payload is mounted.
+        DataUnfit: it does not know how the run's payload is mounted, or knows the payload with another mass.
         EffectRefused: it holds an effect that does not exist.
     """
     gains = _gains(calibration, model)
@@ -53,19 +52,19 @@ def predict_current(calibration: Calibration, model: Model, data: Dataset) -> Fl
     Arguments and errors are those of `predict_torque`.
 
     Returns:
-        current references [A] at full rate, shape (k, n).
+        current references [A] at full rate, shape (n_samples, n_axes).
     """
     torque = predict_torque(calibration, model, data)
     return np.asarray(torque @ model.drive_train.to_motor.T / _gains(calibration, model))
 
 
 def measured_torque(calibration: Calibration, model: Model, current_a: FloatArray) -> FloatArray:
-    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), both of shape (k, n).
+    """Convert current references [A] to joint torque [Nm], Y = V g (eq. 4 through R), shape (n_samples, n_axes) each.
 
     Raises:
         ModelError: the calibration has another number of gains.
     """
-    return np.asarray((_gains(calibration, model) * current_a) @ model.drive_train.direction)
+    return np.asarray((_gains(calibration, model) * np.asarray(current_a)) @ model.drive_train.direction)
 
 
 def standard_parameters(calibration: Calibration, model: Model) -> FloatArray:
@@ -102,16 +101,7 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
     axes = tuple(gain.axis for gain in calibration.gains)
     if accepted.axis not in axes:
         raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
-    placed = PlacedEffect(_rebuilt(accepted, axes.index(accepted.axis), len(axes)), axes.index(accepted.axis))
-    values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
-    expected = tuple(column.name for column in placed.columns)
-    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
-        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
-        raise EffectRefused(f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}")
-    return placed, np.array([values[name] for name in expected])
-
-
-def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
+    axis = axes.index(accepted.axis)
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
@@ -119,12 +109,18 @@ def _rebuilt(accepted: AcceptedEffect, axis: int, axes: int) -> Effect:
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
-    check_settings(known, accepted.settings, axis, axes)
+    check_settings(known, accepted.settings, axis, len(axes))
     # A file knows one kind of number; an order must be whole.
     given = {name: type(known.settings[name])(value) for name, value in accepted.settings.items()}
     if given != accepted.settings:
         raise EffectRefused(f"effect {accepted.name!r} is given {accepted.settings}; these must be whole numbers")
-    return known.with_settings(given)
+    placed = PlacedEffect(known.with_settings(given), axis)
+    values = {coefficient.name: coefficient.value for coefficient in accepted.coefficients}
+    expected = tuple(column.name for column in placed.columns)
+    if set(values) != set(expected) or len(accepted.coefficients) != len(expected):
+        found = ", ".join(coefficient.name for coefficient in accepted.coefficients) or "none"
+        raise EffectRefused(f"effect {accepted.name!r} has the coefficients {found}; it needs {', '.join(expected)}")
+    return placed, np.array([values[name] for name in expected])
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
@@ -137,7 +133,7 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
 def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
     payload = data.payload
     if payload is None:
-        return payload_parameters(None, {})
+        return np.zeros(len(LINK_PARAMETERS))
     identified: dict[str, float] = {}
     mountings: set[str] = set()
     for parameter in calibration.parameters:
@@ -147,6 +143,15 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
             if mounting == payload.mounting:
                 identified[name] = parameter.value
     _check_mounting(payload, identified, mountings, data.name)
+    masses_kg = {source.mass_kg for source in calibration.sources if source.payload == payload.name}
+    mass_kg, fitted_kg = payload.known.get("m"), next(iter(masses_kg - {None}), None)
+    # What was identified beside one mass, first moments and inertia, is not that of a body of another mass.
+    if identified and mass_kg is not None and fitted_kg and not abs(mass_kg / fitted_kg - 1.0) <= SAME_MASS:
+        raise DataUnfit(
+            data.name,
+            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the fit: the calibration "
+            f"holds the rest of its inertia on mounting {payload.mounting!r}; give another body another mounting",
+        )
     return payload_parameters(payload, identified)
 
 

@@ -12,8 +12,8 @@ from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFaile
 
 if TYPE_CHECKING:
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
+    from ident.arrays import FloatArray
     from ident.calibration import Calibration
-    from ident.data.run import FloatArray
     from ident.model.model import Model
 
 
@@ -156,7 +156,7 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
 
     from daq.errors import writing
     from daq.files import replace_file
-    from ident.physical.programme import urdf_links
+    from ident.physical.physical import urdf_links
 
     def check(content: bytes) -> None:
         if not np.allclose(urdf_links(content.decode("utf-8")), robot.parameters.links, rtol=1e-9, atol=1e-12):

@@ -207,7 +207,7 @@ def plan_verb(
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.plan import plan
     from daq.workflow.plan_file import save_plan
-    from ident.planning.verdict import verdicts
+    from ident.planning.excitation import verdicts
 
     check_output(out, (cell,), "drivegain-plan")
     declared = load_cell(cell)

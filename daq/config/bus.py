@@ -148,6 +148,7 @@ def bus_parts(cell: Cell) -> tuple[drivers.BusPart, ...]:
     Raises:
         ConfigurationInconsistent: as `cell_address`.
     """
+
     if not cell.buses:
         raise _no_bus(cell, "no bus")
     return tuple(

@@ -26,12 +26,13 @@ URDF = "robot.urdf"
 DRIVES = "drives/"
 
 
-def load_cell(path: Path) -> Cell:
+def load_cell(path: Path | str) -> Cell:
     """Read a cell file and all it refers to.
 
     Raises:
         ConfigurationError: a file is missing, is not what its schema says, or the cell is inconsistent.
     """
+    path = Path(path)
     sources = _sources(path)
     names = {name: str(source) for name, source in sources.items()}
     return cell_from_bundle({name: read_bytes(source) for name, source in sources.items()}, path, names)

@@ -11,8 +11,17 @@ import numpy as np
 
 from daq.ledger.entry import Acknowledgement, Entry
 from ident.calibration import Gain
-from ident.drift.change import Change, Pattern, change_significance, dispersions, pattern
-from ident.drift.chart import Alarm, AlarmKind, Drift, cusum
+from ident.drift.change import (
+    Alarm,
+    AlarmKind,
+    Change,
+    Drift,
+    Pattern,
+    change_significance,
+    cusum,
+    dispersions,
+    pattern,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,7 +81,7 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
     )
 
 
-def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
+def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell in the log or another description of it.
 
     Warns of a partial log, of accepted losses, and of a first run below the plan's speed.
@@ -90,6 +90,7 @@ def load_run(path: Path, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.
         DataError: the log cannot be read, or its samples cannot be used.
         ConfigurationError: the cell in the log is inconsistent.
     """
+    path = Path(path)
     log = read_log(path)
     if log.partial:
         _LOG.warning(

@@ -229,12 +229,13 @@ class LogReader:
         )
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path | str) -> Log:
     """Read a whole log.
 
     Raises:
         LogUnreadable: one of its kinds, with the place in the file.
     """
+    path = Path(path)
     reader = LogReader(path)
     blocks = list(reader)
     head, statistics = reader.head, reader.statistics

@@ -16,13 +16,13 @@ from daq.report.text import percent_text, picked, plain_table
 from daq.workflow.calibration_file import as_document
 from daq.workflow.cases import CASES, CaseFit
 from daq.workflow.fit import DOUBTFUL_PERCENT, Fit, needed_verdicts
+from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
-from ident.data.run import FloatArray
 from ident.discovery.loop import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
 from ident.estimators.comparison import Comparison, Trial
 from ident.estimators.estimate import RelativeError
-from ident.planning.verdict import GOOD_PERCENT, GainVerdict
+from ident.planning.excitation import GOOD_PERCENT, GainVerdict
 
 
 def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | None) -> Iterator[RenderableType]:

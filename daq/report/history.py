@@ -25,7 +25,7 @@ from daq.report.text import inert_row, picked, plain_table, printable
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import Scalar, rewrite_gain
-from ident.drift.chart import CHART
+from ident.drift.change import CHART
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

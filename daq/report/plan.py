@@ -8,7 +8,7 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.workflow.experiment import Experiment
 from daq.workflow.plan import Plan
-from ident.planning.verdict import GainVerdict
+from ident.planning.excitation import GainVerdict
 
 
 def plan_document(

@@ -24,7 +24,7 @@ from ident.discovery.before_after import Account, BeforeAfter, Errors
 from ident.discovery.loop import MAX_EFFECTS, Step
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect, Side
-from ident.effects.timing import TimeSkew
+from ident.effects.electrical import TimeSkew
 from ident.estimators.estimate import RelativeError
 
 _SHOWN = 6  #: Findings listed for each turn; the JSON has them all

@@ -12,7 +12,7 @@ from rich.text import Text
 from daq.report.text import plain_table, printable, terminal_text
 from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
 from ident.calibration import Calibration
-from ident.physical.programme import MARGIN
+from ident.physical.physical import MARGIN
 
 _SHOWN_SHIFTS = 5
 

@@ -14,13 +14,13 @@ from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.motion.move import Trapezoid, synchronised
 from ident.data.conditioning import decimator
-from ident.model.kinematics import Motion, poses
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Motion, Robot, poses
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.excitation import (
     Design,
     Excitation,
     Expectation,
+    ExtraMoves,
     effective_noise,
     nominal_links,
     nominal_parameters,
@@ -29,7 +29,6 @@ from ident.planning.excitation import (
     side_of_cube,
     visible,
 )
-from ident.planning.verdict import ExtraMoves
 
 LINK_RADIUS = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain: 6 cm for an arm of the TX-40's size."""

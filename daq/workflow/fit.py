@@ -33,8 +33,18 @@ from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS
-from ident.planning.excitation import Design, Excitation, Expectation, ExpectedPayload, effective_noise, recorded
-from ident.planning.verdict import GOOD_PERCENT, ExtraMoves, GainVerdict, verdicts
+from ident.planning.excitation import (
+    GOOD_PERCENT,
+    Design,
+    Excitation,
+    Expectation,
+    ExpectedPayload,
+    ExtraMoves,
+    GainVerdict,
+    effective_noise,
+    recorded,
+    verdicts,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +135,9 @@ BOOTSTRAP_SEED = 0
 
 
 def fit_logs(
-    logs: Sequence[Path],
+    logs: Sequence[Path | str],
     *,
-    holdout: Sequence[Path] = (),
+    holdout: Sequence[Path | str] = (),
     cell: Cell | None = None,
     effects: bool = True,
     created: datetime | None = None,
@@ -148,7 +158,7 @@ def fit_logs(
         ConfigurationError: the description of the cell is inconsistent.
         ident.IdentificationError: the runs do not identify the gains.
     """
-    fitted = fit(logs, holdout=holdout, cell=cell)
+    fitted = fit(list(map(Path, logs)), holdout=list(map(Path, holdout)), cell=cell)
     if effects:
         fitted = close_loop(fitted, BOOTSTRAP_SEED, progress)
     return calibration_of(fitted, created or datetime.now(UTC))

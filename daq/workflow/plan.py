@@ -13,15 +13,13 @@ from enum import Enum
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell, JointUnit
 from daq.errors import UsageError
 from daq.workflow.choices import EXCHANGES, LARGEST_CONDITION, LARGEST_STD_PERCENT
 from daq.workflow.experiment import POSITION_MARGIN, Experiment, PlannedMove, duration_of, experiment_of, path_of
 from drivers.motion.move import Trapezoid
-
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,14 @@ from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.model.bodies import Body
 from ident.model.model import Model
-from ident.physical.physical import PhysicalParameters, physical_parameters
-from ident.physical.programme import InertiaPrior, inertia_prior
-from ident.physical.regrouping import random_motion, regroup
+from ident.physical.physical import (
+    InertiaPrior,
+    PhysicalParameters,
+    inertia_prior,
+    physical_parameters,
+    random_motion,
+    regroup,
+)
 from ident.prediction import placed_effect
 
 FloatArray = NDArray[np.float64]
@@ -74,7 +79,7 @@ def physical_robot(calibration: Calibration, model: Model, limits: FloatArray, u
     Args:
         calibration: its gains, payloads and effects take no part; an axis with an accepted effect of friction may have
             any sign of fv and fs, because they are only a part of its friction.
-        limits: ranges in which the torques are compared, as of `ident.physical.regrouping.random_motion`, shape (4, n).
+        limits: ranges in which the torques are compared, as of `ident.physical.physical.random_motion`, shape (4, n).
 
     Raises:
         ModelError: the calibration is of another robot.

@@ -7,13 +7,12 @@ scipy.signal for them would take longer than fitting a minute of data. The tests
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +35,7 @@ class Conditioning:
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""
-        return {
-            "position_cutoff_hz": self.position_cutoff_hz,
-            "position_order": self.position_order,
-            "decimation_cutoff_hz": self.decimation_cutoff_hz,
-            "standstill_rad_s": list(self.standstill_rad_s),
-            "standstill_share": self.standstill_share,
-        }
+        return asdict(self) | {"standstill_rad_s": list(self.standstill_rad_s)}
 
 
 def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
@@ -126,7 +119,7 @@ class Decimator:
         inside = samples - 2 * self.half
         return 0 if inside < 1 else (inside - 1) // self.factor + 1
 
-    def centres(self, samples: int) -> NDArray[np.int64]:
+    def centres(self, samples: int) -> IntArray:
         """Index of the sample at the centre of each output's window."""
         return self.half + self.factor * np.arange(self.rows(samples))
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
 from ident.model.bodies import Payload
-from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ident.model.robot import Motion
 
 STANDSTILL_SHARE_OF_SPEED = 0.01
 """Standstill speed as a share of the speed that a joint exceeds in a twentieth of a run."""
@@ -54,7 +51,7 @@ class Dataset:
     moving: BoolArray
     motor_moving: BoolArray
     valid: BoolArray
-    move: NDArray[np.int64]
+    move: IntArray
     payload: Payload | None
     started_s: float | None = None
 
@@ -74,6 +71,14 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     Raises:
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
     """
+    run = replace(
+        run,
+        time_s=np.asarray(run.time_s, dtype=np.float64),
+        position_rad=np.asarray(run.position_rad, dtype=np.float64),
+        current_a=np.asarray(run.current_a, dtype=np.float64),
+        move=None if run.move is None else np.asarray(run.move, dtype=np.int64),
+        valid=None if run.valid is None else np.asarray(run.valid, dtype=np.bool_),
+    )
     _check(run, drive_train, conditioning)
     rate = run.rate_hz
     raw = np.ascontiguousarray(run.position_rad.T, dtype=np.float64)
@@ -89,8 +94,12 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
     # One move holds all joints: without a log of moves, they part where every joint is at standstill.
-    move = _moves(np.asarray(np.any(moving, axis=0))) if run.move is None else run.move[1:-1]
-    move = _parted(np.asarray(move, dtype=np.int64), round(LONGEST_MOVE_S * rate))
+    whole = np.any(moving, axis=0)
+    move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if run.move is None else run.move[1:-1]
+    # Long moves are cut: standard errors and folds rest on many, and continuous motion would be a single one.
+    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
+    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
+    move = np.cumsum(since % round(LONGEST_MOVE_S * rate) == 0, dtype=np.int64) - 1
     return Dataset(
         name=run.name,
         rate_hz=rate,
@@ -139,19 +148,36 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     """Make a dataset of a motion that was not recorded, for `ident.prediction`.
 
     Args:
-        motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each.
+        motion: q, q̇ and q̈ of n joints over k samples, shape (k, n) each; lists will do.
         rate_hz: sampling rate.
         payload: what is mounted, None without load.
+
+    Raises:
+        DataUnfit: the shapes differ, or a number is not finite.
     """
-    shape = motion.position_rad.shape
+    states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+    position, velocity, acceleration = (np.asarray(state, dtype=np.float64) for state in states)
+    shape = position.shape
+    if position.ndim != 2 or not shape == velocity.shape == acceleration.shape:
+        raise DataUnfit(
+            "planned motion",
+            f"position, velocity and acceleration have the shapes {shape}, {velocity.shape} and {acceleration.shape}; "
+            "expected (n_samples, n_axes) each",
+        )
+    bad = np.argwhere(~np.isfinite(position + velocity + acceleration))
+    if len(bad):
+        raise DataUnfit(
+            "planned motion",
+            f"{len(bad)} values are not finite, the first in sample {bad[0][0]}, axis {bad[0][1] + 1}; give numbers",
+        )
     everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
         name="planned motion",
         rate_hz=rate_hz,
         time_s=np.arange(shape[0]) / rate_hz,
-        position_rad=motion.position_rad,
-        velocity_rad_s=motion.velocity_rad_s,
-        acceleration_rad_s2=motion.acceleration_rad_s2,
+        position_rad=position,
+        velocity_rad_s=velocity,
+        acceleration_rad_s2=acceleration,
         current_a=np.zeros(shape),
         moving=everywhere,
         motor_moving=everywhere,
@@ -159,18 +185,6 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
         move=np.zeros(shape[0], dtype=np.int64),
         payload=payload,
     )
-
-
-def _moves(moving: BoolArray) -> NDArray[np.int64]:
-    starts = np.concatenate(([False], moving[1:] & ~moving[:-1]))
-    return np.cumsum(starts, dtype=np.int64)
-
-
-def _parted(move: NDArray[np.int64], longest: int) -> NDArray[np.int64]:
-    """Cut long moves: standard errors and folds rest on many moves, and continuous motion would be a single one."""
-    starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
-    since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
-    return np.cumsum((since % longest) == 0, dtype=np.int64) - 1
 
 
 def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> None:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.model.bodies import Payload
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +47,9 @@ class Run:
     position_rad: FloatArray
     current_a: FloatArray
     payload: Payload | None = None
-    move: NDArray[np.int64] | None = None
+    move: IntArray | None = None
     digest: str = ""
-    valid: NDArray[np.bool_] | None = None
+    valid: BoolArray | None = None
     started_s: float | None = None
     partial: bool = False
     recording: Recording | None = None

@@ -1,7 +1,15 @@
 """Change by accepted effects: the error of every motor in four ways, and every gain, before and after.
 
-All errors are those of `ident.discovery.current_error`, with one set of weights. They differ in the data that the model
-has seen:
+One error serves every model and every data set: the part of each motor's current that a model does not explain. For
+motor i, over the rows that count for it (Observation.motor_use), with γ_i = 1/g_i and T from the drive train,
+
+    e_i = v_i − γ_i (T τ)_i,        ε_i = ‖e_i‖/‖v_i‖,        ε = √(Σ_i w_i²‖e_i‖² / Σ_i w_i²‖v_i‖²).
+
+The current is measured: ‖v_i‖ is the same for every model of the same rows, while Y = V g (paper Table 6) scales with
+the gains that a model finds. The weights w convert currents of different motors to torques at the joint, so that a
+robot without coupled axes has the ε of Table 6. They are one set of gains for all models that are compared; whitened by
+σ_i instead, ε would have a scale that an accepted effect moves. A robot with prismatic and revolute axes adds Nm to N
+in ε, as Table 6 would; its ε_i are not affected. The four ways differ in the data that the model has seen:
 
 - in-sample: all data; it cannot rise when an effect joins, so it proves nothing;
 - cross-validated: all moves but those predicted (`ident.equations.linearisation.cut`, one Gauss-Newton step around
@@ -20,21 +28,121 @@ is the jackknife of the change itself: leaving out move c shifts g by d_c = −(
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
-from ident.discovery.current_error import CurrentError, LeftOutRuns, error_left_out, error_on, left_out_runs
-from ident.discovery.loop import Evidence, Step
+from ident.arrays import FloatArray, IntArray
+from ident.discovery.loop import Evidence, Step, with_effects
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
 from ident.equations.linearisation import Folds, cut, left_out_shifts, linearise
-from ident.equations.observation import Observation
-from ident.estimators.estimate import Estimate, RelativeError
+from ident.equations.rows import Observation
+from ident.errors import IdentificationError
+from ident.estimators.estimate import Estimate, RelativeError, of_squares
+from ident.estimators.maximum_likelihood import ml
 
-FloatArray = NDArray[np.float64]
+
+@dataclass(frozen=True, slots=True)
+class CurrentError:
+    """Sums over rows, so that errors of parts of the data can be added."""
+
+    size: FloatArray  #: ‖v_i‖² of each motor [A²], shape (n,)
+    left: FloatArray  #: ‖e_i‖² [A²], same shape
+
+    def __add__(self, other: CurrentError) -> CurrentError:
+        """Error on the rows of both."""
+        return CurrentError(self.size + other.size, self.left + other.left)
+
+    def relative(self, weights_nm_a: FloatArray) -> RelativeError:
+        """ε_i and ε [%] with weights w, shape (n,); NaN for a motor without a row."""
+        return of_squares(self.size * weights_nm_a**2, self.left * weights_nm_a**2)
+
+
+def error_on(observation: Observation, estimate: Estimate) -> CurrentError:
+    """Error of an estimate on rows, those of its fit or others with the same columns."""
+    use, measured = observation.motor_use, observation.current
+    predicted = observation.drive_train.to_motor @ estimate.predicted_torque(observation)
+    residual = measured - predicted / estimate.gains[:, None]
+    return CurrentError(np.sum(measured**2, axis=1, where=use), np.sum(residual**2, axis=1, where=use))
+
+
+def error_left_out(folds: Folds) -> CurrentError:
+    """Error on each fold's rows, predicted by a fit that has not seen their moves."""
+    problem = folds.problem
+    size, left = np.zeros(len(problem.noise)), np.zeros(len(problem.noise))
+    np.add.at(size, problem.motor, (problem.current * problem.noise[problem.motor]) ** 2)
+    np.add.at(left, problem.motor, (folds.residual * problem.noise[problem.motor]) ** 2)
+    return CurrentError(size, left)
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutRun:
+    """One run of the fit, predicted by the others; `error` is None where they cannot be fitted, with the reason."""
+
+    run: str
+    error: RelativeError | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOutRuns:
+    """Errors on each run of the fit, left out in turn."""
+
+    runs: tuple[LeftOutRun, ...]  #: in the order of the fit
+    together: RelativeError | None  #: over the rows of all runs that could be predicted; None without any
+
+
+def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
+    """Refit everything without each run of the fit in turn, and predict that run.
+
+    The only run with the known payload, or the only one without, cannot be left out: it is listed with the reason.
+    """
+    runs: list[LeftOutRun] = []
+    errors: list[CurrentError] = []
+    for index, data in enumerate(evidence.trained):
+        try:
+            errors.append(_error_without(evidence, index))
+        except IdentificationError as error:
+            runs.append(LeftOutRun(data.name, None, str(error)))
+        else:
+            runs.append(LeftOutRun(data.name, errors[-1].relative(weights_nm_a)))
+    return LeftOutRuns(tuple(runs), reduce(add, errors).relative(weights_nm_a) if errors else None)
+
+
+def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
+    """Error on one run of the fit, with the model refitted without it."""
+    order = [index for index in range(len(evidence.trained)) if index != left_out] + [left_out]
+    whole = _in_order(evidence.bare, order)
+    last = whole.run == len(order) - 1
+    training, held = whole.only(~last), whole.only(last)
+    fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
+    bare = replace(
+        evidence,
+        datasets=tuple(evidence.datasets[index] for index in order),
+        held_out=1,
+        bare=whole,
+        training=training,
+        holdout=held,
+        effects=(),
+        estimate=ml(training.system(), fixed),
+    )
+    if not evidence.effects:
+        return error_on(held, bare.estimate)
+    refitted = with_effects(bare, evidence.effects)
+    return error_on(refitted.holdout or held, refitted.estimate)
+
+
+def _in_order(bare: Observation, order: Sequence[int]) -> Observation:
+    """Sort rows by run, in this order."""
+    rows: IntArray = np.concatenate([np.flatnonzero(bare.run == run) for run in order])
+    number = np.zeros(len(bare.runs), dtype=np.int64)
+    number[list(order)] = np.arange(len(order))
+    return replace(bare.only(rows), run=number[bare.run[rows]], runs=tuple(bare.runs[run] for run in order))
+
 
 FALSE_ALARM = 0.05  #: Probability that noise alone makes any gain's change significant, over all axes (Bonferroni)
 
@@ -163,7 +271,10 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
             gains_fixed=estimate.gains_fixed,
         )
     )
-    held = evidence.holdout
+    held, count = evidence.holdout, len(estimate.gains)
+    shifts = np.zeros((folds.problem.moves, count))
+    if not estimate.gains_fixed:
+        shifts = (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]
     return Assessment(
         effects=evidence.effects,
         errors=Errors(
@@ -174,7 +285,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         ),
         gains=estimate.gains,
         gains_std=estimate.gains_std,
-        shifts=_gain_shifts(folds, estimate),
+        shifts=shifts,
     )
 
 
@@ -183,7 +294,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     moves, count = before.shifts.shape
     shifts = after.shifts - before.shifts
     change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
-    limit = float(-special.ndtri(FALSE_ALARM / (2 * count)))
+    limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),
         removed=tuple(placed for placed in before.effects if placed not in after.effects),
@@ -208,11 +319,3 @@ def floor_on(observation: Observation, floors: Sequence[NoiseFloor | None]) -> C
     use = observation.motor_use
     noise_a = np.array([np.nan if floor is None else floor.noise_a for floor in floors])
     return CurrentError(np.sum(observation.current**2, axis=1, where=use), use.sum(axis=1) * noise_a**2)
-
-
-def _gain_shifts(folds: Folds, estimate: Estimate) -> FloatArray:
-    """Shift d_c of the gains when each move is left out, shape (m, n)."""
-    count = len(estimate.gains)
-    if estimate.gains_fixed:
-        return np.zeros((folds.problem.moves, count))
-    return (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]

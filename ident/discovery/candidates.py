@@ -11,22 +11,18 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from ident.arrays import FloatArray, IntArray
 from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
-from ident.effects.effect import Effect
-from ident.effects.placement import at_joints, effect_torque, is_placeable
+from ident.effects.effect import Effect, at_joints, effect_torque, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
 from ident.equations.linearisation import Folds, cut, linearise
-from ident.equations.observation import Observation
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 ColumnCache = dict[tuple[Effect, int], FloatArray]
 
 MOVES_WANTED = 60
@@ -154,12 +150,18 @@ def prepare_search(
         gains_fixed=estimate.gains_fixed,
     )
     floors = noise_floors(datasets, observation.conditioning)
+    rows: list[Signals] = []
+    for run, data in zip(runs, datasets, strict=True):
+        at_rate = {array.name: getattr(run, array.name) for array in fields(run) if array.name != "rate_hz"}
+        arrays = {name: decimate_rows(data, observation.conditioning, array) for name, array in at_rate.items()}
+        time_s = arrays["time_s"]
+        rows.append(Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays))
     return SearchProblem(
         model=model,
         datasets=datasets,
         observation=observation,
         runs=runs,
-        rows=tuple(_at_rows(run, data, observation) for run, data in zip(runs, datasets, strict=True)),
+        rows=tuple(rows),
         folds=cut(problem, whole=whole),
         floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
         cache={} if cache is None else cache,
@@ -184,15 +186,6 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     used = np.flatnonzero(observation.motor_use.any(axis=0))
     _, at = np.unique(pieces[used], return_index=True)
     return pieces, move[used[at]]
-
-
-def _at_rows(run: Signals, data: Dataset, observation: Observation) -> Signals:
-    def rows(column: FloatArray) -> FloatArray:
-        return decimate_rows(data, observation.conditioning, column)
-
-    arrays = {array.name: rows(getattr(run, array.name)) for array in fields(run) if array.name != "rate_hz"}
-    time_s = arrays["time_s"]
-    return Signals(rate_hz=float((len(time_s) - 1) / (time_s[-1] - time_s[0])), **arrays)
 
 
 def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[slice]) -> tuple[Trial | None, ...]:
@@ -228,7 +221,9 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
             made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w, folds.move_hessian
         )
         gram = move_gram.sum(axis=0)
-        if np.any(np.diag(gram) <= REDUNDANT_SHARE * squares[chosen]) or np.linalg.cond(_normalised(gram)) > 1e10:
+        root = np.sqrt(np.maximum(np.diag(gram), 0.0))
+        left = np.all(np.diag(gram) > REDUNDANT_SHARE * squares[chosen])
+        if not left or np.linalg.cond(gram / np.outer(root, root)) > 1e10:
             trials.append(None)
             continue
         score = move_score[:, chosen].sum(axis=0)
@@ -314,7 +309,7 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
         np.zeros((count, n, q)),
     )
     felt = [bool(np.any(columns[problem.motor == motor])) for motor in range(n)]
-    for rows, k, m, i in zip(folds.blocks, folds.fold, folds.move, folds.motor, strict=True):
+    for rows, k, m, i in folds.blocks:
         if not felt[i]:
             continue
         inside = columns[rows]
@@ -327,8 +322,3 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
         made.part_score[k, i] += score
         made.part_held[k, i] += folds.residual[rows] @ inside
     return made
-
-
-def _normalised(gram: FloatArray) -> FloatArray:
-    root = np.sqrt(np.diag(gram))
-    return np.asarray(gram / np.outer(root, root))

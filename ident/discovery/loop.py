@@ -9,34 +9,34 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, prepare_search
 from ident.discovery.search import (
+    MIN_MOVES,
     Finding,
     Gates,
     Place,
     choose_effect,
+    detection_limits_nm,
+    find_structure,
+    is_inadequate,
     place_of,
     rank_effects,
     rank_families,
     refine_setting,
 )
-from ident.discovery.structure import MIN_MOVES, detection_limits_nm, find_structure, is_inadequate
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.placement import effect_torque, joints_of
+from ident.effects.effect import Effect, PlacedEffect, effect_torque, joints_of
 from ident.effects.signals import fitted_signals, session_began_s
-from ident.equations.observation import Observation, observe
+from ident.equations.rows import Observation, observe
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.identify import Identification, estimate_with
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
 
 UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
 MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared model is wrong

@@ -19,19 +19,16 @@ in most of its dwells. Dwells with one constant number (power stage off, brake o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning, Decimator
 from ident.data.dataset import Dataset
 from ident.equations.rows import row_filter
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MIN_DWELLS = 8
 MIN_FREEDOM = 20.0  #: σ is then known to 20 %
@@ -63,19 +60,21 @@ def noise_floors(datasets: Sequence[Dataset], conditioning: Conditioning) -> tup
 
 
 def _floor(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int) -> NoiseFloor | None:
-    dwells = [
-        _variance(row_filter(data, conditioning), data.current_a[part, motor])
-        for data in datasets
-        for part in _standstills(~data.motor_moving[:, motor] & data.valid[:, motor])
-        if row_filter(data, conditioning).rows(part.stop - part.start) > _TREND
-        and np.ptp(data.current_a[part, motor]) > 0.0
-    ]
+    dwells: list[tuple[float, float]] = []
+    for data in datasets:
+        filter_ = row_filter(data, conditioning)
+        still = ~data.motor_moving[:, motor] & data.valid[:, motor]
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            current = data.current_a[start:stop, motor]
+            if filter_.rows(len(current)) > _TREND and np.ptp(current) > 0.0:
+                dwells.append(_variance(filter_, current))
     if len(dwells) < MIN_DWELLS:
         return None
     variance, freedom = np.array(dwells).T
     if freedom.sum() < MIN_FREEDOM:
         return None
-    likely = variance * freedom / special.chdtri(freedom, 0.5)
+    likely = variance * freedom / scipy.special.chdtri(freedom, 0.5)
     order = np.argsort(likely)
     share = np.cumsum(freedom[order]) / freedom.sum()
     middle = likely[order][int(np.searchsorted(share, 0.5))]
@@ -90,12 +89,6 @@ def _variance(filter_: Decimator, current: FloatArray) -> tuple[float, float]:
     spread = rest @ _correlation(filter_, len(seen)) @ rest
     expected = float(np.trace(spread))
     return float(np.sum((rest @ seen) ** 2)) / expected, expected**2 / float(np.sum(spread**2))
-
-
-def _standstills(still: BoolArray) -> Iterator[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        yield slice(int(start), int(stop))
 
 
 def _correlation(filter_: Decimator, rows: int) -> FloatArray:

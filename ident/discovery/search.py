@@ -11,6 +11,10 @@ The lag-one correlation of a residual is about 0.67, so textbook tests are wrong
 
 Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is chosen anew inside
 each fold, by the other folds alone: the score of a family has not seen what it is scored on.
+
+Structure that no named effect explains is found in the same way, with smooth functions of one variable and periodic
+ones of the motor's angle (`find_structure`). Where nothing is found, `detection_limits_nm` gives the size of an effect
+that would have been.
 """
 
 from __future__ import annotations
@@ -19,14 +23,15 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
+import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
+from ident.arrays import FloatArray
 from ident.discovery.candidates import FamilyTrials, SearchProblem, Trial
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.signals import Abscissa
+from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
-FloatArray = NDArray[np.float64]
 Place = tuple[str, int, tuple[int, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
@@ -135,7 +140,7 @@ def is_better(one: Finding, other: Finding) -> bool:
     """Whether one finding explains more than another by a paired comparison over folds."""
     gain = other.fold_errors - one.fold_errors
     error = float(np.std(gain, ddof=1)) * float(np.sqrt(len(gain)))
-    return float(gain.sum()) > float(special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
+    return float(gain.sum()) > float(scipy.special.stdtrit(len(gain) - 1, 0.5 + CLEARLY / 2.0)) * error
 
 
 def refine_setting(
@@ -153,7 +158,10 @@ def refine_setting(
         grid = sorted(member.settings[name] for member in family if member.with_settings({name: value}) == effect)
         place = grid.index(value) if value in grid else 0
         if 0 < place < len(grid) - 1 and grid[0] > 0:
-            lower, upper = _one_side(name, value, grid[place - 1], grid[place + 1])
+            lower, upper = grid[place - 1], grid[place + 1]
+            if name in DECLARED:
+                below, above = DECLARED[name]
+                lower, upper = (lower, min(upper, below)) if value < below else (max(lower, above), upper)
             return _golden_section(search_problem, effect, axis, name, lower, upper)
     return effect
 
@@ -186,11 +194,15 @@ def _judge(
         and explained >= gates.explained
         and error_fall >= gates.error_fall
     )
+    # σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986).
+    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
+    floor_a = search_problem.floors_a[motor]
+    excess = 0.0 if floor_a is None else own - float(np.sum(rows)) * (floor_a / problem.noise[motor]) ** 2
     return Finding(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
-        deviations=_deviations(trial),
+        deviations=np.sqrt(np.sum(spread**2, axis=0)),
         probability=float(probability[best]),
         folds_better=folds_better,
         explained=explained,
@@ -199,23 +211,9 @@ def _judge(
         error_fall=error_fall,
         held_out_fall=float(fall.sum()),
         passed=bool(passed),
-        share_of_excess=_share_of_excess(search_problem, motor, float(trial.fallen[motor]), own),
+        share_of_excess=min(float(trial.fallen[motor]) / excess, 1.0) if excess > 0.0 else None,
         fold_errors=after.sum(axis=1),
     )
-
-
-def _deviations(trial: Trial) -> FloatArray:
-    """σ of the coefficients, G⁻¹XᵀXG⁻¹ over moves (Liang & Zeger, 1986)."""
-    spread = trial.scatter @ np.linalg.pinv(trial.gram.sum(axis=0))
-    return np.asarray(np.sqrt(np.sum(spread**2, axis=0)))
-
-
-def _share_of_excess(search_problem: SearchProblem, motor: int, fallen: float, own: float) -> float | None:
-    floor_a, problem = search_problem.floors_a[motor], search_problem.folds.problem
-    if floor_a is None:
-        return None
-    excess = own - float(np.sum(problem.motor == motor)) * (floor_a / problem.noise[motor]) ** 2
-    return None if excess <= 0.0 else min(fallen / excess, 1.0)
 
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
@@ -235,7 +233,7 @@ def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> F
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
     """−log p of χ² statistics, finite however large they are."""
-    return np.asarray(-np.log(np.maximum(special.chdtrc(freedom, wald), np.finfo(np.float64).tiny)))
+    return np.asarray(-np.log(np.maximum(scipy.special.chdtrc(freedom, wald), np.finfo(np.float64).tiny)))
 
 
 def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
@@ -270,14 +268,6 @@ def _ambiguity_set(finding: Finding, ranked: Sequence[Finding]) -> tuple[PlacedE
     )
 
 
-def _one_side(name: str, value: float, lower: float, upper: float) -> tuple[float, float]:
-    """Part of a bracket on the value's side of DECLARED."""
-    if name not in DECLARED:
-        return lower, upper
-    below, above = DECLARED[name]
-    return (lower, min(upper, below)) if value < below else (max(lower, above), upper)
-
-
 def _golden_section(
     search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float
 ) -> Effect:
@@ -302,3 +292,86 @@ def _golden_section(
     best = float(f"{np.exp((a + b) / 2.0):.4g}")
     better = fall(np.log(best)) > fall(np.log(effect.settings[name]))
     return effect.with_settings({name: best}) if better else effect
+
+
+VARIABLES = (
+    (Abscissa.VELOCITY, (0, 1)),
+    (Abscissa.POSITION, (0, 1)),
+    (Abscissa.LOAD, (0, 1)),
+    (Abscissa.TIME, (0, 1)),
+    (Abscissa.SESSION, (0, 1)),
+    (Abscissa.DISTANCE, (1,)),
+    (Abscissa.CURRENT, (0,)),
+    (Abscissa.TORQUE_RATE, (0,)),
+    (Abscissa.LOAD_CURVATURE, (0,)),
+)
+"""Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
+MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
+MIN_MOVES = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
+TAIL = 0.005
+"""Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
+
+
+def find_structure(
+    search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
+) -> tuple[Finding, ...]:
+    """Find variables that the residual of some axes depends on, the best on held-out moves first."""
+    if search_problem.folds.moves < MIN_MOVES:
+        return ()  # a term of many coefficients would fit the few moves
+    tested = [
+        found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)
+    ]
+    return rank_families(search_problem, tested, rng, gates)
+
+
+def is_inadequate(named: Finding, structure: Finding) -> bool:
+    """Whether a term that fits anything explains clearly and much more than a named effect.
+
+    Then the true effect is only similar to the named one, and the residual counts as unexplained.
+    """
+    more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
+    return structure.passed and more and is_better(structure, named)
+
+
+def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:
+    """Compute the torque of a detectable effect at each motor, root mean square over the moving rows, shape (n,).
+
+    It is torque that the declared model cannot mimic: most of an effect that resembles gravity or viscous friction is
+    absorbed by those. The limit holds for effects whose shape the dictionary or a spline can follow; on a short
+    recording noise raises it.
+    """
+    problem = search_problem.folds.problem
+    noise_a = np.array(
+        [
+            problem.noise[i] * float(np.sqrt(np.mean(problem.residual[problem.motor == i] ** 2)))
+            for i in range(search_problem.axes)
+        ]
+    )
+    return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))
+
+
+def _families(search_problem: SearchProblem, axis: int) -> tuple[tuple[Effect, ...], ...]:
+    """One family a variable, with the range that it has in these runs."""
+    families: list[tuple[Effect, ...]] = []
+    has_session = any(not np.array_equal(run.time_s, run.session_s) for run in search_problem.rows)
+    for variable, signs in VARIABLES:
+        if variable is Abscissa.SESSION and not has_session:
+            continue
+        term = _ranged(search_problem, Smooth(variable), axis)
+        families.append(tuple(replace(term, signed=sign) for sign in signs))
+    families.append((Periodic(0), Periodic(1)))
+    for other in range(search_problem.axes):
+        if other != axis:
+            term = _ranged(search_problem, Smooth(Abscissa.OTHER_VELOCITY, other_axis=other + 1), axis)
+            families.append((replace(term, signed=1), replace(term, signed=0)))
+    return tuple(families)
+
+
+def _ranged(search_problem: SearchProblem, term: Smooth, axis: int) -> Smooth:
+    other = term.other_axis - 1 if term.other_axis else None
+    x = np.concatenate([run.variable(term.variable, axis, other) for run in search_problem.rows])
+    x = x[search_problem.observation.use[axis]]
+    if term.variable in FOLDED:
+        x = np.abs(x)
+    lower, upper = np.quantile(x, (0.0 if term.variable in FOLDED else TAIL, 1.0 - TAIL))
+    return replace(term, lower=float(lower), upper=float(max(upper, lower + 1e-9)))

@@ -4,6 +4,27 @@ Recordings of different days are independent, so σ of a difference is the root 
 fit covers one session: repeated sessions scatter more (friction warms up, magnets too). Every function here therefore
 takes a *dispersion*, the ratio of the scatter of repeated calibrations to their σ; `dispersions` estimates it from a
 history.
+
+Control chart of one gain over many calibrations: CUSUM, single points, and the line through all of them.
+
+With zᵢ the deviation of calibration i from the baseline over its σ (Page 1954; Montgomery, Introduction to Statistical
+Quality Control, ch. 9)::
+
+    C⁺ᵢ = max(0, C⁺ᵢ₋₁ + zᵢ − k),   C⁻ᵢ = max(0, C⁻ᵢ₋₁ − zᵢ − k),   alarm where either exceeds h
+
+The baseline is the weighted mean of the first calibrations, up to `Chart.baseline` of them; while there are fewer, of
+all that came before (Hawkins 1987), so that the zᵢ are independent and the chart watches from the second one on. The
+baseline's own uncertainty is part of the σ of zᵢ.
+
+A drift during the first calibrations becomes part of the baseline. The slope of the straight line through all
+calibrations needs no baseline: with gᵢ the gain of calibration i = 1 … n and wᵢ = 1/σᵢ² (weighted least squares; Draper
+& Smith, Applied Regression Analysis, ch. 9)::
+
+    t = Σ wᵢ (i − ī) gᵢ / √(Σ wᵢ (i − ī)²),    ī = Σ wᵢ i / Σ wᵢ
+
+is standard normal without drift for every n. Of all tests that do not know the level, |t| is the most powerful against
+a drift from the first calibration to the last. It is worse than the CUSUM at a late change, because all the
+calibrations before it pull at the line too; so neither replaces the other.
 """
 
 from __future__ import annotations
@@ -13,9 +34,9 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
 
 DISPERSION = 1.05  #: Default without a history: repeated fits of simulated cells scatter 5 % more than their σ
 FALSE_ALARM = 0.01  #: Share of recalibrations without any change in which `decide` finds one
@@ -120,9 +141,23 @@ def decide(
     changes = tuple(
         change_significance(*map(float, four), dispersion=float(factor)) for *four, factor in zip(*columns, strict=True)
     )
-    adjusted = _holm(np.array([change.probability for change in changes]))
+    # Holm: the smallest probability counts times their number, the next times one less, never falling.
+    probabilities = np.array([change.probability for change in changes])
+    order = np.argsort(probabilities)
+    adjusted = np.empty(n)
+    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(n, 0, -1)))
     differs = bool(adjusted.min(initial=1.0) <= false_alarm)
-    words = _words(axes, changes, adjusted, false_alarm)
+    words = "no gain to compare"
+    if axes:
+        parts = [
+            f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {n})"
+            for axis, change, p in zip(axes, changes, adjusted, strict=True)
+        ]
+        largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
+        words = f"no gain has changed by more than noise: the largest change is {largest}"
+        if differs:
+            changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= false_alarm]
+            words = f"changed by more than noise: {', '.join(changed)}"
     return ChangeDecision(differs, axes, changes, tuple(map(float, adjusted)), words)
 
 
@@ -193,29 +228,242 @@ def _ratio(part: float, whole: float) -> float:
     return math.copysign(math.inf, part) if part else 0.0
 
 
-def _holm(probabilities: FloatArray) -> FloatArray:
-    """Adjust for several tests: the smallest times their number, the next times one less, never falling."""
-    order = np.argsort(probabilities)
-    count = len(probabilities)
-    adjusted = np.empty(count)
-    adjusted[order] = np.maximum.accumulate(np.minimum(1.0, probabilities[order] * np.arange(count, 0, -1)))
-    return adjusted
-
-
-def _words(axes: tuple[str, ...], changes: tuple[Change, ...], adjusted: FloatArray, level: float) -> str:
-    if not axes:
-        return "no gain to compare"
-    parts = [
-        f"{axis} {change.percent:+.2g} % ({_short(abs(change.sigmas))} σ, p = {p:.2g} among {len(axes)})"
-        for axis, change, p in zip(axes, changes, adjusted, strict=True)
-    ]
-    changed = [text for text, p in zip(parts, adjusted, strict=True) if p <= level]
-    if changed:
-        return f"changed by more than noise: {', '.join(changed)}"
-    largest = parts[int(np.argmax([abs(change.sigmas) for change in changes]))]
-    return f"no gain has changed by more than noise: the largest change is {largest}"
-
-
 def _short(sigmas: float) -> str:
     """Format a number in a few digits, however large."""
     return f"{sigmas:.1f}" if sigmas < 1e4 else f"{sigmas:.1e}"
+
+
+FEWEST = 4  #: Calibrations of the first line that is tested; through fewer it is hardly more than one difference
+_RECENT = 3  #: Calibrations that the size of a change is averaged over: enough to reduce noise, few enough to be recent
+_FINEST = 2.0**-52  #: Smallest σ of the largest gain over itself: no number is written finer
+_APART = 1e3  #: Largest factor between a σ and the median one: beyond, a weight is all or nothing anyway
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Limits of the chart; the defaults come from `make drift-study`, docs/evidence/drift.md has its table."""
+
+    reference: float = 1.25  #: k [σ]: half the shift that is to be found soonest
+    threshold: float = 4.6  #: h [σ]: sum that raises an alarm
+    single: float = 5.2  #: deviation of one calibration that is an alarm by itself [σ]
+    trend: float = 4.3  #: slope of the line through all calibrations that is an alarm [its σ]
+    baseline: int = 12  #: number of calibrations that make it
+
+
+CHART = Chart()
+
+
+class AlarmKind(Enum):
+    """Rule that raised an alarm."""
+
+    DRIFT = "drift"  #: Small deviations to one side have added up (CUSUM)
+    JUMP = "jump"  #: One calibration is far off by itself (Shewhart)
+    TREND = "trend"  #: All calibrations lie about a line that rises or falls
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """One calibration with an alarm."""
+
+    index: int  #: of the calibration, from 0
+    kind: AlarmKind  #: the first rule that applies, in the order of `AlarmKind`
+    rose: bool  #: whether the gain's magnitude rose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """Change of one gain since its baseline began."""
+
+    #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to the onset while there
+    #: is an alarm; while that is a trend, the beginning of the line.
+    baseline: float
+    baseline_std: float  #: see `baseline`
+    #: Z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
+    deviations: FloatArray
+    upper: FloatArray  #: C⁺ and C⁻, shape (n,)
+    lower: FloatArray  #: C⁺ and C⁻, shape (n,)
+    #: T of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
+    trend: FloatArray
+    #: In the order of the calibrations, also those that have passed; nothing else here depends on these.
+    alarms: tuple[Alarm, ...]
+    #: Index of the last calibration before the change that `alarm` reports, the first calibration for a trend; None
+    #: where the newest calibration raises no alarm.
+    onset: int | None
+    #: Since the baseline: mean of the newest calibrations (three, or those since the onset, without alarm those behind
+    #: the baseline, if fewer); while there is a trend, along the line [% of the baseline's magnitude].
+    change_percent: float
+    change_sigmas: float  #: the same over its σ
+
+    @property
+    def alarm(self) -> Alarm | None:
+        """Alarm of the newest calibration; None where it raises none, whatever earlier ones did."""
+        return _present(self.alarms, len(self.deviations))
+
+    @property
+    def alarmed(self) -> bool:
+        """Whether the newest calibration raises an alarm."""
+        return self.alarm is not None
+
+    @property
+    def steady(self) -> bool:
+        """Whether the change is given along the line."""
+        return self.alarm is not None and self.alarm.kind is AlarmKind.TREND
+
+
+def cusum(values: ArrayLike, stds: ArrayLike, *, dispersion: float = DISPERSION, chart: Chart = CHART) -> Drift:
+    """Watch one gain.
+
+    Args:
+        values, stds: of its calibrations since the last acknowledged change, oldest first, shape (n,), n ≥ 1, in one
+            unit; σ > 0.
+        dispersion: scatter of repeated calibrations over their σ, as `ident.drift.change.dispersions` finds it.
+        chart: limits.
+
+    Raises:
+        ValueError: shapes do not fit, a number is not finite, a σ is not positive, or the baseline is zero.
+    """
+    values, stds = np.asarray(values, float), np.asarray(stds, float)
+    if values.ndim != 1 or values.shape != stds.shape or not len(values):
+        raise ValueError(f"expected as many values as σ, at least one, found shapes {values.shape} and {stds.shape}")
+    if not (np.isfinite(values).all() and np.isfinite(stds).all() and (stds > 0).all()):
+        raise ValueError("expected finite gains with σ > 0")
+    scale = float(np.abs(values).max())
+    if scale == 0:
+        raise ValueError("expected gains other than zero")
+    values, stds = values / scale, _bounded(stds, scale)
+    sign = 1.0 if values.sum() > 0 else -1.0
+    deviations, upper, lower = cusum_paths(sign * values, stds, dispersion, chart)
+    slopes = trend_statistic(sign * values, stds, dispersion)
+    found: list[Alarm] = []
+    for index, (z, above, below, slope) in enumerate(zip(deviations, upper, lower, slopes, strict=True)):
+        if max(above, below) > chart.threshold:
+            found.append(Alarm(index, AlarmKind.DRIFT, bool(above > below)))
+        elif abs(z) > chart.single:
+            found.append(Alarm(index, AlarmKind.JUMP, bool(z > 0)))
+        elif abs(slope) > chart.trend:
+            found.append(Alarm(index, AlarmKind.TREND, bool(slope > 0)))
+    alarms = tuple(found)
+    # The onset of an alarm that has passed bounds no baseline: that change is over.
+    present = _present(alarms, len(values))
+    onset = None if present is None else 0
+    if present is not None and present.kind is not AlarmKind.TREND:
+        # Where the sum that has the alarm was zero for the last time (Page's estimate of the change point).
+        onset = int(np.flatnonzero((upper if present.rose else lower)[: present.index + 1] == 0.0)[-1])
+    if present is not None and present.kind is AlarmKind.TREND:
+        line, steps = fit_line(values, stds), len(values) - 1
+        baseline, baseline_std = line.start, line.start_std
+        change, change_std = steps * line.slope, steps * line.slope_std
+    else:
+        # The baseline ends at the onset, and the newest calibrations begin behind both.
+        first = max(1, min(len(values) - 1 if onset is None else onset + 1, chart.baseline))
+        since = first if onset is None else max(first, onset + 1)
+        newest = max(1, min(_RECENT, len(values) - since))
+        baseline, baseline_std = _mean(values[:first], stds[:first])
+        recent, recent_std = _mean(values[-newest:], stds[-newest:])
+        change = recent - baseline if len(values) > 1 else 0.0
+        change_std = math.hypot(recent_std, baseline_std)
+    if baseline == 0:
+        raise ValueError("expected gains other than zero")
+    return Drift(
+        baseline=scale * baseline,
+        baseline_std=dispersion * scale * baseline_std,
+        deviations=deviations,
+        upper=upper,
+        lower=lower,
+        trend=slopes,
+        alarms=alarms,
+        onset=onset,
+        change_percent=100.0 * sign * change / abs(baseline),
+        change_sigmas=sign * change / (dispersion * change_std),
+    )
+
+
+def cusum_paths(
+    values: FloatArray, stds: FloatArray, dispersion: FloatArray | float, chart: Chart
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Compute the chart's z, C⁺ and C⁻, shape (..., n) each, for any number of gains at once.
+
+    Args:
+        values, stds: magnitudes, shape (..., n), oldest first.
+        dispersion: shape (...) or a number.
+        chart: limits.
+    """
+    weights = np.cumsum(1.0 / stds**2, axis=-1)
+    means = np.cumsum(values / stds**2, axis=-1) / weights
+    shape, n = values.shape, values.shape[-1]
+    deviations, upper, lower = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for i in range(1, n):
+        last = min(i, chart.baseline) - 1
+        std = dispersion * np.sqrt(stds[..., i] ** 2 + 1.0 / weights[..., last])
+        deviations[..., i] = z = (values[..., i] - means[..., last]) / std
+        upper[..., i] = np.maximum(0.0, upper[..., i - 1] + z - chart.reference)
+        lower[..., i] = np.maximum(0.0, lower[..., i - 1] - z - chart.reference)
+    return deviations, upper, lower
+
+
+def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray | float) -> FloatArray:
+    """Compute t of the line through the first n calibrations, for every n and any number of gains at once.
+
+    Args:
+        values, stds: magnitudes, shape (..., n), oldest first, σ > 0.
+        dispersion: scatter of repeated calibrations over their σ, shape (...) or a number.
+
+    Returns:
+        shape (..., n), positive where the magnitude rises; 0 for the first FEWEST − 1.
+    """
+    found = np.zeros(values.shape)
+    total, middle, mean, spread, product = (np.zeros(values.shape[:-1]) for _ in range(5))
+    # About running means (West 1979): differences of large sums lose their digits where one σ is far below the others.
+    for i in range(values.shape[-1]):
+        weight = 1.0 / stds[..., i] ** 2
+        total = total + weight
+        away = i - middle
+        middle = middle + weight / total * away
+        mean = mean + weight / total * (values[..., i] - mean)
+        spread = spread + weight * away * (i - middle)
+        product = product + weight * away * (values[..., i] - mean)
+        if i + 1 >= FEWEST:
+            found[..., i] = product / np.sqrt(spread) / dispersion
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Line through all calibrations of one gain."""
+
+    start: float  #: its value at the first calibration, in the unit of the gain
+    start_std: float  #: its value at the first calibration, in the unit of the gain
+    slope: float  #: in that unit a calibration
+    slope_std: float  #: in that unit a calibration
+
+
+def fit_line(values: FloatArray, stds: FloatArray) -> Line:
+    """Fit a line by weighted least squares to values of shape (n,), n ≥ 2, oldest first, σ > 0."""
+    weights = 1.0 / stds**2
+    total = float(weights.sum())
+    places = np.arange(len(values))
+    middle, mean = float(weights @ places) / total, float(weights @ values) / total
+    spread = float(weights @ (places - middle) ** 2)
+    slope = float(weights @ ((places - middle) * (values - mean))) / spread
+    start_std = math.sqrt(1.0 / total + middle**2 / spread)
+    return Line(mean - slope * middle, start_std, slope, 1.0 / math.sqrt(spread))
+
+
+def _bounded(stds: FloatArray, scale: float) -> FloatArray:
+    """σ over the scale of the gains, such that no weight 1/σ² overflows, vanishes, or leaves nothing of the others."""
+    with np.errstate(over="ignore"):
+        relative = np.clip(stds / scale, _FINEST, 1.0 / _FINEST)
+    middle = float(np.median(relative))
+    return np.asarray(np.clip(relative, middle / _APART, middle * _APART))
+
+
+def _mean(values: FloatArray, stds: FloatArray) -> tuple[float, float]:
+    """Mean weighted by 1/σ², and its σ."""
+    weights = 1.0 / stds**2
+    total = float(weights.sum())
+    return float(weights @ values) / total, math.sqrt(1.0 / total)
+
+
+def _present(alarms: tuple[Alarm, ...], count: int) -> Alarm | None:
+    """Alarm of the newest of `count` calibrations."""
+    return alarms[-1] if alarms and alarms[-1].index == count - 1 else None

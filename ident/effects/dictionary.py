@@ -2,7 +2,7 @@
 
 To add an effect:
 
-1. Write one class in the chapter of its physics (`friction`, `position`, `transmission`, `electrical`, `timing`). It
+1. Write one class in the chapter of its physics (`friction`, `position`, `transmission`, `electrical`). It
    derives from `Effect`; its docstring states equation, sign, source and signature; the class sets `name`, `declares`,
    `abscissa` and `coefficients` (and `side`, if it does not act on its joint) and defines `columns`. Fields with a
    `Range` are its searched parameters.
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.effects import electrical, friction, position, timing, transmission
+from ident.effects import electrical, friction, position, transmission
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
@@ -35,8 +35,8 @@ EFFECTS: tuple[tuple[Effect, ...], ...] = (
     (friction.PositionFriction(),),
     tuple(electrical.Cogging(order) for order in ORDERS),
     (electrical.Saturation(),),
-    (timing.Lag(),),
-    (timing.TimeSkew(),),
+    (electrical.Lag(),),
+    (electrical.TimeSkew(),),
     tuple(
         friction.WarmUp(constant_s, whole) for constant_s in (20.0, 40.0, 80.0, 160.0, 320.0, 900.0) for whole in (0, 1)
     ),

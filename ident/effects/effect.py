@@ -8,20 +8,22 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
 from typing import Annotated, Self, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
+from ident.data.conditioning import Conditioning
+from ident.data.dataset import Dataset
 from ident.effects.signals import Abscissa, Signals
+from ident.equations.rows import decimate_rows
 from ident.errors import EffectRefused
-from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
+from ident.model.model import Column, DriveTrain, Model
+from ident.model.robot import JointKind, Robot
 
 
 class Side(Enum):
@@ -141,8 +143,16 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         if not math.isfinite(value):
             raise EffectRefused(f"effect {name!r} is given {setting} = {value}; it must be a finite number")
     for setting, allowed in _ranges(type(effect)).items():
-        if setting == "other_axis":
-            _check_other_axis(effect, settings[setting], axis, axes)
+        value = settings[setting]
+        if setting == "other_axis" and effect.abscissa is not Abscissa.OTHER_VELOCITY:
+            if value != 0:
+                raise EffectRefused(f"effect {name!r} is given other_axis = {value:g}; it has no other axis: 0")
+        elif setting == "other_axis":
+            if value not in range(1, axes + 1) or value == axis + 1:
+                raise EffectRefused(
+                    f"effect {name!r} on axis {axis + 1} is given other_axis = {value:g}; it is the number of another "
+                    f"of the {axes} axes"
+                )
         elif not allowed.least <= settings[setting] <= allowed.largest:
             raise EffectRefused(
                 f"effect {name!r} is given {setting} = {settings[setting]:g}; it lies between {allowed.least:g} and "
@@ -153,17 +163,6 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
     if "lower" in settings and not settings["lower"] < settings["upper"]:
         raise EffectRefused(
             f"effect {name!r} is given the range {settings['lower']:g} to {settings['upper']:g}; it must not be empty"
-        )
-
-
-def _check_other_axis(effect: Effect, other: float, axis: int, axes: int) -> None:
-    if effect.abscissa is not Abscissa.OTHER_VELOCITY:
-        if other != 0:
-            raise EffectRefused(f"effect {effect.name!r} is given other_axis = {other:g}; it has no other axis: 0")
-    elif other not in range(1, axes + 1) or other == axis + 1:
-        raise EffectRefused(
-            f"effect {effect.name!r} on axis {axis + 1} is given other_axis = {other:g}; it is the number of another "
-            f"of the {axes} axes"
         )
 
 
@@ -183,3 +182,52 @@ class PlacedEffect:
         return tuple(
             Column(f"{name} {column.name} {number}{suffix}", column.unit) for column in self.effect.coefficients
         )
+
+
+def effect_torque(
+    effect: Effect,
+    axis: int,
+    runs: Sequence[Signals],
+    datasets: Sequence[Dataset],
+    conditioning: Conditioning,
+    model: Model,
+) -> FloatArray:
+    """An effect's columns as joint torques on the observation's rows [Nm per unit], shape (n, p, r)."""
+    parts = [
+        decimate_rows(data, conditioning, effect.columns(run, axis)) for run, data in zip(runs, datasets, strict=True)
+    ]
+    return at_joints(effect, axis, np.concatenate(parts, axis=-1), model.drive_train)
+
+
+def at_joints(effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain) -> FloatArray:
+    """Convert an effect's columns, shape (p, k) or (joints, p, k), to torques of all joints, shape (n, p, k)."""
+    if effect.side is Side.MOTOR:
+        return np.asarray(drive_train.direction[axis][:, None, None] * columns[None])
+    if effect.side is Side.ALL_JOINTS:
+        return columns
+    if effect.side is Side.ALL_MOTORS:
+        return np.asarray(np.einsum("ij,ipk->jpk", drive_train.direction, columns))
+    joints = [axis, int(effect.settings["other_axis"]) - 1] if effect.side is Side.TWO_JOINTS else [axis]
+    torque = np.zeros((len(drive_train.ratio), *columns.shape[-2:]))
+    torque[joints] = columns
+    return torque
+
+
+def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
+    """Whether an effect can act on an axis; an effect of two joints is placed on the one with the lower number."""
+    if effect.needs_revolute and robot.joints[axis].kind is JointKind.PRISMATIC:
+        return False
+    if effect.side is Side.ALL_MOTORS:
+        return axis == 0
+    return effect.side is not Side.TWO_JOINTS or axis + 1 < int(effect.settings["other_axis"]) <= robot.joint_count
+
+
+def joints_of(effect: Effect, axis: int, drive_train: DriveTrain) -> frozenset[int]:
+    """Joints whose own torque an effect changes; elasticity and backlash act through the links, and belong to one."""
+    if effect.side in (Side.ALL_JOINTS, Side.JOINT):
+        return frozenset({axis})
+    if effect.side is Side.TWO_JOINTS:
+        return frozenset({axis, int(effect.settings["other_axis"]) - 1})
+    if effect.side is Side.MOTOR:
+        return frozenset(np.flatnonzero(drive_train.direction[axis]).tolist())
+    return frozenset(range(len(drive_train.ratio)))

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Sense, Side, Switch
 from ident.effects.signals import Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,20 +141,15 @@ class Presliding(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         direction, distance = distance_since_reversal(signals.velocity_rad_s[axis], signals.rate_hz)
-        return np.asarray(_bristle_lag(direction, distance, self.distance_rad))[None]
-
-
-def _bristle_lag(direction: FloatArray, travel_rad: FloatArray, distance_rad: float) -> FloatArray:
-    """z − direction: after a reversal it starts where the last one ended, and dies out over the distance."""
-    faded = np.exp(-travel_rad / distance_rad)
-    starts = np.flatnonzero(np.diff(direction, prepend=np.nan) != 0)
-    lag = np.empty_like(direction)
-    bristle = 0.0
-    for first, last in zip(starts, np.append(starts[1:], len(direction)), strict=True):
-        part = slice(first, last)
-        lag[part] = (bristle - direction[first]) * faded[part]
-        bristle = direction[first] + lag[last - 1]
-    return lag
+        # z − direction: after a reversal it starts where the last one ended, and dies out over the distance.
+        faded = np.exp(-distance / self.distance_rad)
+        starts = np.flatnonzero(np.diff(direction, prepend=np.nan) != 0)
+        lag = np.empty_like(direction)
+        bristle = 0.0
+        for first, last in zip(starts, np.append(starts[1:], len(direction)), strict=True):
+            lag[first:last] = (bristle - direction[first]) * faded[first:last]
+            bristle = direction[first] + lag[last - 1]
+        return lag[None]
 
 
 @dataclass(frozen=True, slots=True)

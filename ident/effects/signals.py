@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.dataset import Dataset
-from ident.equations.observation import Observation
+from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.kinematics import Motion
 from ident.model.model import Model
-
-FloatArray = NDArray[np.float64]
+from ident.model.robot import Motion
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 CHUNK_SAMPLES = 4096
@@ -96,7 +94,14 @@ def fitted_signals(
     standard = np.zeros(len(model.columns))
     independent = list(observation.base.independent)
     standard[independent] = estimate.parameters[: len(independent)]
-    standard[model.flange] += payload_parameters(data.payload, _identified(data.payload, observation, estimate))
+    identified: dict[str, float] = {}
+    first = len(observation.columns)
+    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
+        if data.payload is not None and other.mounting == data.payload.mounting:
+            values = estimate.parameters[first : first + len(indices)]
+            identified = {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
+        first += len(indices)
+    standard[model.flange] += payload_parameters(data.payload, identified)
     return declared_signals(model, data, standard, estimate.gains, session_began_s)
 
 
@@ -125,10 +130,11 @@ def declared_signals(
         total.append(torques[:, 1])
         geared.append(torques[:, 2])
     motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
+    began = None if data.started_s is None or session_began_s is None else data.started_s - session_began_s
     return Signals(
         rate_hz=data.rate_hz,
         time_s=data.time_s - data.time_s[0],
-        session_s=data.time_s - data.time_s[0] + _into_the_session_s(data, session_began_s),
+        session_s=data.time_s - data.time_s[0] + (0.0 if began is None else max(0.0, began)),
         position_rad=data.position_rad.T,
         velocity_rad_s=data.velocity_rad_s.T,
         acceleration_rad_s2=data.acceleration_rad_s2.T,
@@ -145,13 +151,6 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
     """Return the start of the earliest run, None if one of them has no clock."""
     starts_s = [data.started_s for data in datasets if data.started_s is not None]
     return min(starts_s) if starts_s and len(starts_s) == len(datasets) else None
-
-
-def _into_the_session_s(data: Dataset, session_began_s: float | None) -> float:
-    """Return the start of a run in its session, 0 without a common clock."""
-    if data.started_s is None or session_began_s is None:
-        return 0.0
-    return max(0.0, data.started_s - session_began_s)
 
 
 def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
@@ -177,16 +176,6 @@ def payload_parameters(payload: Payload | None, identified: Mapping[str, float])
     """
     values = {} if payload is None else {**payload.known, **identified}
     return np.array([values.get(name, 0.0) for name in LINK_PARAMETERS])
-
-
-def _identified(payload: Payload | None, observation: Observation, estimate: Estimate) -> dict[str, float]:
-    first = len(observation.columns)
-    for other, indices in zip(observation.payloads, observation.payload_columns, strict=True):
-        values = estimate.parameters[first : first + len(indices)]
-        if payload is not None and other.mounting == payload.mounting:
-            return {LINK_PARAMETERS[index]: float(value) for index, value in zip(indices, values, strict=True)}
-        first += len(indices)
-    return {}
 
 
 def curvature(value: FloatArray, rate_hz: float) -> FloatArray:

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side
 from ident.effects.signals import Abscissa, Signals, curvature
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

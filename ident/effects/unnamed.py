@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.effects.effect import AxisNumber, Effect, Property, Range, Side, Switch
 from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
 
 INTERVALS = 6
 """Intervals that the variable's range is divided into; cubic B-splines over them have three more coefficients."""

@@ -12,15 +12,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
-from ident.equations.observation import Observation
+from ident.arrays import FloatArray, IntArray
+from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MIN_MOVES = 8  #: With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each
 
@@ -45,18 +42,6 @@ class Linearisation:
     def moves(self) -> int:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
-
-    def ordered(self, order: IntArray) -> Linearisation:
-        """Reorder the rows."""
-        return replace(
-            self,
-            jacobian=self.jacobian[order],
-            residual=self.residual[order],
-            current=self.current[order],
-            motor=self.motor[order],
-            cluster=self.cluster[order],
-            source=self.source[order],
-        )
 
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
         """Joint torque columns, shape (n, extra, r), as columns beside the Jacobian, shape (rows, extra).
@@ -194,10 +179,7 @@ class Folds:
 
     problem: Linearisation  #: the linearisation, its rows sorted by fold, move and motor
     moves: int  #: whole moves that the folds were dealt, whatever pieces the problem's clusters are
-    blocks: tuple[slice, ...]  #: rows of each block
-    fold: IntArray  #: of each block, shape (blocks,)
-    move: IntArray  #: of each block, shape (blocks,)
-    motor: IntArray  #: of each block, shape (blocks,)
+    blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, move and motor of each block
     whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
@@ -216,7 +198,7 @@ class Folds:
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
         total = np.zeros((self.count, len(self.problem.gamma)))
-        for rows, fold, motor in zip(self.blocks, self.fold, self.motor, strict=True):
+        for rows, fold, _, motor in self.blocks:
             total[fold, motor] += float(residual[rows] @ residual[rows])
         return total
 
@@ -239,16 +221,18 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     count = min(count, moves)
     fold_of = whole % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
-    problem = problem.ordered(np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster])))
+    order = np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster]))
+    of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
+    problem = replace(problem, **{name: getattr(problem, name)[order] for name in of_rows})
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
-    blocks = tuple(slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
+    rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
     move, motor = problem.cluster[starts], problem.motor[starts]
-    fold = fold_of[move]
+    blocks = tuple(zip(rows_of, fold_of[move].tolist(), move.tolist(), motor.tolist(), strict=True))
     move_hessian, move_score = np.zeros((problem.moves, width, width)), np.zeros((problem.moves, width))
     part_hessian = np.zeros((count, motors, width, width))
     motor_score = np.zeros((motors, width))
-    for rows, k, m, i in zip(blocks, fold, move, motor, strict=True):
+    for rows, k, m, i in blocks:
         inside = problem.jacobian[rows]
         gram, score = inside.T @ inside, inside.T @ problem.residual[rows]
         move_hessian[m] += gram
@@ -269,7 +253,7 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores, strict=True)]
     residual = np.empty_like(problem.residual)
     part_score = np.zeros((count, motors, width))
-    for rows, k, i in zip(blocks, fold, motor, strict=True):
+    for rows, k, _, i in blocks:
         inside = problem.jacobian[rows]
         residual[rows] = problem.residual[rows] - inside @ steps[k]
         part_score[k, i] += inside.T @ residual[rows]
@@ -277,9 +261,6 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
         problem=problem,
         moves=moves,
         blocks=blocks,
-        fold=fold,
-        move=move,
-        motor=motor,
         whole=linalg.cho_factor(hessian, lower=True),
         factors=tuple(factors),
         scores=np.stack(scores),

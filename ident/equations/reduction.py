@@ -11,22 +11,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray, IntArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import CHUNK_ROWS, Rows, rows_of
-from ident.equations.system import System
-from ident.equations.triangles import Triangles, qr_update, triangle
+from ident.equations.system import System, Triangles, qr_update, triangle
 from ident.errors import DataUnfit
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, Model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 MAX_CLUSTERS = 256
 """Moves of very long data are joined with their neighbours: 256 clusters say as much of a scatter as 3000."""
@@ -98,22 +93,35 @@ class Reduction:
     def system(self, base: BaseParameters, payload_columns: tuple[tuple[int, ...], ...]) -> System:
         """Eq. (17) with these base parameters and unknown payload parameters."""
         plan, count, standard = layout(self.model), self.model.robot.joint_count, len(self.model.columns)
-        choice = _Choice(self.model, base, self.payloads, payload_columns)
+        leading = len(base.independent)
+        width = leading + sum(map(len, payload_columns)) + 1
+
+        def chosen(rows: FloatArray, mounting: int) -> FloatArray:
+            """[W | W_uL | W_kL χ_kL] among the standard columns."""
+            out = np.zeros((len(rows), width))
+            out[:, :leading] = rows[:, list(base.independent)]
+            if mounting >= 0:
+                flange, first = rows[:, self.model.flange], leading + sum(map(len, payload_columns[:mounting]))
+                indices = list(payload_columns[mounting])
+                out[:, first : first + len(indices)] = flange[:, indices]
+                out[:, -1] = flange @ self.payloads[mounting].known_parameters
+            return out
+
         joints = []
         for joint in range(count):
             parts = []
             for index, factors in enumerate(self.joints):
                 spread = _widened(factors[joint], plan.joint[joint], count + standard)
-                parts.append(np.concatenate((spread[:, :count], -choice.columns(spread[:, count:], index - 1)), axis=1))
-            joints.append(triangle(parts, count + choice.width))
+                parts.append(np.concatenate((spread[:, :count], -chosen(spread[:, count:], index - 1)), axis=1))
+            joints.append(triangle(parts, count + width))
         moves = tuple(
             tuple(
-                np.concatenate((factor[:, :1], choice.columns(_widened(factor[:, 1:], held, standard), c.mounting)), 1)
+                np.concatenate((factor[:, :1], chosen(_widened(factor[:, 1:], held, standard), c.mounting)), 1)
                 for factor, held in zip(c.factors, plan.motor, strict=True)
             )
             for c in self.clusters
         )
-        motors = tuple(triangle((move[motor] for move in moves), 1 + choice.width) for motor in range(count))
+        motors = tuple(triangle((move[motor] for move in moves), 1 + width) for motor in range(count))
         named = zip(base.names, base.independent, strict=True)
         return System(
             drive_train=self.model.drive_train,
@@ -126,32 +134,6 @@ class Reduction:
             motors=Triangles(motors, self.motor_rows),
             moves=moves,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Choice:
-    """[W | W_uL | W_kL χ_kL] among the standard columns, for rows of one mounting."""
-
-    model: Model
-    base: BaseParameters
-    payloads: tuple[Payload, ...]
-    payload_columns: tuple[tuple[int, ...], ...]
-
-    @property
-    def width(self) -> int:
-        return len(self.base.independent) + sum(map(len, self.payload_columns)) + 1
-
-    def columns(self, standard: FloatArray, mounting: int) -> FloatArray:
-        out = np.zeros((len(standard), self.width))
-        first = len(self.base.independent)
-        out[:, :first] = standard[:, list(self.base.independent)]
-        flange = standard[:, self.model.flange]
-        for index, indices in enumerate(self.payload_columns):
-            if index == mounting:
-                out[:, first : first + len(indices)] = flange[:, list(indices)]
-                out[:, -1] = flange @ self.payloads[index].known_parameters
-            first += len(indices)
-        return out
 
 
 def layout(model: Model) -> Layout:
@@ -199,7 +181,10 @@ def reduce_runs(
         moves: dict[int, list[list[FloatArray]]] = {}
         for rows in rows_of(model, data, conditioning, chunk_rows):
             for joint, used in enumerate(rows.use):
-                columns = _joint_columns(model, rows, joint, used, plan.joint[joint])
+                own = plan.joint[joint][plan.joint[joint] < count]
+                current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
+                standard = rows.standard[joint][plan.joint[joint][len(own) :] - count][:, used]
+                columns = np.concatenate((current, standard))
                 joints[mounting + 1][joint] = qr_update(joints[mounting + 1][joint], columns)
             joint_rows += rows.use.sum(axis=1)
             motor_rows += rows.motor_use.sum(axis=1)
@@ -243,14 +228,6 @@ def place_of(payload: Payload | None, payloads: list[Payload], run: str) -> int:
             return index
     payloads.append(payload)
     return len(payloads) - 1
-
-
-def _joint_columns(model: Model, rows: Rows, joint: int, used: BoolArray, columns: IntArray) -> FloatArray:
-    count = len(rows.current)
-    own = columns[columns < count]
-    current = model.drive_train.direction[own, joint, None] * rows.current[own][:, used]
-    standard = rows.standard[joint][columns[columns >= count] - count][:, used]
-    return np.concatenate((current, standard))
 
 
 def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatArray]]:

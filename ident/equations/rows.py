@@ -1,21 +1,21 @@
-"""The rows that a run gives: the filter that makes them, the samples behind each, and whether it counts."""
+"""Rows of W_tot = [V | −W | −W_uL | −W_kL χ_kL] (paper eq. 17), for everything that looks into a residual.
+
+An estimate needs their triangles alone (ident/equations/reduction.py); these are for data of a usual length.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.conditioning import Conditioning, Decimator, decimator
 from ident.data.dataset import Dataset
+from ident.equations.system import Equations, System, Triangles, triangle
 from ident.errors import DataUnfit
-from ident.model.model import DriveTrain, Model
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
+from ident.model.model import Column, DriveTrain, Model
 
 CHUNK_ROWS = 256  #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 
@@ -115,3 +115,141 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
             time_s=time_s[piece],
             move=move[piece],
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Observation(Equations):
+    """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
+
+    current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
+    robot: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
+    flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
+    use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
+    motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
+    time_s: FloatArray  #: of each row, since the start of its run, shape (r,)
+    run: IntArray  #: index of each row's run, shape (r,)
+    move: IntArray  #: number of each row's move, unique over all runs, shape (r,)
+    mounting: IntArray  #: index into payloads, −1 without load, shape (r,)
+    conditioning: Conditioning  #: the filters these rows went through
+
+    def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """[W | W_uL] of some rows, shape (n, p, rows)."""
+        parts = [self.robot[:, :, rows]]
+        for index, indices in enumerate(self.payload_columns):
+            parts.append(self.flange[:, list(indices)][:, :, rows] * (self.mounting[rows] == index))
+        return np.concatenate(parts, axis=1)
+
+    def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """W_kL χ_kL of some rows: the joint torque of what is known of the payloads [Nm], shape (n, rows)."""
+        # An index of −1, no load, takes the last row, which stays zero.
+        weights = np.zeros((len(self.payloads) + 1, 10))
+        for index, payload in enumerate(self.payloads):
+            weights[index] = payload.known_parameters
+        return np.asarray(np.einsum("jpr,rp->jr", self.flange[:, :, rows], weights[self.mounting[rows]]))
+
+    def motor_columns(self) -> list[FloatArray]:
+        """[v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i] of each motor, columns first, shape (p + 2, r)."""
+        to_motor, linear = self.drive_train.to_motor, self.linear()
+        mixed = (to_motor @ linear.reshape(len(to_motor), -1)).reshape(linear.shape)
+        return [
+            np.concatenate((current[None], columns, rest[None]))
+            for current, columns, rest in zip(self.current, mixed, to_motor @ self.known(), strict=True)
+        ]
+
+    def torque(self, gains: FloatArray, rows: BoolArray | slice = slice(None)) -> FloatArray:
+        """Y = V g: joint torque from the measured current references (eq. 4 through R) [Nm], shape (n, rows)."""
+        return self.drive_train.direction.T @ (gains[:, None] * self.current[:, rows])
+
+    def only(self, rows: BoolArray | IntArray) -> Observation:
+        """Keep some of the rows, in the order of their indices."""
+        return replace(
+            self,
+            current=self.current[:, rows],
+            robot=self.robot[:, :, rows],
+            flange=self.flange[:, :, rows],
+            use=self.use[:, rows],
+            motor_use=self.motor_use[:, rows],
+            time_s=self.time_s[rows],
+            run=self.run[rows],
+            move=self.move[rows],
+            mounting=self.mounting[rows],
+        )
+
+    def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
+        """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
+        return replace(self, columns=self.columns + columns, robot=np.concatenate((self.robot, torque), axis=1))
+
+    def system(self) -> System:
+        """Reduce the rows to triangles."""
+        linear, known = self.linear(), self.known()
+        direction, width = self.drive_train.direction, linear.shape[1]
+        joints = []
+        for joint, used in enumerate(self.use):
+            current = direction[:, joint, None] * self.current[:, used]
+            rows = np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))
+            joints.append(triangle((rows.T,), len(rows)))
+        motors, moves = [], []
+        whole = self.motor_columns()
+        for columns, used in zip(whole, self.motor_use, strict=True):
+            motors.append(triangle((columns[:, used].T,), width + 2))
+        for move in np.unique(self.move):
+            here = self.motor_use & (self.move == move)
+            if here.any():
+                moves.append(tuple(columns[:, used].T for columns, used in zip(whole, here, strict=True)))
+        return System(
+            drive_train=self.drive_train,
+            base=self.base,
+            columns=self.columns,
+            payloads=self.payloads,
+            payload_columns=self.payload_columns,
+            runs=self.runs,
+            joints=Triangles(tuple(joints), self.use.sum(axis=1)),
+            motors=Triangles(tuple(motors), self.motor_use.sum(axis=1)),
+            moves=tuple(moves),
+        )
+
+
+def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditioning, like: System) -> Observation:
+    """Build the rows of several runs.
+
+    Args:
+        model: the declared model.
+        datasets: differentiated runs; each one's payload mounting is among those of ``like``.
+        conditioning: the filters; every column and the currents go through the same decimation.
+        like: whose base parameters and payload parameters these are.
+
+    Raises:
+        DataUnfit: a run leaves no usable row.
+    """
+    base = list(like.base.independent)
+    mountings = [payload.mounting for payload in like.payloads]
+    parts: list[tuple[Rows, FloatArray, FloatArray]] = []
+    run, move, mounting = [], [], []
+    first_move = 0
+    for index, data in enumerate(datasets):
+        last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
+        for rows in rows_of(model, data, conditioning):
+            parts.append((rows, rows.standard[:, base], np.ascontiguousarray(rows.standard[:, model.flange])))
+            move.append(rows.move + first_move)
+            last = int(move[-1].max()) + 1
+            run.append(np.full(len(rows.move), index, dtype=np.int64))
+            mounting.append(np.full(len(rows.move), mounted, dtype=np.int64))
+        first_move = last
+    return Observation(
+        drive_train=model.drive_train,
+        columns=like.columns[: len(base)],
+        base=like.base,
+        current=np.concatenate([rows.current for rows, _, _ in parts], axis=1),
+        robot=np.concatenate([robot for _, robot, _ in parts], axis=2),
+        flange=np.concatenate([flange for _, _, flange in parts], axis=2),
+        use=np.concatenate([rows.use for rows, _, _ in parts], axis=1),
+        motor_use=np.concatenate([rows.motor_use for rows, _, _ in parts], axis=1),
+        time_s=np.concatenate([rows.time_s for rows, _, _ in parts]),
+        run=np.concatenate(run),
+        move=np.concatenate(move),
+        mounting=np.concatenate(mounting),
+        payloads=like.payloads,
+        payload_columns=like.payload_columns,
+        runs=tuple(data.name for data in datasets),
+        conditioning=conditioning,
+    )

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
@@ -18,8 +18,6 @@ from ident.estimators.least_squares import Scaling, ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.model.model import Model
 
-FloatArray = NDArray[np.float64]
-
 CUTOFF_FACTORS = (0.5, 1.0, 2.0)
 """Of both cut-offs: an estimator that follows the data and not the filters gives the same gains over two octaves."""
 
@@ -27,23 +25,15 @@ CUTOFF_FACTORS = (0.5, 1.0, 2.0)
 RATIO = 20.0  #: r_σ of essential parameters; the paper finds 10 to 30 right, depending on the noise
 
 
-@dataclass(frozen=True, slots=True)
-class Estimator:
-    """An estimator with its scaling, by name."""
-
-    name: str
-    run: Callable[[System], Estimate]
-
-
-ESTIMATORS = (
-    Estimator("ls", ls),
-    Estimator("wls", wls),
-    Estimator("tls, unscaled", lambda system: tls(system, Scaling.NONE)),
-    Estimator("tls, rows (paper)", lambda system: tls(system, Scaling.ROWS)),
-    Estimator("tls, columns", lambda system: tls(system, Scaling.COLUMNS)),
-    Estimator("tls, both", lambda system: tls(system, Scaling.BOTH)),
-    Estimator("ml", ml),
-)
+ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
+    "ls": ls,
+    "wls": wls,
+    "tls, unscaled": lambda system: tls(system, Scaling.NONE),
+    "tls, rows (paper)": lambda system: tls(system, Scaling.ROWS),
+    "tls, columns": lambda system: tls(system, Scaling.COLUMNS),
+    "tls, both": lambda system: tls(system, Scaling.BOTH),
+    "ml": ml,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,25 +100,25 @@ def compare(
         except IdentificationError as error:
             if factor == 1.0:
                 raise
-            trials += [_failed(estimator.name, filters, error) for estimator in ESTIMATORS]
+            trials += [_failed(name, filters, error) for name in ESTIMATORS]
             continue
-        trials += [_tried(estimator, system, filters) for estimator in ESTIMATORS]
+        for name, estimator in ESTIMATORS.items():
+            try:
+                estimate = estimator(system)
+            except IdentificationError as error:
+                trials.append(_failed(name, filters, error))
+                continue
+            trials.append(
+                Trial(
+                    estimator=name,
+                    position_cutoff_hz=filters.position_cutoff_hz,
+                    decimation_cutoff_hz=filters.decimation_cutoff_hz,
+                    gains=estimate.gains,
+                    std=estimate.gains_std,
+                    relative_error_percent=estimate.relative_error(system).total,
+                )
+            )
     return Comparison(tuple(trials))
-
-
-def _tried(estimator: Estimator, system: System, filters: Conditioning) -> Trial:
-    try:
-        estimate = estimator.run(system)
-    except IdentificationError as error:
-        return _failed(estimator.name, filters, error)
-    return Trial(
-        estimator=estimator.name,
-        position_cutoff_hz=filters.position_cutoff_hz,
-        decimation_cutoff_hz=filters.decimation_cutoff_hz,
-        gains=estimate.gains,
-        std=estimate.gains_std,
-        relative_error_percent=estimate.relative_error(system).total,
-    )
 
 
 def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> Trial:
@@ -184,16 +174,6 @@ def essential(system: System, estimator: Callable[[System], Estimate], ratio: fl
         current = current.holding({worst: 0.0})
         del kept[worst]
         estimate = estimator(current)
-    return Essential(current, estimate, tuple(removed), _among_all(estimate, system, kept))
-
-
-def relative_std_percent(values: FloatArray, std: FloatArray) -> FloatArray:
-    """100 σ/|χ| (eq. 11) [%]; infinite for a value of zero."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.nan_to_num(100.0 * std / np.abs(values), nan=np.inf, posinf=np.inf)
-
-
-def _among_all(estimate: Estimate, system: System, kept: list[int]) -> Estimate:
     count, every = system.joint_count, len(system.unknowns)
     places = [*kept, *range(len(system.columns), every)]
     parameters = np.zeros(every)
@@ -201,4 +181,11 @@ def _among_all(estimate: Estimate, system: System, kept: list[int]) -> Estimate:
     within = [*range(count), *(count + place for place in places)]
     covariance = np.zeros((count + every,) * 2)
     covariance[np.ix_(within, within)] = estimate.covariance
-    return replace(estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance)
+    whole = replace(estimate, unknowns=system.unknowns, parameters=parameters, covariance=covariance)
+    return Essential(current, estimate, tuple(removed), whole)
+
+
+def relative_std_percent(values: FloatArray, std: FloatArray) -> FloatArray:
+    """100 σ/|χ| (eq. 11) [%]; infinite for a value of zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num(100.0 * std / np.abs(values), nan=np.inf, posinf=np.inf)

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ident.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:  # a calibration has relative errors, and reading one needs no LAPACK
-    from ident.equations.observation import Observation
+    from ident.equations.rows import Observation
     from ident.equations.system import System
     from ident.estimators.method import Method
     from ident.model.model import Column
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
+from ident.errors import DataUnfit, ModelError, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
 from ident.model.model import Column, Model
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_STD = 0.1
 """Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
@@ -80,26 +79,27 @@ def identify(
         fixed_gains: known gains, shape (n,).
 
     Raises:
+        ModelError: the fixed gains are not one for each motor.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
+    if fixed_gains is not None:
+        fixed_gains = np.asarray(fixed_gains, dtype=np.float64)
+        if fixed_gains.shape != (model.robot.joint_count,):
+            raise ModelError(f"fixed_gains has shape {fixed_gains.shape}; expected ({model.robot.joint_count},)")
     reduction = reduce_runs(model, runs, conditioning)
     system = reduction.system(reduction.base(), reduction.payload_columns())
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
     if fixed_gains is None:
-        require_seen_payload(estimate if method is Method.ML else _ml_or(estimate, system), system)
+        judged = estimate
+        # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
+        # contradict each other; ml's do, where it has an estimate.
+        with suppress(DataUnfit, NotConverged, RankDeficient, TooFewMoves):
+            judged = estimate if method is Method.ML else ml(system)
+        require_seen_payload(judged, system)
     rest = reduce_runs(model, _mounted_among(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)
-
-
-def _ml_or(estimate: Estimate, system: System) -> Estimate:
-    """``ml``'s estimate where it has one: the deviations of the linear ones are those of independent rows (eqs. 10, 23)
-    and do not see that moves contradict each other."""
-    try:
-        return ml(system)
-    except (DataUnfit, NotConverged, RankDeficient, TooFewMoves):
-        return estimate
 
 
 def require_seen_payload(estimate: Estimate, system: System) -> None:

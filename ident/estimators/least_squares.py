@@ -5,14 +5,11 @@ from __future__ import annotations
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ident.equations.system import System, require_known_payload
-from ident.equations.triangles import Triangles, solve
+from ident.arrays import FloatArray
+from ident.equations.system import System, Triangles, require_known_payload, solve
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
-
-FloatArray = NDArray[np.float64]
 
 
 def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:

@@ -13,17 +13,14 @@ change when a current is given in another unit or the columns are scaled.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
-from ident.equations.system import System, require_known_payload, require_rows
-from ident.equations.triangles import Triangles, solve
+from ident.equations.system import System, Triangles, require_known_payload, require_rows, solve
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.method import Method
-
-FloatArray = NDArray[np.float64]
 
 MAX_ITERATIONS = 100
 STEP_TOLERANCE = 1e-7  #: Relative step of the gains; their standard deviations are some 1e-3
@@ -99,21 +96,17 @@ def noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, fr
     return np.asarray(np.sqrt(size / np.maximum(triangles.rows - free / len(gamma), 1.0)))
 
 
-def _start(system: System) -> FloatArray:
-    """γ of whichever linear estimate makes these data likeliest; each is good somewhere."""
-    even, triangles = np.ones(system.joint_count), system.motors
-    starts = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
-    gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
-    if not gammas:
-        gains = tuple(f"gain {motor + 1}" for motor in range(len(even)))
-        raise RankDeficient("no linear estimate gives every gain a value", gains)
-    return min(gammas, key=lambda gamma: _log_likelihood_cost(triangles, gamma, _parameters(triangles, gamma, even)))
-
-
 def _gauss_newton(system: System) -> tuple[FloatArray, int]:
     """γ by variable projection: χ is eliminated for each γ, so that only n unknowns are iterated."""
     count, triangles = system.joint_count, system.motors
-    gamma = _start(system)
+    # From whichever linear estimate makes these data likeliest; each is good somewhere.
+    starts = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
+    gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
+    if not gammas:
+        names = tuple(f"gain {motor + 1}" for motor in range(count))
+        raise RankDeficient("no linear estimate gives every gain a value", names)
+    even = np.ones(count)
+    gamma = min(gammas, key=lambda one: _log_likelihood_cost(triangles, one, _parameters(triangles, one, even)))
     noise = np.ones(count)
     for _ in range(3):
         parameters = _parameters(triangles, gamma, noise)

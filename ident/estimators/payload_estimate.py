@@ -6,19 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
 from ident.equations.reduction import Cluster, Reduction, place_of
-from ident.equations.system import System, require_distinct
-from ident.equations.triangles import solve, triangle
+from ident.equations.system import System, require_distinct, solve, triangle
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimators.least_squares import ls, wls
 from ident.estimators.maximum_likelihood import noise_of
 from ident.model.base import BaseParameters
 from ident.model.bodies import LINK_PARAMETERS, Payload
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +49,9 @@ def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: flo
     weights[:, ~present] = 0.0
     weights[:, independent] = np.eye(len(independent))
     weights[np.abs(weights) < 1e-6] = 0.0
-    grouped = tuple(_name(row, leading, names) for row, leading in zip(weights, independent, strict=True))
-    return BaseParameters(tuple(independent), weights, grouped)
-
-
-def _name(row: FloatArray, leading: int, names: tuple[str, ...]) -> str:
-    text = names[leading]
-    for other in np.flatnonzero(row):
-        if other != leading:
-            weight = round(float(row[other]), 6)
-            text += f" {'+' if weight > 0 else '-'} {abs(weight)}*{names[other]}"
-    return text
+    grouped = [names[leading] for leading in independent]
+    for number, other in np.argwhere(weights):
+        if other != independent[number]:
+            weight = round(float(weights[number, other]), 6)
+            grouped[number] += f" {'+' if weight > 0 else '-'} {abs(weight)}*{names[other]}"
+    return BaseParameters(tuple(independent), weights, tuple(grouped))

@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
+from ident.errors import ModelError
 
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
 """Inertia about the link frame's origin, first moments, mass, in the paper's order; a payload is a link too (§2.2)."""
@@ -35,11 +35,22 @@ class Payload:
         mounting: names one way of mounting it; runs that share it share their unknown parameters.
         known: known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame
             (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
+
+    Raises:
+        ModelError: a name is not in LINK_PARAMETERS.
     """
 
     name: str
     mounting: str
     known: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
+        if foreign:
+            raise ModelError(
+                f"payload {self.name!r} has the known parameters {', '.join(map(repr, foreign))}; expected names among "
+                f"{', '.join(LINK_PARAMETERS)}; write its mass as {{'m': 4.59}}"
+            )
 
     @property
     def known_parameters(self) -> FloatArray:

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import BoolArray, FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
-from ident.model.kinematics import Motion
 from ident.model.regressor import fill_rigid
-from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
 """Units of torque or force along a joint, of its speed, and of a rotor's inertia seen there."""
@@ -25,13 +21,14 @@ class DriveTrain:
     """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
 
     Attributes:
-        ratio: R, shape (n, n), invertible; row i belongs to motor i.
+        ratio: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do.
     """
 
     ratio: FloatArray
 
     def __post_init__(self) -> None:
-        ratio = self.ratio
+        ratio = np.asarray(self.ratio, dtype=np.float64)
+        object.__setattr__(self, "ratio", ratio)
         if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
             raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}")
         condition = float(np.linalg.cond(ratio))
@@ -84,6 +81,14 @@ class Model:
     robot: Robot
     drive_train: DriveTrain
 
+    def __post_init__(self) -> None:
+        motors, joints = len(self.drive_train.ratio), self.robot.joint_count
+        if motors != joints:
+            raise ModelError(
+                f"the drive train has shape {self.drive_train.ratio.shape}, expected {(joints, joints)}: the robot has "
+                f"{joints} joints; give one motor for each"
+            )
+
     @property
     def columns(self) -> tuple[Column, ...]:
         """Names and units of the standard parameters."""
@@ -134,12 +139,19 @@ class Model:
 
         Returns:
             shape (n, c, k) [Nm or N per unit], time last.
+
+        Raises:
+            ModelError: the motion is not one of n joints.
         """
-        position, velocity, acceleration = (
-            np.ascontiguousarray(samples.T)
-            for samples in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
-        )
-        count, samples = position.shape
+        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        position, velocity, acceleration = (np.ascontiguousarray(np.transpose(state)) for state in states)
+        count, samples = self.robot.joint_count, position.shape[-1]
+        if not position.shape == velocity.shape == acceleration.shape == (count, samples):
+            found = ", ".join(str(np.shape(state)) for state in states)
+            raise ModelError(
+                f"position, velocity and acceleration have the shapes {found}; expected (n_samples, {count}) each: a "
+                "row a sample, a column a joint"
+            )
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         by_link = out[:, : 14 * count].reshape(count, count, 14, samples)

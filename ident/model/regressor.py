@@ -22,31 +22,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ident.model.bodies import LINK_PARAMETERS
+from ident.arrays import FloatArray
 from ident.model.robot import JointKind, Robot
 
-FloatArray = NDArray[np.float64]
-
 BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
-
-
-def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
-    """Columns of the rigid links.
-
-    Args:
-        robot: n joints.
-        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n, k), time last.
-
-    Returns:
-        shape (n, 10 n, k): row of joint j, column 10 i + p of parameter p (LINK_PARAMETERS) of link i, sample
-        [Nm or N per unit].
-    """
-    count, samples = position.shape
-    out = np.zeros((count, count, len(LINK_PARAMETERS), samples))
-    fill_rigid(robot, position, velocity, acceleration, out)
-    return out.reshape(count, count * len(LINK_PARAMETERS), samples)
 
 
 def fill_rigid(
@@ -55,9 +35,11 @@ def fill_rigid(
     """Write the columns of the rigid links into an array of the caller, who may use it again for the next piece.
 
     Args:
-        robot, position, velocity, acceleration: as for ``rigid_regressor``.
-        out: shape (n, n, 10, k): joint, link, parameter, sample; a view into a wider layout will do. Only links that
-            the joint moves are written (``moved_links``), so that the rest may be zeroed once and for all.
+        robot: n joints.
+        position, velocity, acceleration: of the joints [rad or m, and their derivatives], shape (n, k), time last.
+        out: torque per unit of each parameter (LINK_PARAMETERS) [Nm or N], shape (n, n, 10, k): joint, link,
+            parameter, sample; a view into a wider layout will do. Only links that the joint moves are written, so that
+            the rest may be zeroed once and for all.
     """
     links = _links(robot)
     samples = position.shape[1]
@@ -75,14 +57,6 @@ def fill_rigid(
                 screw, row = screws[:, place], out[mover, index, :, block]
                 np.einsum("dk,dck->ck", screw[:3], work.inertia, out=row[:6])
                 np.einsum("dk,dck->ck", screw, work.moments, out=row[6:])
-
-
-def moved_links(robot: Robot) -> tuple[tuple[int, ...], ...]:
-    """For each joint the links behind it, ascending, its own first: in other columns its row is zero."""
-    links = _links(robot)
-    return tuple(
-        tuple(index for index, link in enumerate(links) if joint in link.movers) for joint in range(robot.joint_count)
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A robot as its URDF describes it: the joint chain for the regressor, and inertias for the planner and the prior.
+"""A robot as its URDF describes it: the joint chain, inertias for the planner and the prior; its motions and poses.
 
 The reader takes from a URDF what identification needs and skips the rest (meshes, transmissions, plugins). Joints are
 ordered and merged as Pinocchio does it, which the tests compare with: depth first, branches in the order of their
@@ -13,12 +13,10 @@ from math import cos, inf, isfinite, sin, sqrt
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.bodies import Body
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
 
@@ -170,7 +168,14 @@ def _joint(element: Element, at: _Frame) -> Joint:
     axis = np.array([1.0, 0.0, 0.0]) if declared is None else _vector(declared, "xyz", name)
     length = float(np.linalg.norm(axis))
     axis = axis / length if length > 0.0 else axis
-    _check_geometry(name, at.translation_m, axis)
+    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
+        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
+    distance = float(np.max(np.abs(at.translation_m)))
+    if not distance <= LARGEST_DISTANCE_M:
+        raise ModelError(
+            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
+            "is the URDF in mm?"
+        )
     return Joint(
         name=name,
         kind=JointKind.PRISMATIC if kind == "prismatic" else JointKind.REVOLUTE,
@@ -294,12 +299,49 @@ def _finite(text: str) -> float | None:
     return number if isfinite(number) and "_" not in text else None
 
 
-def _check_geometry(name: str, translation_m: FloatArray, axis: FloatArray) -> None:
-    if not np.isclose(float(np.linalg.norm(axis)), 1.0, atol=1e-6):
-        raise ModelError(f"joint {name!r} has the axis {axis.tolist()}; expected a direction of length one")
-    distance = float(np.max(np.abs(translation_m)))
-    if not distance <= LARGEST_DISTANCE_M:
-        raise ModelError(
-            f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most {LARGEST_DISTANCE_M:g} m: "
-            "is the URDF in mm?"
-        )
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
+
+    Attributes:
+        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
+    """
+
+    position_rad: FloatArray
+    velocity_rad_s: FloatArray
+    acceleration_rad_s2: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """Poses of n + 1 frames in the base frame over k samples; frame 0 is the base, frame i + 1 moves with joint i."""
+
+    rotation: FloatArray  #: shape (n + 1, k, 3, 3)
+    origin_m: FloatArray  #: shape (n + 1, k, 3)
+
+
+def poses(robot: Robot, position_rad: FloatArray) -> Poses:
+    """Forward kinematics.
+
+    Args:
+        robot: n joints.
+        position_rad: of the joints [rad; m for a prismatic joint], shape (k, n).
+    """
+    samples, count = position_rad.shape
+    rotation = np.empty((count + 1, samples, 3, 3))
+    origin = np.empty((count + 1, samples, 3))
+    rotation[0], origin[0] = np.eye(3), 0.0
+    for index, joint in enumerate(robot.joints):
+        parent = rotation[joint.parent + 1]
+        offset = np.broadcast_to(joint.translation_m, (samples, 3))
+        turn = np.broadcast_to(joint.rotation, (samples, 3, 3))
+        if joint.kind is JointKind.PRISMATIC:
+            offset = offset + position_rad[:, index, None] * (joint.rotation @ joint.axis)
+        else:
+            x, y, z = joint.axis  # Rodrigues' formula
+            skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            angle, outer = position_rad[:, index, None, None], np.outer(joint.axis, joint.axis)
+            turn = joint.rotation @ (outer + np.cos(angle) * (np.eye(3) - outer) + np.sin(angle) * skew)
+        origin[index + 1] = origin[joint.parent + 1] + np.einsum("kij,kj->ki", parent, offset)
+        rotation[index + 1] = parent @ turn
+    return Poses(rotation, origin)

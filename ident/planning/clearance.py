@@ -14,12 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ident.model.kinematics import poses
-from ident.model.robot import JointKind, Robot
-
-FloatArray = NDArray[np.float64]
+from ident.arrays import FloatArray
+from ident.model.robot import JointKind, Robot, poses
 
 BASE = -1  #: Index of the link that does not move
 RESOLUTION_M = 0.004
@@ -110,7 +107,9 @@ class Checker:
         Args:
             start, end: positions of the joints [rad or m], shape (n,).
         """
-        travel = self._travel(start, end)
+        # A bound on the path of any point of one body relative to the other, for each row of `_margins` [m].
+        rows = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
+        travel = np.array([self._relative_travel(first, second, start, end) for first, second in rows])
         middles, half = np.array([0.5]), 0.5
         while len(middles):
             position = start + (end - start) * middles[:, None]
@@ -120,7 +119,12 @@ class Checker:
             blocked = (margins < 0.0) | (unsure & (needed < RESOLUTION_M)[:, None])
             if blocked.any():
                 row, sample = np.argwhere(blocked)[0]
-                return self._obstruction_at(int(row), float(margins[row, sample]), position[sample])
+                margin_m, where = float(margins[row, sample]), tuple(position[sample].tolist())
+                if row < len(self._pairs):
+                    first, second = (self._names[index] for index in self._pairs[row])
+                    return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
+                confined = self.scene.capsules[self._confined[row - len(self._pairs)]]
+                return Obstruction(confined.name, "the end of the workspace", margin_m, where)
             half /= 2.0
             open_ = middles[unsure.any(axis=0)]
             middles = np.concatenate((open_ - half, open_ + half))
@@ -158,11 +162,6 @@ class Checker:
                 out[last] = np.minimum(*inside) - self._radius[index]
         return out
 
-    def _travel(self, start: FloatArray, end: FloatArray) -> FloatArray:
-        """Bound on the path of any point of one body relative to the other, for each row of `_margins` [m]."""
-        pairs = [*self._pairs, *((index, len(self.scene.capsules)) for index in self._confined)]
-        return np.array([self._relative_travel(first, second, start, end) for first, second in pairs])
-
     def _relative_travel(self, first: int, second: int, start: FloatArray, end: FloatArray) -> float:
         capsules = self.scene.capsules
         links = [capsules[index].link if index < len(capsules) else BASE for index in (first, second)]
@@ -190,14 +189,6 @@ class Checker:
             chain.append(link)
             link = self.robot.joints[link].parent
         return chain
-
-    def _obstruction_at(self, row: int, margin_m: float, position: FloatArray) -> Obstruction:
-        where = tuple(position.tolist())
-        if row < len(self._pairs):
-            first, second = (self._names[index] for index in self._pairs[row])
-            return Obstruction(first, second, margin_m + self.scene.minimum_m, where)
-        confined = self.scene.capsules[self._confined[row - len(self._pairs)]]
-        return Obstruction(confined.name, "the end of the workspace", margin_m, where)
 
 
 def segment_to_segment(

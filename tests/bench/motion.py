@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident.model.kinematics import Motion
+from ident.model.robot import Motion
 
 FloatArray = NDArray[np.float64]
 

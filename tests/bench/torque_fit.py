@@ -3,19 +3,18 @@ joint torques, sample by sample, as the classical tools do it. Nothing larger th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from ident.equations.triangles import qr_merge, qr_update
+from ident.equations.system import qr_update
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS
-from ident.model.kinematics import Motion
-from ident.model.regressor import fill_rigid, moved_links
-from ident.model.robot import Robot
+from ident.model.regressor import fill_rigid
+from ident.model.robot import Motion, Robot
 
 FloatArray = NDArray[np.float64]
 
@@ -110,3 +109,35 @@ def fit_torques(robot: Robot, pieces: Iterable[tuple[Motion, FloatArray]]) -> To
     small = qr_update(None, whole[:, [*base.independent, last]].T)
     values = solve_triangular(small[:-1, :-1], small[:-1, -1])
     return TorqueFit(base, np.asarray(values), float(abs(small[-1, -1])))
+
+
+def qr_merge(parts: Iterable[tuple[FloatArray, Sequence[int]]], width: int) -> FloatArray:
+    """R of several sets of rows, each known by its own triangle over a subset of the columns.
+
+    A joint's torque depends on the links behind it and on its own drive alone: its triangle is that narrow, and only
+    here the joints meet.
+
+    Args:
+        parts: triangle of shape (c_i, c_i), and which of the ``width`` columns these c_i are.
+        width: number of columns.
+
+    Returns:
+        upper triangular, shape (width, width).
+    """
+    out: FloatArray | None = None
+    for triangle, places in parts:
+        rows = np.zeros((width, triangle.shape[0]))
+        rows[list(places)] = triangle.T
+        out = qr_update(out, rows)
+    return np.zeros((width, width)) if out is None else out
+
+
+def moved_links(robot: Robot) -> tuple[tuple[int, ...], ...]:
+    """For each joint the links behind it, ascending, its own first: in other columns its row is zero."""
+    behind: list[list[int]] = [[] for _ in robot.joints]
+    for link in range(robot.joint_count):
+        joint = link
+        while joint >= 0:
+            behind[joint].append(link)
+            joint = robot.joints[joint].parent
+    return tuple(map(tuple, behind))

@@ -70,7 +70,7 @@ def test_the_contracts_are_kept() -> None:
             "import ident.discovery.search",
             "ident.effects is not allowed to import ident.dis",
         ),
-        ("ident/drift/chart.py", "import ident.model.model", "ident.drift is not allowed to import ident.model"),
+        ("ident/drift/change.py", "import ident.model.model", "ident.drift is not allowed to import ident.model"),
         ("drivers/stream/sample.py", "import daq.errors", "drivers is not allowed to import daq"),
         ("drivers/stream/sample.py", "import mcap.writer", "drivers is not allowed to import mcap"),
         ("drivers/profiles/profile.py", "import pinocchio", "drivers.profiles is not allowed to import pinocchio"),

@@ -94,3 +94,74 @@ def test_currents_are_predicted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     # Raising the disc costs motor 2 at least its weight at a hand's breadth.
     ampere = [float(line.split("currents ")[1].split(", ")[1].removesuffix(" A")) for line in (bare, loaded)]
     assert ampere[1] > ampere[0] + 0.2
+
+
+def _slow_motion(axes: int = 3, samples: int = 200) -> ident.Motion:
+    time_s = np.arange(samples)[:, None] / 100.0 + np.arange(axes)
+    return ident.Motion(np.sin(time_s), np.cos(time_s), -np.sin(time_s))
+
+
+def test_a_misspelt_parameter_of_a_payload_is_refused() -> None:
+    with pytest.raises(ident.ModelError, match=r"'disc'.* 'mass'; expected names among .*mz, m; write .*'m': 4.59"):
+        ident.Payload("disc", mounting="flange", known={"mass": 4.59})
+
+
+def test_a_payload_of_another_mass_is_not_predicted(example: SimpleNamespace) -> None:
+    found = example.main()
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    heavier = ident.Payload("disc", mounting="flange", known={"m": 6.0})
+    with pytest.raises(ident.DataUnfit, match=r"weighs 6 kg; expected 4.59 kg as in the fit"):
+        ident.predict_current(calibration, found.model, ident.planned(_slow_motion(), 100.0, heavier))
+    same = ident.Payload("disc", mounting="flange", known={"m": 4.595})  # weighed again
+    assert np.isfinite(
+        ident.predict_current(calibration, found.model, ident.planned(_slow_motion(), 100.0, same))
+    ).all()
+
+
+def test_a_planned_motion_holds_numbers_of_one_shape() -> None:
+    motion = _slow_motion()
+    motion.velocity_rad_s[7, 1] = np.nan
+    with pytest.raises(ident.DataUnfit, match="1 values are not finite, the first in sample 7, axis 2"):
+        ident.planned(motion, 100.0)
+    with pytest.raises(ident.DataUnfit, match=r"\(200, 3\), \(200, 3\) and \(3, 200\); expected \(n_samples, n_axes\)"):
+        motion = _slow_motion()
+        ident.planned(ident.Motion(motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2.T), 100.0)
+
+
+def test_lists_are_as_good_as_arrays(example: SimpleNamespace) -> None:
+    found = example.main()
+    calibration = ident.calibration_of(found, ["J1", "J2", "J3"], list(example.NAMEPLATE_NM_A))
+    model = ident.Model(found.model.robot, ident.DriveTrain(np.diag(example.GEAR_RATIOS).tolist()))
+    run = example.record(found.model, "lists", example.DISC, 3)
+    lists = ident.Run("lists", run.time_s.tolist(), run.position_rad.tolist(), run.current_a.tolist(), example.DISC)
+    data, same = (ident.differentiate(one, model.drive_train, found.conditioning) for one in (run, lists))
+    assert np.array_equal(data.velocity_rad_s, same.velocity_rad_s)
+    assert np.array_equal(data.current_a, same.current_a)
+    assert np.array_equal(
+        ident.measured_torque(calibration, model, run.current_a),
+        ident.measured_torque(calibration, model, run.current_a.tolist()),
+    )
+    motion = _slow_motion()
+    states = (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
+    listed = ident.Motion(*(state.tolist() for state in states))
+    assert np.array_equal(
+        ident.predict_torque(calibration, model, ident.planned(motion, 100.0)),
+        ident.predict_torque(calibration, model, ident.planned(listed, 100.0)),
+    )
+
+
+def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(example: SimpleNamespace) -> None:
+    found = example.main()
+    with pytest.raises(ident.ModelError, match=r"drive train has shape \(2, 2\), expected \(3, 3\)"):
+        ident.Model(found.model.robot, ident.DriveTrain(np.diag([100.0, 100.0])))
+    run = example.record(found.model, "run", None, 3)
+    turned = ident.Run("turned", run.time_s, run.position_rad.T, run.current_a)
+    with pytest.raises(ident.DataUnfit, match=r"position has shape \(3, \d+\), expected \(\d+, 3\)"):
+        ident.identify(found.model, [turned], found.conditioning)
+    with pytest.raises(ident.ModelError, match=r"fixed_gains has shape \(2,\); expected \(3,\)"):
+        ident.identify(found.model, [run], found.conditioning, fixed_gains=np.ones(2))
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    motion = _slow_motion()
+    across = ident.Motion(motion.position_rad.T, motion.velocity_rad_s.T, motion.acceleration_rad_s2.T)
+    with pytest.raises(ident.ModelError, match=r"shapes \(3, 200\).*expected \(n_samples, 3\)"):
+        ident.predict_torque(calibration, found.model, ident.planned(across, 100.0))

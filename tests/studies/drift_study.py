@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from ident.drift.change import DISPERSION, dispersions
-from ident.drift.chart import CHART, Chart, cusum_paths, trend_statistic
+from ident.drift.change import CHART, DISPERSION, Chart, cusum_paths, dispersions, trend_statistic
 
 FloatArray = NDArray[np.float64]
 

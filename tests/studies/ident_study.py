@@ -78,9 +78,9 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     true = np.array(logs.truth.gains_nm_per_a)
     mass = logs.truth.payloads[PLATE].mass_kg
     scores = {}
-    for estimator in ESTIMATORS:
-        found = estimator.run(system)
-        scores[estimator.name] = Score(
+    for name, estimator in ESTIMATORS.items():
+        found = estimator(system)
+        scores[name] = Score(
             error_percent=tuple(float(error) for error in 100.0 * (found.gains / true - 1.0)),
             second_payload_percent=tuple(100.0 * (_mass(one, found.gains) / mass - 1.0) for one in weighing),
             relative_error_percent=found.relative_error(system).total,
@@ -148,18 +148,18 @@ def main(arguments: list[str] | None = None) -> int:
         logs = study_logs(options.seeds, options.floors)
     else:
         logs = record_study(options.seeds, options.floors, report_line=_print_line)
-    result: dict[str, Any] = {_key(estimator.name): {} for estimator in ESTIMATORS}
+    result: dict[str, Any] = {_key(name): {} for name in ESTIMATORS}
     lines = ["| floor % | estimator | gain error mean / max % | second payload mean / max % |", "|---|---|---|---|"]
     cells: list[dict[str, Any]] = []
     for floor in options.floors:
         scored = [(one.seed, score(one, model, cell.conditioning)) for one in logs if one.floor == floor]
         for seed, of in scored:
             cells += [{"floor": floor, "seed": seed, "estimator": name, **asdict(one)} for name, one in of.items()]
-        for estimator in ESTIMATORS:
-            reported = summarise([of[estimator.name] for _, of in scored])
-            result[_key(estimator.name)][floor] = asdict(reported)
+        for name in ESTIMATORS:
+            reported = summarise([of[name] for _, of in scored])
+            result[_key(name)][floor] = asdict(reported)
             lines.append(
-                f"| {reported.relative_error_percent:.1f} | {estimator.name} | {reported.mean_percent:.2f} / "
+                f"| {reported.relative_error_percent:.1f} | {name} | {reported.mean_percent:.2f} / "
                 f"{reported.max_percent:.2f} | {reported.second_payload_percent:.2f} / "
                 f"{reported.second_payload_max_percent:.2f} |"
             )

@@ -22,7 +22,7 @@ from daq.config.cell import model_of
 from daq.environment import shipped_configurations
 from daq.log.conversion import load_run
 from ident.discovery.loop import find_effects, gather
-from ident.equations.observation import Observation
+from ident.equations.rows import Observation
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import identify
 from ident.estimators.method import Method

@@ -38,6 +38,7 @@ def _spoil(path: Path, old: str, new: str) -> Path:
 
 def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
+    assert load_cell(str(checkout / "configs/cells/demo.yaml")).digest == cell.digest
     assert cell.name == "demo"
     assert cell.axis_names == ("J1", "J2", "J3", "J4", "J5", "J6")
     np.testing.assert_array_equal(cell.ratio[5], [0, 0, 0, 0, 32, 32])

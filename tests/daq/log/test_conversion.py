@@ -60,7 +60,9 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
         CellEvent(START_NS + 50_000_000, None, EventKind.MOVE_END, 4, ""),
         CellEvent(START_NS + 60_000_000, None, EventKind.MOVE_START, 5, ""),
     )
-    run, cell = load_run(record(samples([[1000 * k] * 6 for k in range(100)]), events=events, loaded=True))
+    path = record(samples([[1000 * k] * 6 for k in range(100)]), events=events, loaded=True)
+    run, cell = load_run(path)
+    assert np.array_equal(load_run(str(path))[0].position_rad, run.position_rad)  # a name is as good as a path
     assert cell.digest == CELL.digest
     assert run.payload == DISC
     assert run.rate_hz == pytest.approx(1000.0)

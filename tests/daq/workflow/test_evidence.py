@@ -35,8 +35,8 @@ from ident.calibration import Calibration
 from ident.data.run import Recording, Run
 from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
+from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.friction import Stribeck
-from ident.effects.timing import Lag, TimeSkew
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write

@@ -28,8 +28,7 @@ from ident.model.base import base_parameters
 from ident.model.bodies import Body
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import robot_from_urdf
-from ident.physical.programme import urdf_links
-from ident.physical.regrouping import random_motion
+from ident.physical.physical import random_motion, urdf_links
 from tests.ident.arms import GANTRY
 
 FloatArray = NDArray[np.float64]

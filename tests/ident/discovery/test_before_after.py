@@ -9,8 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.discovery.before_after import Account, account, assess, before_after, floor_on
-from ident.discovery.current_error import CurrentError, error_left_out, error_on, left_out_runs
+from ident.discovery.before_after import (
+    Account,
+    CurrentError,
+    account,
+    assess,
+    before_after,
+    error_left_out,
+    error_on,
+    floor_on,
+    left_out_runs,
+)
 from ident.discovery.loop import Evidence, Step, gather, with_effects, without_effects
 from ident.discovery.noise_floor import NoiseFloor
 from ident.effects.effect import PlacedEffect

@@ -37,7 +37,7 @@ def problem(small: Evidence) -> Linearisation:
 
 def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
     fold = np.empty(len(folds.problem.motor), dtype=np.int64)
-    for rows, number in zip(folds.blocks, folds.fold, strict=True):
+    for rows, number, _, _ in folds.blocks:
         fold[rows] = number
     return fold
 

@@ -19,8 +19,8 @@ from ident.effects.effect import Effect, PlacedEffect, Side
 from ident.errors import RankDeficient, TooFewMoves
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
-from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain, Model
+from ident.model.robot import Motion
 from tests.ident.recordings import (
     CONDITIONING,
     GAINS,

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.discovery import loop
 from ident.discovery.loop import Evidence, Step, find_effects
-from ident.discovery.search import Gates, choose_effect, rank_effects
-from ident.discovery.structure import detection_limits_nm
+from ident.discovery.search import Gates, choose_effect, detection_limits_nm, rank_effects
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
-from ident.drift.chart import FEWEST, fit_line, trend_statistic
+from ident.drift.change import FEWEST, fit_line, trend_statistic
 
 _points = st.lists(st.tuples(st.floats(5.0, 15.0), st.floats(0.01, 1.0)), min_size=FEWEST, max_size=30)
 

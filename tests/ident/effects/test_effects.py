@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.discovery.structure import VARIABLES
+from ident.discovery.search import VARIABLES
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import Effect, Property, Side
-from ident.effects.electrical import Cogging, Saturation
+from ident.effects.effect import Effect, Property, Side, at_joints, is_placeable
+from ident.effects.electrical import Cogging, Saturation, TimeSkew
 from ident.effects.friction import AsymmetricViscous, Coupling, LoadFriction, PositionFriction, Stribeck
-from ident.effects.placement import at_joints, is_placeable
 from ident.effects.position import Hinge, Spring
 from ident.effects.signals import Abscissa, Signals
-from ident.effects.timing import TimeSkew
 from ident.effects.transmission import Elasticity
 from ident.effects.unnamed import INTERVALS, Periodic, Smooth
 from ident.model.model import DriveTrain

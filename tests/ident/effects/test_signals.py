@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ident.data.dataset import Dataset
 from ident.discovery.loop import Evidence
 from ident.effects.signals import Signals, declared_signals, fitted_signals, session_began_s
-from ident.model.kinematics import Motion
+from ident.model.robot import Motion
 from tests.ident.recordings import PAYLOAD_TRUTH, Truth
 
 FloatArray = NDArray[np.float64]

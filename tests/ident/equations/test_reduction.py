@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from ident.data.run import Run
 from ident.equations import reduction as reduction_module
 from ident.equations.reduction import Reduction, layout, reduce_runs
-from ident.equations.system import System
-from ident.equations.triangles import triangle
+from ident.equations.system import System, triangle
 from ident.estimators.maximum_likelihood import ml
 from ident.model.model import DriveTrain, Model
 from tests.ident.recordings import CONDITIONING, Truth, gathered

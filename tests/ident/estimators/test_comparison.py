@@ -27,7 +27,7 @@ def _of(comparison: Comparison, estimator: str) -> FloatArray:
 def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(noisy: Comparison) -> None:
     assert len(noisy.trials) == len(ESTIMATORS) * len(CUTOFF_FACTORS)
     assert {trial.position_cutoff_hz for trial in noisy.declared} == {CONDITIONING.position_cutoff_hz}
-    assert [trial.estimator for trial in noisy.declared] == [estimator.name for estimator in ESTIMATORS]
+    assert [trial.estimator for trial in noisy.declared] == list(ESTIMATORS)
 
 
 def test_ml_hangs_on_the_filters_less_than_the_papers_tls_and_tls_on_its_scaling(noisy: Comparison) -> None:

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.run import Run
-from ident.equations.system import System
-from ident.equations.triangles import Triangles, triangle
+from ident.equations.system import System, Triangles, triangle
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls
 from ident.model.base import BaseParameters

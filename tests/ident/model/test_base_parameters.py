@@ -7,8 +7,8 @@ import pytest
 
 from ident.data.dataset import differentiate
 from ident.data.run import Run
-from ident.equations.observation import observe
 from ident.equations.reduction import reduce_runs
+from ident.equations.rows import observe
 from ident.model.base import base_parameters
 from tests.ident.recordings import CONDITIONING, Truth
 

@@ -6,9 +6,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from ident.arrays import FloatArray
 from ident.model import regressor
-from ident.model.regressor import fill_rigid, moved_links, rigid_regressor
-from ident.model.robot import robot_from_urdf
+from ident.model.regressor import fill_rigid
+from ident.model.robot import Robot, robot_from_urdf
+from tests.bench.torque_fit import moved_links
 from tests.ident.arms import ARMS, GRAVITIES, Arm
 
 
@@ -18,6 +20,14 @@ def _pinocchio_parameters(model: pin.Model) -> np.ndarray[tuple[int], np.dtype[n
         mass, mx, my, mz, ixx, ixy, iyy, ixz, iyz, izz = inertia.toDynamicParameters()
         parameters.extend((ixx, ixy, ixz, iyy, iyz, izz, mx, my, mz, mass))
     return np.array(parameters)
+
+
+def rigid_regressor(robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
+    """Columns of the rigid links, shape (n, 10 n, k)."""
+    count, samples = position.shape
+    out = np.zeros((count, count, 10, samples))
+    fill_rigid(robot, position, velocity, acceleration, out)
+    return out.reshape(count, 10 * count, samples)
 
 
 @pytest.mark.parametrize("gravity", GRAVITIES)

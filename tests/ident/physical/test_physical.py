@@ -14,12 +14,19 @@ from numpy.typing import NDArray
 from ident.errors import ModelError
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import body_of, link_parameters, pseudo_inertia
-from ident.model.kinematics import Motion
 from ident.model.model import DriveTrain, Model
-from ident.model.robot import robot_from_urdf
-from ident.physical.physical import SLACK, PhysicalParameters, physical_parameters
-from ident.physical.programme import DEFAULT_MASS_KG, MARGIN, NotPhysical, inertia_prior
-from ident.physical.regrouping import random_motion, regroup
+from ident.model.robot import Motion, robot_from_urdf
+from ident.physical.physical import (
+    DEFAULT_MASS_KG,
+    MARGIN,
+    SLACK,
+    NotPhysical,
+    PhysicalParameters,
+    inertia_prior,
+    physical_parameters,
+    random_motion,
+    regroup,
+)
 from tests.ident.arms import ARMS, GANTRY, GRAVITIES, TX40, Arm
 from tests.ident.recordings import RATIO
 

@@ -15,19 +15,21 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.estimators.identify import identify
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.kinematics import Motion
 from ident.model.model import Model
-from ident.model.robot import robot_from_urdf
+from ident.model.robot import Motion, robot_from_urdf
 from ident.planning.excitation import (
     Design,
     Excitation,
     Expectation,
     ExpectedPayload,
+    ExtraMoves,
+    Source,
+    Verdict,
     effective_noise,
     recorded,
+    verdicts,
     visible,
 )
-from ident.planning.verdict import ExtraMoves, Source, Verdict, verdicts
 from tests.ident.arms import TX40
 from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, Truth, record, tx40_truth
 
