@@ -40,7 +40,7 @@ TOGETHER = "tests/daq/jobs/"
 """Folder whose files share a whole job: the worker that has made it runs them all."""
 
 
-class _FolderTogether(LoadFileScheduling):
+class _FolderTogether(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
     """As `--dist loadfile`, with the files of one folder in one worker."""
 
     def _split_scope(self, nodeid: str) -> str:
