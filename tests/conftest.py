@@ -7,6 +7,7 @@ import os
 # Before NumPy is imported: what is equal bit by bit with one thread need not be with two.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
 import resource
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -29,6 +30,17 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 
 LONG = ("test_guide.py", "test_main_job.py", "test_any_robot.py")
 """Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
+
+
+def pytest_sessionstart() -> None:
+    """Leave garbage alone while modules are imported: a third of that time would go into looking for it."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, but never look through what was imported."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
