@@ -20,8 +20,8 @@ class Gain:
     """One joint drive gain g = N·Gt·Kt (paper eq. 4)."""
 
     axis: str  #: name of the axis
-    value: float  #: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed
-    std: float  #: identified gain and its standard deviation [unit]; std is 0 where the gain was held fixed
+    value: float  #: identified gain [unit]
+    std: float  #: its standard deviation [unit], 0 where the gain was held fixed
     unit: str  #: Nm at the joint per unit of the current-loop reference
     nameplate: float  #: the manufacturer's a priori gain [unit]
 
@@ -63,7 +63,7 @@ class AcceptedEffect:
     #: use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or where these say nothing of it ‖e‖/‖v‖ of the motor
     #: that feels it most, on moves left out in turn.
     error_before_percent: float
-    error_after_percent: float  #: see `error_before_percent`
+    error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
 
 

@@ -7,11 +7,19 @@ import os
 # Before NumPy is imported: what is equal bit by bit with one thread need not be with two.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
 import resource
+from collections import OrderedDict
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from hypothesis import settings
+from xdist.scheduler import LoadFileScheduling
+
+from daq.config import yaml_file
 
 # A busy machine is no reason to fail: no test asserts on a clock. And what passed once passes again.
 settings.register_profile("drivegain", deadline=None, derandomize=True)
@@ -24,9 +32,68 @@ LONG = ("test_guide.py", "test_main_job.py", "test_any_robot.py")
 """Files that take a minute and more: begun last, they would keep one processor busy after the other has ended."""
 
 
+def pytest_sessionstart() -> None:
+    """Leave garbage alone while modules are imported: a third of that time would go into looking for it."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, but never look through what was imported."""
+    gc.freeze()
+    gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the longest files first."""
     items.sort(key=lambda item: item.path.name not in LONG)
+
+
+TOGETHER = "tests/daq/jobs/"
+"""Folder whose files share a whole job: the worker that has made it runs them all."""
+
+
+class _FolderTogether(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
+    """As `--dist loadfile`, with the files of one folder in one worker."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return TOGETHER if nodeid.startswith(TOGETHER) else nodeid.split("::", 1)[0]
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LoadFileScheduling | None:
+    """Replace the scheduler of `--dist loadfile`."""
+    return _FolderTogether(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+PARSED = 128
+"""Texts whose nodes are kept."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def parsed_once() -> Iterator[None]:
+    """Compose the nodes of equal YAML texts once: the same few files are read thousands of times.
+
+    Nodes depend on the bytes alone and are not changed afterwards. What cannot be parsed is not kept, so that each
+    error is raised by the file that it names.
+    """
+    kept: OrderedDict[bytes, yaml.Node | None] = OrderedDict()
+
+    class Loader(yaml_file._Loader):
+        def __init__(self, text: bytes, name: str) -> None:
+            super().__init__(text, name)
+            self._text = text
+
+        def get_single_node(self) -> yaml.Node | None:
+            if self._text not in kept:
+                kept[self._text] = super().get_single_node()
+            kept.move_to_end(self._text)
+            if len(kept) > PARSED:
+                kept.popitem(last=False)
+            return kept[self._text]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(yaml_file, "_Loader", Loader)
+        yield
 
 
 @pytest.fixture(scope="session")

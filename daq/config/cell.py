@@ -119,10 +119,10 @@ class Axis:
 class WeighedPayload:
     """A body that can be mounted."""
 
-    name: str  #: the body, and the one way in which it is mounted
-    mounting: str  #: the body, and the one way in which it is mounted
+    name: str  #: the body
+    mounting: str  #: the one way in which it is mounted
     mass_kg: float  #: as weighed [kg]
-    mass_tolerance_kg: float  #: as weighed [kg]
+    mass_tolerance_kg: float  #: its tolerance [kg]
     #: Further inertial parameters, from its drawing, by their names in ident.model.bodies.LINK_PARAMETERS.
     known: dict[str, float]
 

@@ -131,10 +131,10 @@ def _inertia_faults(payload: PayloadModel, index: int) -> Iterator[Fault]:
 class _Plausible:
     """Positions that a joint can have, in its unit."""
 
-    farthest: float  #: largest position, and the most likely unit of a larger one
-    too_far: str  #: largest position, and the most likely unit of a larger one
-    shortest: float  #: smallest range, and the most likely unit of a smaller one
-    too_short: str  #: smallest range, and the most likely unit of a smaller one
+    farthest: float  #: largest position
+    too_far: str  #: most likely unit of a larger one
+    shortest: float  #: smallest range
+    too_short: str  #: most likely unit of a smaller one
 
 
 _PLAUSIBLE = {

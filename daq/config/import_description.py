@@ -97,13 +97,13 @@ class ImportDescription(StrictModel):
     name: Name  #: name of the recording
     cell: FileName  #: cell file, relative to this one
     table: Table = Table()  #: layout of the files
-    position: PositionColumns  #: the columns
-    current: CurrentColumns  #: the columns
+    position: PositionColumns  #: column of the position
+    current: CurrentColumns  #: column of the current
     #: Sampling rate [Hz], or the time column; exactly one of the two.
     rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
     time: TimeColumn | None = None  #: sampling rate [Hz], or the time column; exactly one of the two
-    payload: Name | None = None  #: mounted payload, named as in the cell; None without load
-    mounting: Name | None = None  #: mounted payload, named as in the cell; None without load
+    payload: Name | None = None  #: mounted payload, as named in the cell; None without load
+    mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it
 
 

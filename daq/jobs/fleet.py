@@ -142,8 +142,8 @@ class FleetRow:
 
     cell: str  #: its name; that of the log where the cell is unknown
     configuration_sha256: str  #: of its configuration; empty where it is unknown
-    fit: tuple[str, ...]  #: names of the logs
-    holdout: tuple[str, ...]  #: names of the logs
+    fit: tuple[str, ...]  #: names of the logs of the fit
+    holdout: tuple[str, ...]  #: names of the held-out logs
     result: Summary | Failure  #: summary of the calibration, or the failure
     seconds: float  #: that it took
     configurations: int = 1  #: in how many different ones the cell's logs were made; each has a row

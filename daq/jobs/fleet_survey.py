@@ -184,7 +184,7 @@ class UnknownLog:
 class CellLogs:
     """The logs of one cell in one configuration."""
 
-    cell: str  #: of all of them
+    cell: str  #: name of the cell of all of them
     configuration_sha256: str  #: of all of them
     fit: tuple[SeenLog, ...]  #: logs of the fit, in the order in which they were made
     holdout: tuple[SeenLog, ...]  #: logs that the fit must not see

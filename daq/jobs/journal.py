@@ -43,8 +43,8 @@ class Journal:
     stream: TextIO  #: that lines are written to
     form: Form  #: of the lines
     now: Callable[[], datetime]  #: wall clock with time zone
-    session: str = ""  #: of what is said from here on
-    step: str = ""  #: of what is said from here on
+    session: str = ""  #: session of the lines that follow
+    step: str = ""  #: step of the lines that follow
 
     def say(self, level: Level, event: str, /, **fields: object) -> None:
         """Write one event.

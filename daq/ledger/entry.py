@@ -46,8 +46,8 @@ class Entry:
     configuration_sha256: str  #: of the cell configuration that its logs carry
     method: str  #: of the fit
     software: str  #: that made it
-    error_percent: float  #: relative error of the fit, and on held-out data [%]; None where there was none
-    holdout_percent: float | None  #: relative error of the fit, and on held-out data [%]; None where there was none
+    error_percent: float  #: relative error of the fit [%]
+    holdout_percent: float | None  #: relative error on held-out data [%], None without any
     rows: int  #: of the observation
     gains: tuple[Gain, ...]  #: one an axis, in the order of the axes
     events: tuple[Event, ...]  #: writes after which a controller had its gains, oldest first

@@ -192,9 +192,9 @@ class Ledger(HistoryStore):
 class Rebuilt:
     """Content of a history after `rebuild`."""
 
-    calibrations: int  #: how many
-    writes: int  #: how many
-    acknowledgements: int  #: how many
+    calibrations: int  #: number of calibrations
+    writes: int  #: number of writes
+    acknowledgements: int  #: number of acknowledged changes
     kept: Path | None  #: the history that was replaced, None where there was none
     trusted: bool  #: whether what only the old history had was entered in the audit log: not where it was broken
 

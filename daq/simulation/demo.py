@@ -76,8 +76,8 @@ class Outcome:
     fitted: Fit  #: with the effects that were found
     calibration: Calibration  #: as saved
     truth: dict[str, float]  #: true gain by axis
-    proposal: Proposal[FileEdit]  #: what the controller file would get, and what its copy got
-    written: Written | None  #: what the controller file would get, and what its copy got
+    proposal: Proposal[FileEdit]  #: what the controller file would get
+    written: Written | None  #: what its copy got
 
 
 def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: ProgressReporter) -> Outcome:

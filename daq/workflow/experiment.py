@@ -236,8 +236,8 @@ class PlannedMove:
     """One synchronised point-to-point move."""
 
     target_rad: tuple[float, ...]  #: joint positions at its end [rad; m of a prismatic joint], shape (n,)
-    velocity: float  #: share of the joints' limits, above 0 up to 1
-    acceleration: float  #: share of the joints' limits, above 0 up to 1
+    velocity: float  #: share of the joints' velocity limits, above 0 up to 1
+    acceleration: float  #: share of the joints' acceleration limits, above 0 up to 1
     dwell_s: float  #: rest after it [s]
 
 

@@ -42,8 +42,8 @@ class Shift:
     """One base parameter that had to move."""
 
     name: str  #: leading name of the base parameter
-    identified: float  #: before and after
-    realised: float  #: before and after
+    identified: float  #: before
+    realised: float  #: after
     deviations: float  #: the change in standard deviations of the fit
 
 
@@ -123,8 +123,8 @@ class Markup:
     file: str  #: name in messages
     content: bytes  #: of the file
     root: Element  #: <robot>
-    links: Mapping[str, Element]  #: by their names
-    joints: Mapping[str, Element]  #: by their names
+    links: Mapping[str, Element]  #: links by name
+    joints: Mapping[str, Element]  #: joints by name
     fixed: Mapping[str, Sequence[str]]  #: links that fixed joints hold to a link, by its name
 
     @property

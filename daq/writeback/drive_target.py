@@ -40,16 +40,16 @@ _U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 class DriveNote(StrictModel):
     """One drive in a record."""
 
-    axis: str  #: which
-    node_id: Annotated[int, Field(ge=1, le=127)]  #: which
-    vendor_id: _U32  #: identity that the drive reported (1018h)
-    product_code: _U32  #: identity that the drive reported (1018h)
-    serial: _U32 | None  #: identity that the drive reported (1018h)
-    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: the object that was to be written
-    subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: the object that was to be written
-    type: ParameterKind  #: the object that was to be written
-    old: _U32  #: its bits before the write, and as they were to be
-    new: _U32  #: its bits before the write, and as they were to be
+    axis: str  #: name of the axis
+    node_id: Annotated[int, Field(ge=1, le=127)]  #: its node id
+    vendor_id: _U32  #: vendor that the drive reported (1018h:1)
+    product_code: _U32  #: product (1018h:2)
+    serial: _U32 | None  #: serial number (1018h:4)
+    index: Annotated[int, Field(ge=0x1000, le=0xFFFF)]  #: index of the object that was to be written
+    subindex: Annotated[int, Field(ge=0, le=0xFF)]  #: its subindex
+    type: ParameterKind  #: its data type
+    old: _U32  #: its bits before the write
+    new: _U32  #: its bits as they were to be
 
     @property
     def parameter(self) -> Parameter:

@@ -144,8 +144,8 @@ class Backup:
     """A backup beside a controller file; all but its content is in its name."""
 
     path: Path  #: file
-    stamp: str  #: its place in the order of time
-    count: int  #: its place in the order of time
+    stamp: str  #: time in its name
+    count: int  #: number among those of that time
     was: str  #: digest of its content
     after_digest: str  #: digest of the content that replaced it in the controller file
 

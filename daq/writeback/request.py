@@ -79,8 +79,8 @@ class GainChange:
     axis: str  #: name of the axis
     key: str  #: place of the number: its key in the controller file, or the drive's object
     line: int  #: of the number in the file, from 1; 0 in a drive
-    old: float  #: gain now, and as it will be read back [unit]; new is NaN where there is none to write
-    new: float  #: gain now, and as it will be read back [unit]; new is NaN where there is none to write
+    old: float  #: gain now [unit]
+    new: float  #: gain as it will be read back [unit], NaN where there is none to write
     std: float  #: standard deviation of the identified gain [unit]
     unit: str  #: Nm at the joint per unit of the current-loop reference
     nameplate: float  #: the manufacturer's gain [unit]

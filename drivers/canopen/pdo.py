@@ -46,8 +46,8 @@ class Direction(Enum):
 class PdoRecord:
     """Communication and mapping parameters of one PDO in a drive."""
 
-    direction: Direction  #: of the PDO; numbers from 0
-    number: int  #: of the PDO; numbers from 0
+    direction: Direction  #: receive or transmit
+    number: int  #: number of the PDO, from 0
     cob_id: int  #: sub 1 with its flag bits
     transmission: int  #: type, sub 2
     entries: tuple[int, ...]  #: mapped objects, each as the 32-bit word of the mapping parameter

@@ -48,11 +48,11 @@ class MotionBounds:
     #: this many counts for this many cycles. An encoder of 20 bits a turn flickers by several counts at rest. 16 counts
     #: in 20 cycles of 1 ms are at most 800 counts/s, 0.3 deg/s of such a motor, which is harmless to a brake.
     standstill_cycles: int = 20
-    standstill_counts: int = 16  #: see `standstill_cycles`
+    standstill_counts: int = 16  #: largest step between two of those cycles
     #: Largest distance from a target that bit 10 reports as reached, in counts plus a fraction of the way: it catches a
     #: drive whose bit 10 is still that of the move before.
     arrival_counts: int = 2000
-    arrival_fraction: float = 0.05  #: see `arrival_counts`
+    arrival_fraction: float = 0.05  #: or this share of the move, whichever is smaller
 
 
 DEFAULT_BOUNDS = MotionBounds()

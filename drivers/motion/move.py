@@ -153,8 +153,8 @@ class Trapezoid:
     linear combination of axes (a coupled motor) moves on a trapezoid of the same times.
     """
 
-    start: FloatArray  #: positions [any unit], shape (n,)
-    end: FloatArray  #: positions [any unit], shape (n,)
+    start: FloatArray  #: first position [any unit], shape (n,)
+    end: FloatArray  #: last position [any unit], shape (n,)
     duration_s: float  #: from start to end [s]
     ramp_s: float  #: of acceleration, and of deceleration [s]
 

@@ -24,13 +24,13 @@ FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
 class ScaleReading:
     """Current scale and motor data of a drive."""
 
-    node_id: int  #: of the axis
-    name: str  #: of the axis
+    node_id: int  #: node id of the axis
+    name: str  #: name of the axis
     profile: str  #: name of its profile
     ampere_per_unit: float  #: of the mapped current object [A]
     objects: dict[str, int]  #: values of the scale objects, by object
-    rated_current_a: float | None  #: of the motor, None where the drive does not report them
-    rated_torque_nm: float | None  #: of the motor, None where the drive does not report them
+    rated_current_a: float | None  #: rated current of the motor, None where the drive reports none
+    rated_torque_nm: float | None  #: rated torque of the motor, None where the drive reports none
     warnings: tuple[str, ...]  #: missing checks and doubtful values, with the evidence
 
 

@@ -250,9 +250,9 @@ class Readings:
     velocity: list[int]  #: 606Ch [counts/s]
     current_demand: list[int]  #: 6074h [per mille of rated current]
     current: list[int]  #: 6077h and 6078h [per mille of rated current]
-    reached: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    limited: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
-    following_error: list[int]  #: bits 10, 11 and 13 of 6041h as the loops see them
+    reached: list[int]  #: target reached, bit 10 of 6041h
+    limited: list[int]  #: internal limit active, bit 11
+    following_error: list[int]  #: following error, bit 13
 
 
 @compiled

@@ -11,7 +11,7 @@ from types import TracebackType
 import can
 import numpy as np
 
-from drivers.canopen.bus import SocketcandBus
+from drivers.canopen.bus import SocketcandBus, send_burst
 from drivers.errors import BusError
 from drivers.simulation.amplifier import AmplifierSet
 from drivers.simulation.drive import ErrorCode, PowerState
@@ -128,6 +128,7 @@ class SimulatedCell:
         self._enabled = np.zeros(len(ids), dtype=np.int64)
         self._substeps, self._period_us = spec.substeps, spec.sync_period_us
         self._bus, self._clock = bus, clock
+        self._burst: list[can.Message] | None = None
         self.nodes = tuple(
             Node(index, axis, self._amplifiers, partial(self._send_of, index)) for index, axis in enumerate(spec.axes)
         )
@@ -313,8 +314,7 @@ class SimulatedCell:
         now_us = self.time_us
         for node in self.nodes:
             node.end_cycle()
-        for node in synchronised:
-            node.send_sync(now_us)
+        self._send_together(synchronised, now_us)
 
     def _send_of(self, index: int, can_id: int, data: bytes) -> None:
         if not self._disturbance:
@@ -323,9 +323,24 @@ class SimulatedCell:
         for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):
             self._send(*frame)
 
+    def _send_together(self, nodes: Sequence[Node], now_us: int) -> None:
+        """Send the nodes' answers to a SYNC as one burst: on a hub one system call instead of one for each frame."""
+        self._burst = []
+        for node in nodes:
+            node.send_sync(now_us)
+        burst, self._burst = self._burst, None
+        self._put(burst)
+
     def _send(self, can_id: int, data: bytes) -> None:
+        message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+        if self._burst is None:
+            self._put((message,))
+        else:
+            self._burst.append(message)
+
+    def _put(self, messages: Sequence[can.Message]) -> None:
         try:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            send_burst(self._bus, messages)
         except BusError:
             if not self._goes_on():
                 raise

@@ -30,8 +30,8 @@ class Moment:
 
     time_s: float  #: since power-on
     step_s: float  #: length of the substep
-    position_rad: FloatArray  #: at its start, shape (N,); read only
-    velocity_rad_s: FloatArray  #: at its start, shape (N,); read only
+    position_rad: FloatArray  #: position at the start of the step, shape (N,); read only
+    velocity_rad_s: FloatArray  #: velocity at the start of the step, shape (N,); read only
     motor_rad: FloatArray  #: rotor angles, shape (n,); read only
     current_a: FloatArray  #: in the motors, shape (n,); read only
     load_torque_nm: FloatArray  #: torque of the links on each joint in the step before, shape (n,); read only
@@ -128,8 +128,8 @@ class Coupling:
 
     axis: int  #: one joint
     other_axis: float  #: number of the other joint, from 1 as a person counts
-    coulomb_nm: float  #: of the shared friction
-    viscous_nm_s_rad: float  #: of the shared friction
+    coulomb_nm: float  #: dry part of the shared friction
+    viscous_nm_s_rad: float  #: viscous part of the shared friction
     direction: int = field(default=-1, init=False)  #: index of its direction of dry friction, filled in by the plant
 
     @property
@@ -150,12 +150,12 @@ class Elasticity:
     """A spring and a damper in the drive of one motor: the motor becomes a coordinate of its own (two masses)."""
 
     axis: int  #: motor
-    stiffness_nm_per_rad: float  #: in joint units
-    damping_nm_s_per_rad: float  #: in joint units
+    stiffness_nm_per_rad: float  #: stiffness in joint units
+    damping_nm_s_per_rad: float  #: damping in joint units
     gap_rad: float = field(default=0.0, init=False)  #: free play between the flanks, in joint units
     #: The motor's coordinate and its row r of the drive train, filled in by the plant.
     coordinate: int = field(default=-1, init=False)
-    row: FloatArray = field(default_factory=lambda: np.zeros(0), init=False)  #: see `coordinate`
+    row: FloatArray = field(default_factory=lambda: np.zeros(0), init=False)  #: its row of the drive train
 
     def __call__(self, moment: Moment) -> None:
         """Add the drive's torque to the links and subtract it from the motor."""

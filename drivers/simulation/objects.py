@@ -57,8 +57,8 @@ class Entry:
     default: int = 0  #: at power-on, if the node does not compute it
     writable: bool = False  #: by SDO
     mappable: Mappable = Mappable.NO  #: into PDOs
-    lowest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
-    highest: int | None = None  #: range of values that are accepted, inclusive, None for the whole type
+    lowest: int | None = None  #: lowest accepted value, None for the type's own
+    highest: int | None = None  #: highest accepted value, None for the type's own
     text: str = ""  #: value of an entry of kind TEXT
 
     def encode(self, value: int) -> bytes:

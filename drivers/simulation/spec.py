@@ -50,19 +50,19 @@ class AxisSpec:
     """One motor, its amplifier, and the joint of the same number."""
 
     node_id: Annotated[int, Interval(ge=1, le=127)]  #: CANopen node id
-    vendor_id: U32  #: object 1018h
-    product_code: U32  #: object 1018h
-    revision: U32  #: object 1018h
-    serial: U32  #: object 1018h
+    vendor_id: U32  #: 1018h:1
+    product_code: U32  #: 1018h:2
+    revision: U32  #: 1018h:3
+    serial: U32  #: 1018h:4
     counts_per_revolution: Annotated[int, Gt(0)]  #: encoder counts a motor revolution
     rated_current_a: Positive  #: object 6075h (written there in mA); the current reference 6074h is in per mille of it
     peak_current_a: Positive  #: the amplifier's limit; the reference saturates there and statusword bit 11 is set
     gain_nm_per_a: float  #: the true joint drive gain g = N·Gt·Kt [Nm at the joint per A]; may be negative
     motor_inertia_kg_m2: NotNegative  #: of the rotor, seen at the joint (Ia = N²·J)
-    viscous_nm_s_rad: NotNegative  #: friction on the joint side
-    coulomb_nm: NotNegative  #: friction on the joint side
-    motor_viscous_nm_s_rad: NotNegative  #: friction on the motor side, in joint units (divided by N, see eq. 25).
-    motor_coulomb_nm: NotNegative  #: friction on the motor side, in joint units (divided by N, see eq. 25).
+    viscous_nm_s_rad: NotNegative  #: viscous friction on the joint side
+    coulomb_nm: NotNegative  #: dry friction on the joint side
+    motor_viscous_nm_s_rad: NotNegative  #: viscous friction on the motor side, in joint units (divided by N, eq. 25)
+    motor_coulomb_nm: NotNegative  #: dry friction on the motor side, in joint units (eq. 25)
     offset_nm: float  #: constant torque at the joint
     current_noise_a: NotNegative  #: standard deviation of the noise of the current reference [A]
     noise_correlation_s: NotNegative  #: correlation time of that noise (first-order); 0 is white

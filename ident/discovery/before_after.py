@@ -163,8 +163,8 @@ class Assessment:
 
     effects: tuple[PlacedEffect, ...]  #: in the model
     errors: Errors  #: of the model
-    gains: FloatArray  #: drive gains and their σ [Nm at the joint per A], shape (n,)
-    gains_std: FloatArray  #: drive gains and their σ [Nm at the joint per A], shape (n,)
+    gains: FloatArray  #: drive gains [Nm at the joint per A], shape (n,)
+    gains_std: FloatArray  #: their σ, shape (n,)
     shifts: FloatArray  #: of the gains when each move is left out, shape (m, n); zero for fixed gains
 
 
@@ -172,10 +172,10 @@ class Assessment:
 class GainChange:
     """One gain without and with further effects [Nm at the joint per A]."""
 
-    before: float  #: the estimates with their own σ
-    before_std: float  #: the estimates with their own σ
-    after: float  #: the estimates with their own σ
-    after_std: float  #: the estimates with their own σ
+    before: float  #: estimate without the effects
+    before_std: float  #: its σ
+    after: float  #: estimate with the effects
+    after_std: float  #: its σ
     change_std: float  #: σ of the change, 0 for a fixed gain
     significant: bool  #: whether the change is more than noise, at FALSE_ALARM over all axes
 
@@ -194,10 +194,10 @@ class GainChange:
 class BeforeAfter:
     """Two models of the same data."""
 
-    added: tuple[PlacedEffect, ...]  #: effects of the second model only, and of the first only
-    removed: tuple[PlacedEffect, ...]  #: effects of the second model only, and of the first only
-    before: Errors  #: errors of the two
-    after: Errors  #: errors of the two
+    added: tuple[PlacedEffect, ...]  #: effects of the second model only
+    removed: tuple[PlacedEffect, ...]  #: effects of the first model only
+    before: Errors  #: errors of the first
+    after: Errors  #: errors of the second
     gains: tuple[GainChange, ...]  #: one a motor
 
 

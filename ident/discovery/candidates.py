@@ -286,13 +286,13 @@ def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, h
 class _Products:
     """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns."""
 
-    move_jacobian: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
-    move_gram: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
-    move_score: FloatArray  #: JᵀΦ, ΦᵀΦ and Φᵀe of each move
-    part_jacobian: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
-    part_gram: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
-    part_score: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
-    part_held: FloatArray  #: JᵀΦ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor
+    move_jacobian: FloatArray  #: JᵀΦ of each move
+    move_gram: FloatArray  #: ΦᵀΦ of each move
+    move_score: FloatArray  #: Φᵀe of each move
+    part_jacobian: FloatArray  #: JᵀΦ of each fold and motor
+    part_gram: FloatArray  #: ΦᵀΦ of each fold and motor
+    part_score: FloatArray  #: Φᵀe of each fold and motor
+    part_held: FloatArray  #: Φᵀr of each fold and motor
 
 
 def _products(folds: Folds, columns: FloatArray) -> _Products:

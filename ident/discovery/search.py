@@ -50,12 +50,12 @@ class Gates:
     false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
     #: Least share of folds, of the motor's squared residual and of its error on held-out moves.
     folds_better: float = 0.75
-    explained: float = 0.03  #: least share of folds, of the motor's squared residual and of its error on held-out moves
-    error_fall: float = 0.02  #: see `folds_better`
+    explained: float = 0.03  #: least share of the motor's squared residual
+    error_fall: float = 0.02  #: least relative fall of its error on held-out moves
     #: Shares of folds and error on held-out moves from which `strong_false_alarm` applies: with few moves the bootstrap
     #: has little power, and a correct prediction is evidence of another kind.
     strong_folds: float = 0.875
-    strong_fall: float = 0.1  #: see `strong_folds`
+    strong_fall: float = 0.1  #: fall of the error on held-out moves of a strong candidate
     strong_false_alarm: float = 0.05  #: as `false_alarm`, for strong candidates
     draws: int = 999  #: number of draws of the bootstrap
 
@@ -71,13 +71,13 @@ class Finding:
 
     effect: Effect  #: with the setting that explains most
     axis: int  #: index of the joint (or motor)
-    coefficients: FloatArray  #: first estimate of its linear parameters, and their σ by the scatter of moves
-    deviations: FloatArray  #: first estimate of its linear parameters, and their σ by the scatter of moves
+    coefficients: FloatArray  #: first estimate of its linear parameters
+    deviations: FloatArray  #: their σ by the scatter of moves
     probability: float  #: that noise alone makes a candidate this strong somewhere among all
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
-    error_before_percent: float  #: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%]
-    error_after_percent: float  #: of that motor on held-out moves, ‖e‖/‖v‖ of its current [%]
+    error_before_percent: float  #: error of that motor on held-out moves without it, ‖e‖/‖v‖ of the current [%]
+    error_after_percent: float  #: the same with it [%]
     error_fall: float  #: relative fall from one to the other
     held_out_fall: float  #: fall of the whole whitened ‖e‖² on held-out moves; the rank
     passed: bool  #: whether it passes every gate

@@ -277,11 +277,11 @@ class Drift:
     #: Reference of the newest calibrations, in the unit of the gains: the chart's baseline, up to the onset while there
     #: is an alarm; while that is a trend, the beginning of the line.
     baseline: float
-    baseline_std: float  #: see `baseline`
+    baseline_std: float  #: its σ
     #: Z of each calibration, shape (n,), positive where the magnitude is larger; 0 for the first.
     deviations: FloatArray
-    upper: FloatArray  #: C⁺ and C⁻, shape (n,)
-    lower: FloatArray  #: C⁺ and C⁻, shape (n,)
+    upper: FloatArray  #: C⁺, shape (n,)
+    lower: FloatArray  #: C⁻, shape (n,)
     #: T of the line through each calibration and all before it, shape (n,), positive where the magnitude rises.
     trend: FloatArray
     #: In the order of the calibrations, also those that have passed; nothing else here depends on these.
@@ -431,10 +431,10 @@ def trend_statistic(values: FloatArray, stds: FloatArray, dispersion: FloatArray
 class Line:
     """Line through all calibrations of one gain."""
 
-    start: float  #: its value at the first calibration, in the unit of the gain
-    start_std: float  #: its value at the first calibration, in the unit of the gain
-    slope: float  #: in that unit a calibration
-    slope_std: float  #: in that unit a calibration
+    start: float  #: value at the first calibration [unit of the gain]
+    start_std: float  #: its σ
+    slope: float  #: slope in that unit a calibration
+    slope_std: float  #: its σ
 
 
 def fit_line(values: FloatArray, stds: FloatArray) -> Line:

@@ -54,9 +54,9 @@ class Signals:
     time_s: FloatArray  #: since the start of the run, shape (k,)
     #: Since the first run of the session began, shape (k,); equal to time_s without a common clock.
     session_s: FloatArray
-    position_rad: FloatArray  #: of the joints
-    velocity_rad_s: FloatArray  #: of the joints
-    acceleration_rad_s2: FloatArray  #: of the joints
+    position_rad: FloatArray  #: position of the joints
+    velocity_rad_s: FloatArray  #: velocity of the joints
+    acceleration_rad_s2: FloatArray  #: acceleration of the joints
     motor_position_rad: FloatArray  #: of the motors, R q
     #: Mass matrix of links and payload: torque at joint i per unit of acceleration of joint j, with a rotor's inertia
     #: where it is regrouped with theirs, shape (n, n, k).

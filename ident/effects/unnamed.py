@@ -39,7 +39,7 @@ class Smooth(Effect):
     variable: Abscissa  #: x
     #: Its range; outside of it the function keeps its value at the end.
     lower: Annotated[float, Range(-1e12, 1e12)] = 0.0
-    upper: Annotated[float, Range(-1e12, 1e12)] = 1.0  #: see `lower`
+    upper: Annotated[float, Range(-1e12, 1e12)] = 1.0  #: upper end of the range
     signed: Switch = 0  #: 1 where p turns with the direction of motion, else 0
     other_axis: AxisNumber = 0  #: number of the other axis, from 1, where x is its velocity; else 0
 

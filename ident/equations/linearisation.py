@@ -183,10 +183,10 @@ class Folds:
     whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
-    move_hessian: FloatArray  #: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f)
-    move_score: FloatArray  #: JᵀJ and Jᵀe of each move, shape (moves, f, f) and (moves, f)
-    part_hessian: FloatArray  #: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f)
-    part_score: FloatArray  #: JᵀJ and Jᵀr of each fold and motor, shape (folds, n, f, f) and (folds, n, f)
+    move_hessian: FloatArray  #: JᵀJ of each move, shape (moves, f, f)
+    move_score: FloatArray  #: Jᵀe of each move, shape (moves, f)
+    part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, n, f, f)
+    part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, n, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (n, f)
     residual: FloatArray  #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
 

@@ -55,8 +55,8 @@ class Reduction:
     runs: tuple[str, ...]  #: names of the runs
     #: For each mounting, −1 (without load) first, the triangle of each joint's rows.
     joints: tuple[tuple[FloatArray, ...], ...]
-    joint_rows: IntArray  #: equations of each axis, shape (n,)
-    motor_rows: IntArray  #: equations of each axis, shape (n,)
+    joint_rows: IntArray  #: equations of each joint, shape (n,)
+    motor_rows: IntArray  #: equations of each motor, shape (n,)
     clusters: tuple[Cluster, ...]  #: in the order of the runs
 
     def base(self) -> BaseParameters:

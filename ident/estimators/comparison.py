@@ -41,8 +41,8 @@ class Trial:
     """One estimator under one filter."""
 
     estimator: str  #: its name
-    position_cutoff_hz: float  #: of the filters
-    decimation_cutoff_hz: float  #: of the filters
+    position_cutoff_hz: float  #: cut-off of the position filter
+    decimation_cutoff_hz: float  #: cut-off of the decimation filter
     gains: FloatArray | None  #: Nm/A, shape (n,); None where it found none
     std: FloatArray | None  #: of the gains, same shape
     relative_error_percent: float | None  #: ‖ρ‖/‖Y‖ of the fit; it means nothing beside that of another filter

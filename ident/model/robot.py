@@ -35,8 +35,8 @@ class Joint:
     name: str  #: as in the URDF
     kind: JointKind  #: revolute or prismatic
     parent: int  #: index of the joint before it, -1 for the base
-    rotation: FloatArray  #: placement of the joint frame in the parent's frame at position zero, (3, 3) and (3,)
-    translation_m: FloatArray  #: placement of the joint frame in the parent's frame at position zero, (3, 3) and (3,)
+    rotation: FloatArray  #: rotation of the joint frame in the parent's frame at position zero, (3, 3)
+    translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
 
 

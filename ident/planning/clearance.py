@@ -29,8 +29,8 @@ class Capsule:
 
     name: str  #: for messages
     link: int  #: index of the joint that it moves with, BASE for the base
-    start_m: tuple[float, float, float]  #: ends of the segment in that joint's frame (3 numbers each)
-    end_m: tuple[float, float, float]  #: ends of the segment in that joint's frame (3 numbers each)
+    start_m: tuple[float, float, float]  #: first end of the segment in that joint's frame
+    end_m: tuple[float, float, float]  #: second end
     radius_m: float  #: above zero
 
 
@@ -39,8 +39,8 @@ class Box:
     """Axis-aligned box in the base frame."""
 
     name: str  #: for messages
-    lower_m: tuple[float, float, float]  #: opposite corners
-    upper_m: tuple[float, float, float]  #: opposite corners
+    lower_m: tuple[float, float, float]  #: lower corner
+    upper_m: tuple[float, float, float]  #: upper corner
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +59,8 @@ class Scene:
 class Obstruction:
     """Reason why a path is not clear."""
 
-    first: str  #: names of the two bodies
-    second: str  #: names of the two bodies
+    first: str  #: name of one body
+    second: str  #: name of the other
     distance_m: float  #: found there; negative when they overlap
     position: tuple[float, ...]  #: of the joints there [rad or m]
 

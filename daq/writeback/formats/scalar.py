@@ -24,8 +24,8 @@ class IntegerStyle:
     """Integers of a type in decimal, or in hexadecimal as two's complement."""
 
     bits: int  #: of the type
-    lowest: int  #: limits
-    highest: int  #: limits
+    lowest: int  #: lowest value
+    highest: int  #: highest value
 
     def read(self, text: str) -> int:
         """Parse an integer.
@@ -90,8 +90,8 @@ class Scalar:
     key: str  #: its key in the cell configuration
     value: float  #: the number
     text: str  #: the number as it is written
-    start: int  #: its characters in the text, quotes outside
-    end: int  #: its characters in the text, quotes outside
+    start: int  #: its first character in the text, inside any quotes
+    end: int  #: the character behind its last one
     line: int  #: from 1
     #: Style of the integers that are allowed there; None where any decimal number is.
     integer: IntegerStyle | None = None
@@ -131,8 +131,8 @@ class Scalar:
 class RewrittenGain:
     """A gain in a document, whose unit may be another."""
 
-    old: float  #: gain there now, and as it would be read back from the new text [gain unit]
-    new: float  #: gain there now, and as it would be read back from the new text [gain unit]
+    old: float  #: gain there now [unit]
+    new: float  #: gain as it would be read back from the new text [unit]
     spelling: str  #: the new number in the document; unchanged text where it is the same number
 
 

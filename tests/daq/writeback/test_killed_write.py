@@ -5,22 +5,24 @@ from __future__ import annotations
 import gc
 import os
 import re
+import shutil
 import stat
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from daq.ledger.audit import AuditAction, AuditVerdict, Content, verify
+from daq.workflow.calibration_file import encode
 from daq.writeback.file_access import backups
 from daq.writeback.file_target import FileTarget
 from daq.writeback.formats.document import decode
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose, rollback
-from ident.calibration import Calibration
 from ident.estimators.estimate import RelativeError
 from tests.daq import killing
 from tests.daq.calibrations import demo_calibration
@@ -34,15 +36,18 @@ LEFT = re.compile(r"x\.yaml|x\.yaml\..*\.bak|audit\.jsonl|\.x\.yaml\.lock|\.x\.y
 """Files that may remain: the files themselves, whole backups, the lock file without a holder, unfinished copies."""
 
 
-def _calibration(gain: float) -> Calibration:
+@cache
+def _request(gain: float) -> Request:
+    """A calibration of this gain, with the bytes of its file: these take long to make."""
     calibration = demo_calibration()
-    return replace(
+    calibration = replace(
         calibration,
         gains=(replace(calibration.gains[0], value=gain, std=0.1),),
         relative_error_percent=RelativeError((3.1,), 3.1),
         holdout_error_percent=RelativeError((3.2,), 3.2),
         nameplate_holdout_error_percent=RelativeError((4.2,), 4.2),
     )
+    return Request(calibration, NOW, content=encode(calibration))
 
 
 @dataclass(frozen=True)
@@ -61,13 +66,13 @@ class Place:
 
     def apply(self, gain: float, minutes: int = 0) -> None:
         """Write a gain."""
-        proposal = propose(FileTarget(self.file, KEYS), Request(_calibration(gain), NOW))
+        proposal = propose(FileTarget(self.file, KEYS), _request(gain))
         assert proposal.refusals == ()
         apply(proposal, NOW + timedelta(minutes=minutes), audit=self.audit, who="Ada")
 
     def to_apply(self) -> Callable[[], object]:
         """The write itself, everything before it done: another gain goes in."""
-        proposal = propose(FileTarget(self.file, KEYS), Request(_calibration(33.9), NOW))
+        proposal = propose(FileTarget(self.file, KEYS), _request(33.9))
         return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
 
     def to_roll_back(self) -> Callable[[], object]:
@@ -149,14 +154,16 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
     assert before != after
     outcomes: Counter[Content] = Counter()
     left: set[str] = set()
+    place, kept = prepare(tmp_path / "place"), tmp_path / "kept"
+    shutil.copytree(place.folder, kept)
     number = 0
     gc.disable()  # of the child: when it collects is not part of the path
     try:
         while True:
             number += 1
-            with monkeypatch.context() as patch:
-                patch.setattr(os, "fsync", _unflushed)
-                place = prepare(tmp_path / str(number))
+            # Copied back, because preparing it takes longer; into the same folder, because the audit names the file.
+            shutil.rmtree(place.folder)
+            shutil.copytree(kept, place.folder)
             killed = killed_at(number, work(place))
             outcomes[_check(place, before, after)] += 1
             left |= place.kinds_left()
