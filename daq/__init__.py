@@ -35,97 +35,70 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from daq.config.cell import Cell
-    from daq.config.cell_file import load_cell
-    from daq.config.controller import ControllerFormat
-    from daq.errors import (
-        CalibrationRefused,
-        ConfigurationError,
-        ControllerChanged,
-        ControllerUnfit,
-        DaqError,
-        DataError,
-        ExitCode,
-        LogUnreadable,
-        OutputFailed,
-        UsageError,
-    )
-    from daq.log.conversion import load_run
-    from daq.log.reader import Log, LossyLogs, read_log
-    from daq.workflow.calibration_file import load as load_calibration
-    from daq.workflow.calibration_file import save as save_calibration
-    from daq.workflow.fit import Fit, calibration_of, close_loop, fit, fit_logs
-    from daq.workflow.validate import Validation, validate
-    from daq.writeback.drive_target import DriveTarget
-    from daq.writeback.file_target import FileTarget
-    from daq.writeback.request import Request
-    from daq.writeback.target import Proposal, Written, apply, propose, rollback
-    from ident.calibration import Calibration
-
-__all__ = [
-    "Calibration",
-    "CalibrationRefused",
-    "Cell",
-    "ConfigurationError",
-    "ControllerChanged",
-    "ControllerFormat",
-    "ControllerUnfit",
-    "DaqError",
-    "DataError",
-    "DriveTarget",
-    "ExitCode",
-    "FileTarget",
-    "Fit",
-    "Log",
-    "LogUnreadable",
-    "LossyLogs",
-    "OutputFailed",
-    "Proposal",
-    "Request",
-    "UsageError",
-    "Validation",
-    "Written",
-    "apply",
-    "calibration_of",
-    "close_loop",
-    "fit",
-    "fit_logs",
-    "load_calibration",
-    "load_cell",
-    "load_run",
-    "propose",
-    "read_log",
-    "rollback",
-    "save_calibration",
-    "validate",
-]
+    from daq.config.cell import Cell as Cell
+    from daq.config.cell_file import load_cell as load_cell
+    from daq.config.controller import ControllerFormat as ControllerFormat
+    from daq.errors import CalibrationRefused as CalibrationRefused
+    from daq.errors import ConfigurationError as ConfigurationError
+    from daq.errors import ControllerChanged as ControllerChanged
+    from daq.errors import ControllerUnfit as ControllerUnfit
+    from daq.errors import DaqError as DaqError
+    from daq.errors import DataError as DataError
+    from daq.errors import ExitCode as ExitCode
+    from daq.errors import LogUnreadable as LogUnreadable
+    from daq.errors import OutputFailed as OutputFailed
+    from daq.errors import UsageError as UsageError
+    from daq.log.conversion import load_run as load_run
+    from daq.log.reader import Log as Log
+    from daq.log.reader import LossyLogs as LossyLogs
+    from daq.log.reader import read_log as read_log
+    from daq.workflow.calibration_file import load_calibration as load_calibration
+    from daq.workflow.calibration_file import save_calibration as save_calibration
+    from daq.workflow.fit import Fit as Fit
+    from daq.workflow.fit import calibration_of as calibration_of
+    from daq.workflow.fit import close_loop as close_loop
+    from daq.workflow.fit import fit as fit
+    from daq.workflow.fit import fit_logs as fit_logs
+    from daq.workflow.validate import Validation as Validation
+    from daq.workflow.validate import validate as validate
+    from daq.writeback.drive_target import DriveTarget as DriveTarget
+    from daq.writeback.file_target import FileTarget as FileTarget
+    from daq.writeback.request import Request as Request
+    from daq.writeback.target import Proposal as Proposal
+    from daq.writeback.target import Written as Written
+    from daq.writeback.target import apply as apply
+    from daq.writeback.target import propose as propose
+    from daq.writeback.target import rollback as rollback
+    from ident.calibration import Calibration as Calibration
 
 _HOMES = {
-    "daq.config.cell": ("Cell",),
-    "daq.config.cell_file": ("load_cell",),
-    "daq.config.controller": ("ControllerFormat",),
-    "daq.log.conversion": ("load_run",),
-    "daq.log.reader": ("Log", "LossyLogs", "read_log"),
-    "daq.workflow.calibration_file": ("load_calibration", "save_calibration"),
-    "daq.workflow.fit": ("Fit", "calibration_of", "close_loop", "fit", "fit_logs"),
-    "daq.workflow.validate": ("Validation", "validate"),
-    "daq.writeback.drive_target": ("DriveTarget",),
-    "daq.writeback.file_target": ("FileTarget",),
-    "daq.writeback.request": ("Request",),
-    "daq.writeback.target": ("Proposal", "Written", "apply", "propose", "rollback"),
-    "ident.calibration": ("Calibration",),
+    "daq.config.cell": "Cell",
+    "daq.config.cell_file": "load_cell",
+    "daq.config.controller": "ControllerFormat",
+    "daq.errors": "CalibrationRefused ConfigurationError ControllerChanged ControllerUnfit DaqError DataError ExitCode "
+    "LogUnreadable OutputFailed UsageError",
+    "daq.log.conversion": "load_run",
+    "daq.log.reader": "Log LossyLogs read_log",
+    "daq.workflow.calibration_file": "load_calibration save_calibration",
+    "daq.workflow.fit": "Fit calibration_of close_loop fit fit_logs",
+    "daq.workflow.validate": "Validation validate",
+    "daq.writeback.drive_target": "DriveTarget",
+    "daq.writeback.file_target": "FileTarget",
+    "daq.writeback.request": "Request",
+    "daq.writeback.target": "Proposal Written apply propose rollback",
+    "ident.calibration": "Calibration",
 }
-_MODULES = {name: home for home, names in _HOMES.items() for name in names}
-_RENAMED = {"load_calibration": "load", "save_calibration": "save"}
+_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
-def __getattr__(name: str) -> object:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
-    module = import_module(_MODULES.get(name, "daq.errors"))
-    value = globals()[name] = getattr(module, _RENAMED.get(name, name))
-    return value
+if not TYPE_CHECKING:  # a type checker knows the names above, and no others
 
+    def __getattr__(name: str) -> object:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
+        return value
 
-def __dir__() -> list[str]:
-    return __all__
+    def __dir__() -> list[str]:
+        return __all__

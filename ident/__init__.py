@@ -27,67 +27,42 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ident.calibration import Calibration, calibration_of
-    from ident.data.conditioning import Conditioning
-    from ident.data.dataset import Dataset, differentiate, planned
-    from ident.data.run import Run
-    from ident.discovery.loop import Evidence, Step, find_effects, gather
-    from ident.errors import (
-        DataUnfit,
-        EffectRefused,
-        IdentificationError,
-        ModelError,
-        NotConverged,
-        PayloadUnseen,
-        RankDeficient,
-        TooFewMoves,
-    )
-    from ident.estimators.estimate import Estimate, RelativeError
-    from ident.estimators.identify import Identification, identify
-    from ident.estimators.method import Method
-    from ident.model.bodies import Payload
-    from ident.model.model import DriveTrain, Model
-    from ident.model.robot import Motion, Robot, robot_from_urdf
-    from ident.prediction import measured_torque, predict_current, predict_torque
-
-__all__ = [
-    "Calibration",
-    "Conditioning",
-    "DataUnfit",
-    "Dataset",
-    "DriveTrain",
-    "EffectRefused",
-    "Estimate",
-    "Evidence",
-    "Identification",
-    "IdentificationError",
-    "Method",
-    "Model",
-    "ModelError",
-    "Motion",
-    "NotConverged",
-    "Payload",
-    "PayloadUnseen",
-    "RankDeficient",
-    "RelativeError",
-    "Robot",
-    "Run",
-    "Step",
-    "TooFewMoves",
-    "calibration_of",
-    "differentiate",
-    "find_effects",
-    "gather",
-    "identify",
-    "measured_torque",
-    "planned",
-    "predict_current",
-    "predict_torque",
-    "robot_from_urdf",
-]
+    from ident.calibration import Calibration as Calibration
+    from ident.calibration import calibration_of as calibration_of
+    from ident.data.conditioning import Conditioning as Conditioning
+    from ident.data.dataset import Dataset as Dataset
+    from ident.data.dataset import differentiate as differentiate
+    from ident.data.dataset import planned as planned
+    from ident.data.run import Run as Run
+    from ident.discovery.loop import Evidence as Evidence
+    from ident.discovery.loop import Step as Step
+    from ident.discovery.loop import find_effects as find_effects
+    from ident.discovery.loop import gather as gather
+    from ident.errors import DataUnfit as DataUnfit
+    from ident.errors import EffectRefused as EffectRefused
+    from ident.errors import IdentificationError as IdentificationError
+    from ident.errors import ModelError as ModelError
+    from ident.errors import NotConverged as NotConverged
+    from ident.errors import PayloadUnseen as PayloadUnseen
+    from ident.errors import RankDeficient as RankDeficient
+    from ident.errors import TooFewMoves as TooFewMoves
+    from ident.estimators.estimate import Estimate as Estimate
+    from ident.estimators.estimate import RelativeError as RelativeError
+    from ident.estimators.identify import Identification as Identification
+    from ident.estimators.identify import identify as identify
+    from ident.estimators.method import Method as Method
+    from ident.model.bodies import Payload as Payload
+    from ident.model.model import DriveTrain as DriveTrain
+    from ident.model.model import Model as Model
+    from ident.model.robot import Motion as Motion
+    from ident.model.robot import Robot as Robot
+    from ident.model.robot import robot_from_urdf as robot_from_urdf
+    from ident.prediction import measured_torque as measured_torque
+    from ident.prediction import predict_current as predict_current
+    from ident.prediction import predict_torque as predict_torque
 
 # Importing the package stays light: a name brings its module along when it is first used.
-_MODULES = {
+_HOMES = {
     "ident.calibration": "Calibration calibration_of",
     "ident.data.conditioning": "Conditioning",
     "ident.data.dataset": "Dataset differentiate planned",
@@ -103,17 +78,17 @@ _MODULES = {
     "ident.model.robot": "Motion Robot robot_from_urdf",
     "ident.prediction": "measured_torque predict_current predict_torque",
 }
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names.split()}
+_MODULES = {name: home for home, names in _HOMES.items() for name in names.split()}
+__all__ = list(_MODULES)
 
 
-if not TYPE_CHECKING:  # a type checker knows the names from above, and no others
+if not TYPE_CHECKING:  # a type checker knows the names above, and no others
 
     def __getattr__(name: str) -> object:
-        if name not in _MODULE_OF:
-            raise AttributeError(f"module 'ident' has no attribute {name!r}; it exports {', '.join(__all__)}")
-        value = getattr(import_module(_MODULE_OF[name]), name)
-        globals()[name] = value
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it exports {', '.join(__all__)}")
+        value = globals()[name] = getattr(import_module(_MODULES[name]), name)
         return value
 
     def __dir__() -> list[str]:
-        return sorted((*globals(), *__all__))
+        return __all__

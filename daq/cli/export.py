@@ -70,7 +70,7 @@ def export_urdf_verb(
     from daq.config.yaml_file import read_bytes
     from daq.environment import software
     from daq.report.urdf import urdf_document, urdf_view
-    from daq.workflow.calibration_file import load
+    from daq.workflow.calibration_file import load_calibration
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
 
@@ -78,7 +78,7 @@ def export_urdf_verb(
     given = cell or urdf or Path()
     require_solver()
     check_output(out, (calibration, given), FORMAT)
-    known = load(calibration)
+    known = load_calibration(calibration)
     left = known.relative_error_percent.total
     if not left <= DOUBTFUL_PERCENT:  # it explains too little of the torque to derive bodies from it
         raise ModelContradicted(

@@ -124,7 +124,7 @@ def _fit_cases(
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
     from daq.report.paper_tables import case_tables, page
-    from daq.workflow.calibration_file import save
+    from daq.workflow.calibration_file import save_calibration
     from daq.workflow.cases import CASES, CaseFit, calibration_of_case, fit_case, reduce_logs
 
     created = datetime.now(UTC)
@@ -144,7 +144,7 @@ def _fit_cases(
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
-            save(calibrations[name], file)
+            save_calibration(calibrations[name], file)
         replace_file(page_file, page(f"Identification of {reduced.cell.name}", tables, marker=TABLES).encode())
     if json:
         print_json(cases_document(fits, calibrations))
@@ -236,11 +236,11 @@ RESIDUAL = Verb(
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
     from daq.errors import writing
     from daq.report.plots import draw_fit
-    from daq.workflow.calibration_file import save
+    from daq.workflow.calibration_file import save_calibration
 
     if out is not None:
         with writing(out):
-            save(calibration, out)
+            save_calibration(calibration, out)
     if pictures is not None:
         with writing(pictures):
             pictures.mkdir(parents=True, exist_ok=True)

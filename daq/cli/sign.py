@@ -60,10 +60,10 @@ def sign_calibration_verb(
 
     from daq.cli.terminal import print_view
     from daq.report.gains import gain_table
-    from daq.workflow.calibration_file import load
+    from daq.workflow.calibration_file import load_calibration
     from daq.writeback.signature import needs_password, sign
 
-    known = load(calibration)
+    known = load_calibration(calibration)
     password = _password() if needs_password(key) else ""
     if not json:
         print_view([gain_table(known.gains, title=f"{known.cell}, {known.created}")])

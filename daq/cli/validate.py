@@ -72,7 +72,7 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
     """Load calibrations by label, the one to validate first; a file that is named twice counts once."""
     from collections import Counter
 
-    from daq.workflow.calibration_file import load
+    from daq.workflow.calibration_file import load_calibration
 
     files = [calibration]
     for place in beside:
@@ -86,7 +86,7 @@ def load_beside(calibration: Path, beside: list[Path]) -> dict[str, Calibration]
             )
         files += [file for file in found if file.resolve() not in {other.resolve() for other in files}]
     stems = Counter(file.stem for file in files)
-    return {file.stem if stems[file.stem] == 1 else str(file): load(file) for file in files}
+    return {file.stem if stems[file.stem] == 1 else str(file): load_calibration(file) for file in files}
 
 
 VALIDATE = Verb(

@@ -9,8 +9,6 @@ from math import pi
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from daq.config.clearance import Clearance
@@ -19,12 +17,11 @@ from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistoryPlace
 from daq.config.recalibration import Recalibration
 from daq.config.yaml_file import FileName, Name
 from drivers.profiles.profile import DriveProfile, Identity
+from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.model.bodies import Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.robot import JointKind, robot_from_urdf
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

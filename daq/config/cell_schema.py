@@ -11,7 +11,6 @@ from math import pi
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from daq.config.cell import DEGREE, MILLIMETRE, Bus, JointUnit, MotionPolicy, Sync, UnnamedBus
@@ -20,8 +19,8 @@ from daq.config.controller import Controller
 from daq.config.policy import DEFAULT_APPLY_POLICY, ApplyPolicy, HistorySection
 from daq.config.recalibration import RecalibrationSection
 from daq.config.yaml_file import FileName, Name, Positive, StrictModel, not_in_file
+from ident.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 ONE_BUS, SEVERAL_BUSES = not_in_file("one bus"), not_in_file("several buses")
 U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 

@@ -31,8 +31,7 @@ from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
 from daq.report.residual import summary
-from daq.workflow.calibration_file import load
-from daq.workflow.calibration_file import save as save_calibration
+from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.plan import Plan
 from daq.workflow.plan_file import load_plan, save_plan
 from daq.workflow.record import Recorded
@@ -235,7 +234,7 @@ def calibration_of_session(session: Session) -> Calibration | None:
     if fitted is None or sha256_of(path) != fitted.calibration_sha256:
         return None
     try:
-        found = load(path)
+        found = load_calibration(path)
     except (CalibrationMissing, CalibrationUnreadable, CalibrationRefused):
         return None
     own = {run.sha256 for run in session.state.runs}

@@ -16,10 +16,10 @@ from daq.errors import ClockImplausible, CurrentSaturated, CyclesLost, LogIncomp
 from daq.log.metadata import Readback
 from daq.log.reader import Log, LossyLogs, read_log, reports_only_losses
 from drivers.stream.sample import CellEvent, EventKind
+from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Recording, Run
 
 _LOG = logging.getLogger("drivegain")
-FloatArray = NDArray[np.float64]
 LIMIT_MARGIN = 0.05  #: Largest excursion beyond the limits, as a share of the joint's range
 LARGEST_SATURATED = 0.1  #: Largest share of an axis's samples with an active limit; these samples are masked
 STEP_TOLERANCE = 0.5
@@ -196,7 +196,7 @@ def moves(events: tuple[CellEvent, ...], time_ns: NDArray[np.int64]) -> NDArray[
     return number[np.maximum(np.searchsorted(begin_ns, time_ns, side="right") - 1, 0)]
 
 
-def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: NDArray[np.bool_] | None = None) -> None:
+def check_limits(name: str, position_rad: FloatArray, cell: Cell, valid: BoolArray | None = None) -> None:
     """Refuse positions that no joint of this cell can have.
 
     Args:

@@ -17,7 +17,6 @@ from math import ceil, log2, pi
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
@@ -27,11 +26,10 @@ from daq.log.conversion import check_limits, scaling
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics
 from daq.log.writer import LogContent, LogWriter
 from drivers.stream.sample import Sample
+from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
 
 _LOG = logging.getLogger("drivegain")
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 LARGEST_RAW = 2**31 - 1
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
 LARGEST_OUTLIER = 1000.0

@@ -5,15 +5,10 @@ from __future__ import annotations
 import io
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-FloatArray = NDArray[np.float64]
 
 # Okabe and Ito, "Color Universal Design" (2008): distinct to colour-blind readers and in grey print.
 BLUE = "#0072B2"

@@ -22,7 +22,6 @@ from daq.report.picture import (
     PURPLE,
     QUANTITY,
     SKY,
-    FloatArray,
     grid,
     legend_below,
     panels,
@@ -30,6 +29,7 @@ from daq.report.picture import (
     unformatted,
 )
 from daq.workflow.fit import Fit
+from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.discovery.loop import Evidence
 from ident.discovery.search import Finding

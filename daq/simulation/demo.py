@@ -21,7 +21,7 @@ from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.report.plots import draw_fit
 from daq.simulation.simulation_file import load_simulation, require_simulator
-from daq.workflow.calibration_file import as_document, save
+from daq.workflow.calibration_file import as_document, save_calibration
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
 from daq.workflow.plan import Plan, plan
 from daq.workflow.plan_file import save_plan
@@ -109,7 +109,7 @@ def demonstrate(settings: Settings, now: Callable[[], datetime], reporter: Progr
     reporter.step("detect missing effects")
     fitted = close_loop(fitted, settings.seed, lambda step: reporter.progress(0, 0, step))
     calibration = calibration_of(fitted, now())
-    save(calibration, out / "calibration.yaml")
+    save_calibration(calibration, out / "calibration.yaml")
     reporter.step("write the calibration to a copy of the controller file")
     if cell.controller_path is None:
         raise UsageError("the demo cell", found="no controller", expected="one", remedy="install drivegain again")

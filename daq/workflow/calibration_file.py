@@ -168,7 +168,7 @@ def _as_entry(value: Any) -> Any:
     return {f.name: _as_entry(getattr(value, f.name)) for f in fields(value)} if is_dataclass(value) else value
 
 
-def save(calibration: Calibration, path: Path) -> None:
+def save_calibration(calibration: Calibration, path: Path) -> None:
     """Write `calibration` to `path` atomically, and read it back before it replaces an older file.
 
     Raises:
@@ -200,7 +200,7 @@ def encode(calibration: Calibration) -> bytes:
     return (_HEADER + text).encode()
 
 
-def load(path: Path) -> Calibration:
+def load_calibration(path: Path) -> Calibration:
     """Read a calibration.
 
     Raises:

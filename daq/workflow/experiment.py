@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from itertools import cycle, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell, WeighedPayload, model_of
 from daq.config.clearance import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.motion.move import Trapezoid, synchronised
+from ident.arrays import BoolArray, FloatArray
 from ident.data.conditioning import decimator
 from ident.model.robot import JointKind, Motion, Robot, poses
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
@@ -111,9 +111,6 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
 def _point(vector: FloatArray) -> tuple[float, float, float]:
     return float(vector[0]), float(vector[1]), float(vector[2])
 
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 NOISE_SHARE = 0.006
 """Standard deviation of a row's residual, as a share of the motor's current at its torque limit: some 4 % of the rms

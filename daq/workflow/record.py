@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config import cell as declared
 from daq.config.bus import cell_address, drive_axes, load_warnings
@@ -50,8 +49,6 @@ from drivers.stream.sync import (
     TimedSync,
 )
 from ident.model.bodies import Payload
-
-FloatArray = NDArray[np.float64]
 
 LOCKSTEP_TIMEOUT_S = 3.0
 """A simulated cell on a busy machine may be that late; one that ended is reported in four seconds."""

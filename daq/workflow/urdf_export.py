@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell
 from daq.errors import ConfigurationMissing, ControllerUnfit, SchemaMismatch
 from daq.writeback.formats.xml_document import Element, parse
+from ident.arrays import FloatArray
 from ident.calibration import Calibration
 from ident.effects.effect import Property
 from ident.model.bodies import Body
@@ -26,8 +26,6 @@ from ident.physical.physical import (
     regroup,
 )
 from ident.prediction import placed_effect
-
-FloatArray = NDArray[np.float64]
 
 SAMPLES = 400
 """Random states on which torques are compared: some ten times as many equations as a six-axis arm has parameters."""

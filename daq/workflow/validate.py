@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
+from ident.arrays import BoolArray, FloatArray
 from ident.calibration import Calibration, Parameter
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
@@ -31,9 +31,6 @@ from ident.estimators.payload_estimate import as_one_body, joined, payload_besid
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque, standard_parameters
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 class DataUse(Enum):

@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.workflow.calibration_file import as_document, load
+from daq.workflow.calibration_file import as_document, load_calibration
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import CELLS, FleetCell, make_fleet, print_line
 
@@ -108,7 +108,7 @@ def _single(folder: Path) -> dict[str, Any]:
 def _kept(out: Path, name: str) -> dict[str, Any]:
     (file,) = out.glob(f"{name}-*.yaml")
     # Through JSON as the single ones: it gives every number back as it was.
-    kept: dict[str, Any] = json.loads(json.dumps(_timeless(as_document(load(file)))))
+    kept: dict[str, Any] = json.loads(json.dumps(_timeless(as_document(load_calibration(file)))))
     return kept
 
 

@@ -21,7 +21,7 @@ from daq.ledger.audit import read as read_audit
 from daq.ledger.store import HistoryStore
 from daq.ledger.verify import writes_to
 from daq.log.reader import read_log
-from daq.workflow.calibration_file import load
+from daq.workflow.calibration_file import load_calibration
 
 FILES = Path(__file__).parents[1] / "data" / "previous_version"
 J4 = {"wls": -9.0029, "ml": -9.6291, "tls": -9.507}
@@ -64,7 +64,7 @@ def _digest(cell: Path, method: str) -> str:
 
 def test_calibrations_and_the_log_are_read(folder: Path) -> None:
     for method, gain in J4.items():
-        calibration = load(folder / f"{method}.yaml")
+        calibration = load_calibration(folder / f"{method}.yaml")
         assert (calibration.cell, calibration.method) == ("press", method)
         assert calibration.gains[3].value == pytest.approx(gain, abs=5e-4)
     log = read_log(folder / "held-out.mcap")

@@ -26,7 +26,7 @@ from daq.ledger.audit import AuditAction, read, verify
 from daq.ledger.judgement import NOTHING, Known
 from daq.ledger.store import HistoryStore
 from daq.report.proposal import change_table
-from daq.workflow.calibration_file import decode, encode, save
+from daq.workflow.calibration_file import decode, encode, save_calibration
 from daq.writeback.request import GainChange
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
@@ -74,7 +74,7 @@ def bench(tmp_path: Path) -> Bench:
     cell.write_text(text)
     shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
     calibration = recorded(demo_calibration(), datetime.now(UTC))
-    save(replace(calibration, configuration_sha256=load_cell(cell).digest), tmp_path / "calibration.yaml")
+    save_calibration(replace(calibration, configuration_sha256=load_cell(cell).digest), tmp_path / "calibration.yaml")
     return Bench(cell, controllers / "demo.yaml", tmp_path / "calibration.yaml")
 
 
@@ -163,7 +163,7 @@ def test_another_configuration_is_refused_until_someone_says_so(
 
 def test_the_mass_may_be_entered_at_the_write_back(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     once = with_recordings(recorded(demo_calibration(), datetime.now(UTC)), entered_kg=None)
-    save(replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration)
+    save_calibration(replace(once, configuration_sha256=load_cell(bench.cell).digest), bench.calibration)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--payload-mass disc=KG" in capsys.readouterr().err
     assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
@@ -266,7 +266,9 @@ def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(
         declared = load_cell(file)
         made = recorded(demo_calibration(), datetime.now(UTC))
         gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
-        save(replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains), bench.calibration)
+        save_calibration(
+            replace(made, cell=declared.name, configuration_sha256=declared.digest, gains=gains), bench.calibration
+        )
         base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
         assert main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base]) == ExitCode.OK
     for file in (bench.cell, other):
@@ -368,7 +370,7 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     known = decode(bench.calibration.read_bytes(), "")
     gain = known.gains[3]
     moved = replace(gain, value=gain.value * 1.015)
-    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
     found = fourth()
     assert found["change_sigmas"] == pytest.approx(0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01)
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
@@ -392,7 +394,7 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     # Another calibration under the same name.
     known = decode(fitted, "")
     moved = replace(known.gains[3], value=known.gains[3].value * 1.01)
-    save(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
+    save_calibration(replace(known, gains=(*known.gains[:3], moved, *known.gains[4:])), bench.calibration)
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
     assert "the keys or the factors have changed since the dry run" in " ".join(capsys.readouterr().err.split())
     assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
@@ -425,7 +427,7 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
 ) -> None:
     known = decode(bench.calibration.read_bytes(), "")
     digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
-    save(with_recordings(known, controller_sha256=digest), bench.calibration)
+    save_calibration(with_recordings(known, controller_sha256=digest), bench.calibration)
     bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--base" not in capsys.readouterr().out

@@ -33,7 +33,7 @@ from daq.jobs import fleet as fleet_module
 from daq.jobs.cell_fit import Failure, Fitted, Loop, fit_cell, open_cache
 from daq.jobs.fleet import FleetRow, WorkerPool, each, fit_fleet, worker_pool
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, at_hand, by_cell, list_logs, survey
-from daq.workflow.calibration_file import as_document, load
+from daq.workflow.calibration_file import as_document, load_calibration
 from daq.workflow.fit import calibration_of, fit
 from tests.bench.fleet_cells import FleetCell, make_cell, plans_of
 from tests.daq.logs import content, samples, write
@@ -80,7 +80,7 @@ def _timeless(document: dict[str, object]) -> dict[str, Any]:
 
 def _files(out: Path) -> dict[str, dict[str, Any]]:
     """Calibrations in a folder, by cell."""
-    made = [load(file) for file in sorted(out.glob("*.yaml"))]
+    made = [load_calibration(file) for file in sorted(out.glob("*.yaml"))]
     return {calibration.cell: _timeless(as_document(calibration)) for calibration in made}
 
 
@@ -119,7 +119,7 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
         assert [float(row[f"{gain['axis']} gain"]) for gain in cell["gains"]] == [
             gain["value"] for gain in single[row["cell"]]["gains"]
         ]
-        assert load(Path(row["calibration"])).cell == row["cell"]
+        assert load_calibration(Path(row["calibration"])).cell == row["cell"]
 
 
 def test_processes_give_the_same(fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from daq.ledger.ledger import Ledger
 from daq.ledger.store import HistoryStore
 from daq.ledger.watch import Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
-from daq.workflow.calibration_file import save
+from daq.workflow.calibration_file import save_calibration
 from daq.writeback.file_access import resolve_links
 from daq.writeback.formats.document import decode as read_controller
 from daq.writeback.formats.scalar import rewrite_gain
@@ -131,7 +131,7 @@ def test_an_empty_history_says_what_to_do(cell: Path, capsys: pytest.CaptureFixt
 
 def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = cell.parent / "calibration.yaml"
-    save(calibration_of(0), file)
+    save_calibration(calibration_of(0), file)
     assert main(["history", str(cell), "--add", str(file)]) == 0
     shown = capsys.readouterr()
     assert "entered" in shown.err
@@ -139,7 +139,7 @@ def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixt
     assert "baseline: 1 of 12" in shown.out
     assert main(["history", str(cell), "--add", str(file)]) == 0
     assert "already" in capsys.readouterr().err
-    save(replace(calibration_of(1), cell="another"), file)
+    save_calibration(replace(calibration_of(1), cell="another"), file)
     assert main(["history", str(cell), "--add", str(file)]) == 4
     assert "another" in capsys.readouterr().err
     assert main(["history", str(cell), "--add", str(cell)]) == 4
@@ -306,7 +306,7 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
         digest = ""
         if own is not None:
             file = cell.parent / "own.yaml"
-            save(own, file)
+            save_calibration(own, file)
             digest = sha256_of(file) or ""
             ledger.add(own, digest=digest, at=BEGIN)
         changes = [GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names]
@@ -608,7 +608,7 @@ def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_h
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
-    save(calibration, file)
+    save_calibration(calibration, file)
     digest = digest_of(calibration)
     first, back = _write_down(cell, digest), _write_down(cell, digest, back=True)
     # Of another target the history of this cell need not know.
@@ -640,7 +640,7 @@ def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.
     assert f"entry {lost.number} of" in reported
     assert "it knows of a later write" in reported
     file = cell.parent / "calibration.yaml"
-    save(calibration_of(5), file)
+    save_calibration(calibration_of(5), file)
     assert main(["history", str(cell), "--add", str(file)]) == 0
     assert "Entered too" not in capsys.readouterr().err
     assert f"entry {lost.number} of" in _verified(cell, capsys)
@@ -648,7 +648,7 @@ def test_a_write_is_never_entered_behind_a_later_one(cell: Path, capsys: pytest.
 
 def test_nothing_is_entered_from_an_audit_that_someone_changed(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
-    save(calibration, file)
+    save_calibration(calibration, file)
     _write_down(cell, digest_of(calibration))
     audit = _place(cell).audit
     audit.write_bytes(audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"'))

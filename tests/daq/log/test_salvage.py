@@ -24,7 +24,7 @@ from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
 from daq.log.salvage import salvage
 from daq.log.writer import LogWriter
-from daq.workflow.calibration_file import as_document, decode, encode, save
+from daq.workflow.calibration_file import as_document, decode, encode, save_calibration
 from daq.workflow.fit import Reading
 from daq.writeback.gates.gate import Gate, GateContext
 from daq.writeback.gates.table import check_gates
@@ -263,7 +263,7 @@ def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
 
 def test_apply_ends_with_3(tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = demo_calibration()
-    save(replace(good, sources=(replace(good.sources[0], partial=True),)), tmp_path / "calibration.yaml")
+    save_calibration(replace(good, sources=(replace(good.sources[0], partial=True),)), tmp_path / "calibration.yaml")
     cell = str(checkout / "configs/cells/demo.yaml")
     command = ["apply", str(tmp_path / "calibration.yaml"), "--cell", cell, "--configuration-changed"]
     assert main(command) == ExitCode.CALIBRATION_REFUSED

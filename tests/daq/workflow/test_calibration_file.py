@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 
 from daq.errors import CalibrationMissing, CalibrationRefused, CalibrationUnreadable, exit_code
-from daq.workflow.calibration_file import as_document, decode, encode, load, save
+from daq.workflow.calibration_file import as_document, decode, encode, load_calibration, save_calibration
 from ident.calibration import Calibration
 from tests.daq.calibrations import calibrations, demo_calibration
 
@@ -21,7 +21,7 @@ from tests.daq.calibrations import calibrations, demo_calibration
 def path(tmp_path: Path) -> Path:
     """A calibration file as `save` wrote it."""
     path = tmp_path / "calibration.yaml"
-    save(demo_calibration(), path)
+    save_calibration(demo_calibration(), path)
     return path
 
 
@@ -32,7 +32,7 @@ def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration
 
 
 def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
-    assert load(path) == demo_calibration()
+    assert load_calibration(path) == demo_calibration()
     assert list(path.parent.iterdir()) == [path]
 
 
@@ -74,12 +74,12 @@ def test_an_edit_by_hand_is_noticed_and_named(path: Path, old: str, new: str, se
     assert text.count(old) == 1
     path.write_text(text.replace(old, new))
     with pytest.raises(CalibrationRefused, match=rf"by hand in {section};"):
-        load(path)
+        load_calibration(path)
 
 
 def test_a_comment_added_by_hand_is_no_edit(path: Path) -> None:
     path.write_text(path.read_text() + "# checked by K.\n")
-    assert load(path) == demo_calibration()
+    assert load_calibration(path) == demo_calibration()
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_what_does_not_belong_is_refused_with_its_place(path: Path, old: str, ne
     assert text.count(old) == 1
     path.write_text(text.replace(old, new))
     with pytest.raises(CalibrationUnreadable, match=says) as caught:
-        load(path)
+        load_calibration(path)
     assert str(path) in str(caught.value)
 
 
@@ -112,12 +112,12 @@ def test_what_does_not_belong_is_refused_with_its_place(path: Path, old: str, ne
 def test_another_file_is_refused(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(CalibrationUnreadable):
-        load(path)
+        load_calibration(path)
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(CalibrationMissing, match=r"none\.yaml: found no such file"):
-        load(tmp_path / "none.yaml")
+        load_calibration(tmp_path / "none.yaml")
 
 
 def test_a_truncated_file_is_never_taken_for_a_whole_one(path: Path) -> None:
@@ -125,13 +125,13 @@ def test_a_truncated_file_is_never_taken_for_a_whole_one(path: Path) -> None:
     for length in range(0, len(content) - 1, 97):
         path.write_bytes(content[:length])
         with pytest.raises((CalibrationUnreadable, CalibrationRefused)):
-            load(path)
+            load_calibration(path)
 
 
 def test_a_number_that_is_not_finite_is_not_saved(path: Path) -> None:
     before = path.read_bytes()
     with pytest.raises(CalibrationUnreadable, match="condition"):
-        save(dataclasses.replace(demo_calibration(), condition=float("nan")), path)
+        save_calibration(dataclasses.replace(demo_calibration(), condition=float("nan")), path)
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]
 
@@ -151,7 +151,7 @@ def test_a_failing_disk_leaves_the_old_calibration(path: Path, call: str, monkey
 
     monkeypatch.setattr(os, call, fail)
     with pytest.raises(OSError, match="No space"):
-        save(dataclasses.replace(demo_calibration(), method="tls"), path)
+        save_calibration(dataclasses.replace(demo_calibration(), method="tls"), path)
     monkeypatch.undo()
     assert path.read_bytes() == before
     assert list(path.parent.iterdir()) == [path]

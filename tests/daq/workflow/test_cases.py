@@ -19,7 +19,7 @@ from daq.log.reader import LossyLogs
 from daq.report.paper_tables import condition_table, error_table, gain_table, mass_tables, parameter_table
 from daq.workflow import fit as fit_module
 from daq.workflow import validate as validate_module
-from daq.workflow.calibration_file import load, save
+from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.cases import CASES, ReducedLogs, calibration_of_case, essential_fit, fit_case, reduce_logs
 from daq.workflow.choices import Known
 from daq.workflow.fit import fit
@@ -146,8 +146,8 @@ def test_essential_parameters_leave_no_trace_in_the_file(reduced: ReducedLogs, t
     removed = {step.name for step in found.essential.removed}
     assert len(removed) > 5
     assert not removed & {parameter.name for parameter in calibration.parameters}
-    save(calibration, tmp_path / "c.yaml")
-    assert load(tmp_path / "c.yaml") == calibration
+    save_calibration(calibration, tmp_path / "c.yaml")
+    assert load_calibration(tmp_path / "c.yaml") == calibration
     error = calibration.holdout_error_percent
     assert error is not None
     found_again = cross_validate({"c": calibration}, _paths("disc3")).runs[0].errors["c"]
@@ -296,7 +296,7 @@ def test_the_command_line_writes_cases_and_tables(tmp_path: Path, capsys: pytest
     assert "leaves its mass open" in text
     assert main(["fit", *logs, "--known", "cad", "--method", "tls", "--json"]) == 0
     gains = [gain["value"] for gain in json.loads(capsys.readouterr().out)["gains"]]
-    assert gains == pytest.approx([gain.value for gain in load(folder / "case-3.yaml").gains], rel=0.02)
+    assert gains == pytest.approx([gain.value for gain in load_calibration(folder / "case-3.yaml").gains], rel=0.02)
 
 
 def test_what_does_not_go_together_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

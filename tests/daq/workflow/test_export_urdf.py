@@ -20,7 +20,7 @@ from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.errors import SchemaMismatch
-from daq.workflow.calibration_file import save
+from daq.workflow.calibration_file import save_calibration
 from daq.workflow.urdf_export import JointUpdate, cell_limits, update_urdf
 from ident.calibration import AcceptedEffect, Calibration, Gain, Parameter
 from ident.estimators.estimate import RelativeError
@@ -89,7 +89,7 @@ def tx40(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
         standard[14 * joint : 14 * joint + 14] = (*(link + more.parameters), 0.3, 1.2, 2.0, 0.1)
     standard[-3:] = (0.1, 0.3, 0.8)
     file = tmp_path_factory.mktemp("calibration") / "calibration.yaml"
-    save(_calibration("tx40", model, cell_limits(cell), standard, cell.digest), file)
+    save_calibration(_calibration("tx40", model, cell_limits(cell), standard, cell.digest), file)
     return path, file, standard
 
 
@@ -124,7 +124,7 @@ def test_a_gantry_without_a_cell(tmp_path: Path, capsys: pytest.CaptureFixture[s
     for joint, link in enumerate(urdf_links(GANTRY.urdf)):
         standard[14 * joint : 14 * joint + 14] = (*(1.3 * link), 0.5, 3.0, 4.0, 0.2)
     limits = np.repeat([[0.0], [1.0], [2.0], [5.0]], 5, axis=1)
-    save(_calibration("any", model, limits, standard), file)
+    save_calibration(_calibration("any", model, limits, standard), file)
     assert _export(file, "--urdf", source, "--out", out, "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert report["same_configuration"] is None
@@ -159,7 +159,7 @@ def test_an_impossible_calibration_is_projected_and_reported(
     broken = standard.copy()
     broken[14 * 4 + 12] = -0.3  # fs5
     file = tmp_path / "c.yaml"
-    save(_calibration("tx40", model_of(declared), cell_limits(declared), broken), file)
+    save_calibration(_calibration("tx40", model_of(declared), cell_limits(declared), broken), file)
     assert _export(file, "--cell", cell, "--out", tmp_path / "r.urdf", "--json") == 0
     report = json.loads(capsys.readouterr().out)
     assert not report["exact"]

@@ -13,7 +13,7 @@ import pytest
 from daq.cli import main
 from daq.errors import CalibrationUnreadable
 from daq.log.csv_import import import_csv
-from daq.workflow.calibration_file import load, save
+from daq.workflow.calibration_file import load_calibration, save_calibration
 from daq.workflow.fit import calibration_of, fit
 from daq.workflow.validate import DataUse, conditioning_of, together, validate
 from ident.calibration import Calibration
@@ -27,7 +27,7 @@ def real(checkout: Path, shared_data: Path, tmp_path_factory: pytest.TempPathFac
     folder = tmp_path_factory.mktemp("tx40")
     log, file = folder / "tx40.mcap", folder / "calibration.yaml"
     import_csv(checkout / "configs/imports/tx40.yaml", shared_data / "tx40", log, software="test")
-    save(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
+    save_calibration(calibration_of(fit([log], gains_fixed=True), datetime(2025, 1, 2, tzinfo=UTC)), file)
     return file, log
 
 
@@ -37,7 +37,7 @@ def test_the_file_gives_the_errors_of_the_fit(real: tuple[Path, Path], capsys: p
     output = capsys.readouterr()
     assert output.err == ""
     found = json.loads(output.out)
-    calibration = load(file)
+    calibration = load_calibration(file)
     assert found["axes"] == ["J1", "J2", "J3", "J4", "J5", "J6"]
     (entry,) = found["logs"]
     error = entry["relative_error_percent"]
@@ -53,7 +53,7 @@ def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytes
     file, log = real
     assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
     text = capsys.readouterr().out
-    assert f"{load(file).relative_error_percent.total:.2f}" in text
+    assert f"{load_calibration(file).relative_error_percent.total:.2f}" in text
     assert "seen by the fit" in text
     assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.png'}"
     assert (tmp_path / "new" / "folder" / "tx40.png").read_bytes().startswith(b"\x89PNG")
@@ -66,7 +66,7 @@ def test_text_and_picture(real: tuple[Path, Path], tmp_path: Path, capsys: pytes
 
 def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, Path]) -> None:
     file, log = real
-    calibration = load(file)
+    calibration = load_calibration(file)
     (source,) = calibration.sources
     changed = replace(calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64)
     (held_out,) = validate(changed, [log])
@@ -79,7 +79,7 @@ def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, 
 
 def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
     file, log = real
-    calibration = load(file)
+    calibration = load_calibration(file)
     first, *others = calibration.gains
     (right,) = validate(calibration, [log])
     (wrong,) = validate(replace(calibration, gains=(replace(first, value=1.2 * first.value), *others)), [log])
@@ -91,7 +91,7 @@ def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
 
 def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
     file, log = real
-    calibration = load(file)
+    calibration = load_calibration(file)
     (as_fitted,) = validate(calibration, [log])
     (slower,) = validate(replace(calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}), [log])
     assert len(slower.time_s) < 0.3 * len(as_fitted.time_s)
@@ -120,7 +120,7 @@ def complete() -> Calibration:
 
 
 def _calibrated(calibration: Calibration, tmp_path: Path) -> list[str]:
-    save(calibration, tmp_path / "calibration.yaml")
+    save_calibration(calibration, tmp_path / "calibration.yaml")
     return ["validate", str(tmp_path / "calibration.yaml")]
 
 

@@ -27,7 +27,7 @@ from daq.errors import (
     UsageError,
     exit_code,
 )
-from daq.workflow.calibration_file import save
+from daq.workflow.calibration_file import save_calibration
 from daq.writeback import minisign
 from daq.writeback.signature import generate, needs_password, sign, signature_path, signers_of
 from tests.daq.calibrations import demo_calibration
@@ -84,7 +84,7 @@ def test_a_pipe_or_a_folder_in_place_of_a_file_keeps_no_one_waiting(tmp_path: Pa
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     path = tmp_path / "calibration.yaml"
-    save(demo_calibration(), path)
+    save_calibration(demo_calibration(), path)
     return path
 
 

@@ -62,7 +62,7 @@ def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
     with pytest.raises(ControllerUnfit):
         propose(FileTarget(path, KEYS), Request(demo_calibration(), NOW))
     with pytest.raises(CalibrationMissing):
-        calibration_file.load(path)
+        calibration_file.load_calibration(path)
 
 
 def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
     with pytest.raises(ControllerUnfit, match="round in a circle"):
         rollback(FileTarget(one), NOW)
     with pytest.raises(CalibrationMissing):
-        calibration_file.load(one)
+        calibration_file.load_calibration(one)
 
 
 def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(controller: Path, tmp_path: Path) -> None:
