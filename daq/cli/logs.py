@@ -12,10 +12,7 @@ from daq.cli.verb import JsonOption, Verb, print_json
 NewLogOption = Annotated[Path, typer.Option("--out", help="Log to write (.mcap); must not exist.")]
 
 
-def info(
-    log: Annotated[Path, typer.Argument(help="A log (.mcap).")],
-    json: JsonOption = False,
-) -> None:
+def info(log: Annotated[Path, typer.Argument(help="A log (.mcap).")], json: JsonOption = False) -> None:
     """Show what is in a log: role and payload, duration, losses, moves, validity."""
     from daq.cli.terminal import print_view
     from daq.report.log import describe_log, log_table

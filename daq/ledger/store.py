@@ -20,17 +20,7 @@ from typing import Self
 from urllib.parse import quote
 
 from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
-from daq.ledger.entry import (
-    Acknowledgement,
-    Entry,
-    Event,
-    WriteAction,
-    differences,
-    iso,
-    listed,
-    row_of,
-    zoned,
-)
+from daq.ledger.entry import Acknowledgement, Entry, Event, WriteAction, differences, iso, listed, row_of, zoned
 from daq.workflow.calibration_file import decode, encode
 from ident.calibration import Calibration, Gain
 

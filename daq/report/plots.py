@@ -225,11 +225,7 @@ def _draw_scatter(place: Axes, variable: FloatArray, residual_nm: FloatArray, ve
 
 
 _BAR_IN = 0.32
-_LOOK = {
-    "passes every gate": (BLUE, ""),
-    "indistinguishable from the best": (ORANGE, "//"),
-    "fails a gate": (GREY, ""),
-}
+_LOOK = {"passes every gate": (BLUE, ""), "indistinguishable from the best": (ORANGE, "//"), "fails a gate": (GREY, "")}
 """Colour and hatch of a bar by its label; the hatch distinguishes them in grey print."""
 
 

@@ -17,14 +17,7 @@ from daq.report.fit import error_document
 from daq.report.plots import plot_torques
 from daq.report.text import percent_text, picked, plain_table, printable, terminal_text
 from daq.workflow.fit import DOUBTFUL_PERCENT
-from daq.workflow.validate import (
-    CrossValidation,
-    DataUse,
-    Validation,
-    WeighedRun,
-    conditioning_of,
-    together,
-)
+from daq.workflow.validate import CrossValidation, DataUse, Validation, WeighedRun, conditioning_of, together
 from ident.calibration import Calibration
 
 

@@ -11,20 +11,9 @@ from pathlib import Path
 
 from daq.config.signers import SIGNER_NAME, UNTRUSTED, PublicKey, public_keys
 from daq.config.yaml_file import MAX_BYTES
-from daq.errors import (
-    CalibrationMissing,
-    OutputFailed,
-    SignatureInvalid,
-    UsageError,
-)
+from daq.errors import CalibrationMissing, OutputFailed, SignatureInvalid, UsageError
 from daq.files import read_regular, replace_file
-from daq.writeback.minisign import (
-    SecretKey,
-    check_signature,
-    is_encrypted,
-    parse_secret_key,
-    parse_signature,
-)
+from daq.writeback.minisign import SecretKey, check_signature, is_encrypted, parse_secret_key, parse_signature
 
 SUFFIX = ".minisig"
 _LARGEST_BYTES = 16_384

@@ -78,14 +78,8 @@ _PATHS = {
         State.OPERATION_ENABLED: Command.ENABLE_OPERATION,
     },
     # One step at a time: voltage is removed only after the drive has stopped and its brake could close.
-    Goal.SWITCH_ON_DISABLED: {
-        State.OPERATION_ENABLED: Command.DISABLE_OPERATION,
-        State.SWITCHED_ON: Command.SHUTDOWN,
-    },
-    Goal.QUICK_STOP: {
-        State.OPERATION_ENABLED: Command.QUICK_STOP,
-        State.QUICK_STOP_ACTIVE: Command.QUICK_STOP,
-    },
+    Goal.SWITCH_ON_DISABLED: {State.OPERATION_ENABLED: Command.DISABLE_OPERATION, State.SWITCHED_ON: Command.SHUTDOWN},
+    Goal.QUICK_STOP: {State.OPERATION_ENABLED: Command.QUICK_STOP, State.QUICK_STOP_ACTIVE: Command.QUICK_STOP},
 }
 
 

@@ -80,10 +80,7 @@ def parse(content: bytes, name: str) -> tuple[Element, str]:
         parser.Parse(content, True)
     except (expat.ExpatError, ValueError, LookupError) as error:
         raise ControllerUnfit(
-            name,
-            found=f"no XML ({error})",
-            expected="one XML document",
-            remedy="correct the file; nothing was written",
+            name, found=f"no XML ({error})", expected="one XML document", remedy="correct the file; nothing was written"
         ) from error
     return around, encodings[-1]
 
