@@ -84,7 +84,8 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
 def load_run(path: Path | str, cell: Cell | None = None, lossy: LossyLogs = LossyLogs.REFUSED) -> tuple[Run, Cell]:
     """Read a log as a run, with the cell in the log or another description of it.
 
-    Warns of a partial log, of accepted losses, and of a first run below the plan's speed.
+    A given description also replaces the mass of the payload that the log records. Warns of a partial log, of accepted
+    losses, and of a first run below the plan's speed.
 
     Raises:
         DataError: the log cannot be read, or its samples cannot be used.

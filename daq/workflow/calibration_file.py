@@ -88,9 +88,10 @@ class CalibrationDocument(StrictModel):
     configuration_sha256: str
     created: str
     software: str
+    # Files of earlier versions lack the following three.
     session_began_s: float | None = None
     nameplate_holdout_error_percent: RelativeErrorEntry | None = None
-    recording_configuration_sha256: str | None = None  #: Files of earlier versions lack these three
+    recording_configuration_sha256: str | None = None
 
 
 _CLASSES: dict[type, type] = {
@@ -215,7 +216,7 @@ def read(path: Path) -> bytes:
     """Read the content of a calibration's file, for callers that also need its digest.
 
     Raises:
-        CalibrationMissing: see `load`.
+        CalibrationMissing: see `load_calibration`.
     """
     try:
         return read_regular(path, MAX_BYTES)
@@ -229,7 +230,7 @@ def read(path: Path) -> bytes:
 
 
 def decode(content: bytes, name: str) -> Calibration:
-    """Decode a file's content; `name` is its name in messages. Raises as `load`."""
+    """Decode a file's content; `name` is its name in messages. Raises as `load_calibration`."""
     try:
         document = parse_yaml(content, name)
         # Before the schema: in a later version every key may be unknown, and only the version explains it.

@@ -20,7 +20,7 @@ in ε, as Table 6 would; its ε_i are not affected. The four ways differ in the 
 
 Estimates before and after share their noise, so the σ of a change is neither one's σ nor the root of both squared. It
 is the jackknife of the change itself: leaving out move c shifts g by d_c = −(H − G_c)⁻¹ s_c
-(ident/estimators/estimate.py), and
+(ident/equations/linearisation.py), and
 
     σ_Δ² = (m − 1)/m Σ_c (Δd_c − mean)²,        Δd_c = d_c after − d_c before.
 """

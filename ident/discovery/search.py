@@ -48,15 +48,13 @@ class Gates:
     """Limits that a candidate must pass before it may join the model."""
 
     false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
-    #: Least share of folds, of the motor's squared residual and of its error on held-out moves.
-    folds_better: float = 0.75
+    folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
     explained: float = 0.03  #: least share of the motor's squared residual
-    error_fall: float = 0.02  #: least relative fall of its error on held-out moves
-    #: Shares of folds and error on held-out moves from which `strong_false_alarm` applies: with few moves the bootstrap
-    #: has little power, and a correct prediction is evidence of another kind.
-    strong_folds: float = 0.875
-    strong_fall: float = 0.1  #: fall of the error on held-out moves of a strong candidate
-    strong_false_alarm: float = 0.05  #: as `false_alarm`, for strong candidates
+    error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
+    # With few moves the bootstrap has little power, and a correct prediction is evidence of another kind.
+    strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate
+    strong_fall: float = 0.1  #: as `error_fall`, for a strong candidate
+    strong_false_alarm: float = 0.05  #: as `false_alarm`, for a strong candidate
     draws: int = 999  #: number of draws of the bootstrap
 
     @property

@@ -187,7 +187,7 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
     """Parse a DCF.
 
     Raises:
-        ControllerUnfit: they are no text, or in an encoding of two bytes a character.
+        ControllerUnfit: the bytes are no text, or of an encoding with two bytes a character.
     """
     if b"\0" in content:
         raise ControllerUnfit(

@@ -120,7 +120,7 @@ def json_document(content: bytes, name: str) -> JsonDocument:
     """Parse a JSON document.
 
     Raises:
-        ControllerUnfit: they are not UTF-8.
+        ControllerUnfit: the bytes are not UTF-8.
     """
     return JsonDocument(name, utf8(content, name, "JSON"))
 

@@ -95,7 +95,7 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
     """Parse a YAML document.
 
     Raises:
-        ControllerUnfit: they are not UTF-8.
+        ControllerUnfit: the bytes are not UTF-8.
     """
     return YamlDocument(name, utf8(content, name, "YAML"))
 
