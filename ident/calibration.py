@@ -59,9 +59,8 @@ class AcceptedEffect:
     axis: str  #: name of the axis, or of all together
     settings: dict[str, float]  #: the searched (non-linear) parameters by name, units in the names
     coefficients: tuple[Parameter, ...]  #: the linear parameters, identified
-    #: Of the axis, or in total for an effect on all motors, without and with the effect, on data that the fit did not
-    #: use [%]: ‖ρ‖/‖Y‖ of the joint torque on the runs held out, or where these say nothing of it ‖e‖/‖v‖ of the motor
-    #: that feels it most, on moves left out in turn.
+    #: Error without the effect on data that the fit did not use [%]: of the axis's joint torque on held-out runs (in
+    #: total for an effect on all motors); without such runs, of the most affected motor's current on left-out moves.
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
     ambiguity: tuple[str, ...] = ()  #: families whose held-out score does not differ from this one's
@@ -103,10 +102,10 @@ class Calibration:
         created: ISO 8601 time, given by the caller.
         software: name and version that made it.
         nameplate_holdout_error_percent: on the same run, of the same model, effects included, fitted with the
-            nameplate's gains; its axes are put together with the torques of the calibration. None where there is none
-            to compare.
-        recording_configuration_sha256: of what of that configuration a recording depends on; None in calibrations of
-            earlier versions.
+            nameplate's gains; the total weighs the axes by the torques under the identified gains. None where there is
+            none to compare.
+        recording_configuration_sha256: digest of the part of the configuration that a recording depends on; None in
+            calibrations of earlier versions.
         session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where a run has no
             clock.
     """

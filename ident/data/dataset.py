@@ -15,7 +15,7 @@ from ident.model.model import DriveTrain
 from ident.model.robot import Motion
 
 STANDSTILL_SHARE_OF_SPEED = 0.01
-"""Standstill speed as a share of the speed that a joint exceeds in a twentieth of a run."""
+"""Standstill speed as a share of the 95 % quantile of the joint's speed."""
 STANDSTILL_SIGMAS = 6.0
 """Least standstill speed in standard deviations of the encoder's noise after filter and difference."""
 
@@ -34,7 +34,7 @@ class Dataset:
         position_rad, velocity_rad_s, acceleration_rad_s2: of the joints, low-passed and differentiated.
         current_a: of the motors, as recorded.
         moving: joint faster than its standstill speed.
-        motor_moving: motor of that number faster than the same speed, seen at its own joint's ratio.
+        motor_moving: motor faster than its joint's standstill speed times the reduction.
         valid: sample may be used.
         move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
         payload: what was mounted, None without load.
@@ -90,13 +90,13 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
         :, None
     ]
     moving = np.abs(velocity) >= speed_limit
-    # A motor's speed is seen at its joint, which need not have its number.
+    # Motor speed divided by the reduction, compared at the motor's own joint, which may have another number.
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
-    # One move holds all joints: without a log of moves, they part where every joint is at standstill.
+    # If the log has no moves, a new one begins after every standstill of all joints.
     whole = np.any(moving, axis=0)
     move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if run.move is None else run.move[1:-1]
-    # Long moves are cut: standard errors and folds rest on many, and continuous motion would be a single one.
+    # Long moves are split: σ and folds need many moves, and continuous motion would be a single one.
     starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
     since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
     move = np.cumsum(since % round(LONGEST_MOVE_S * rate) == 0, dtype=np.int64) - 1

@@ -2,9 +2,8 @@
 
 The lag-one correlation of a residual is about 0.67, so textbook tests are wrong. A candidate must pass every gate:
 
-1. cluster Wald, max-T: its statistic, clustered by move, is larger than the largest of all candidates' in 99 % of
-   draws in which each move's noise keeps its size and gets a random sign (a wild bootstrap, Cameron et al. 2008), or in
-   95 % where it is better on nearly all folds and by a tenth;
+1. its Wald statistic, clustered by move, exceeds the largest one of all candidates in 99 % of draws that give the noise
+   of each move a random sign (wild bootstrap, Cameron et al. 2008), or in 95 % if the candidate is strong (`Gates`);
 2. it lowers the error on at least three quarters of the folds of held-out moves;
 3. it explains at least 3 % of the squared residual of the motor that it affects most;
 4. that motor's error on held-out moves falls by at least 2 %.
@@ -114,8 +113,8 @@ def rank_families(
 def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
     """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
 
-    A hinge that begins where the joint never comes is a spring, and is named so.
-    An effect joins an axis once: places taken, in the model or refused, are not chosen again.
+    So a hinge that starts outside the joint's range is reported as a spring. Places that are taken, in the model or
+    refused, are not chosen again.
     """
     passed = [finding for finding in findings if finding.passed and place_of(finding.effect, finding.axis) not in taken]
     if not passed:
@@ -130,7 +129,7 @@ def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozens
 
 
 def place_of(effect: Effect, axis: int) -> Place:
-    """Identify an effect on an axis whatever its real settings are: two orders of a ripple are two effects."""
+    """Identify an effect on an axis by its family and integer settings: two orders of a ripple are two effects."""
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 

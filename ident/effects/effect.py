@@ -108,7 +108,7 @@ class Effect(ABC):
 
     @abstractmethod
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Torque per unit of each coefficient [Nm], shape (p, k); (joints, p, k) where `side` is more than one."""
+        """Torque per unit coefficient [Nm], (p, k); (2, p, k) of two joints, (n, p, k) of all joints or motors."""
 
     @property
     def settings(self) -> dict[str, float]:

@@ -178,7 +178,7 @@ class Folds:
     """
 
     problem: Linearisation  #: the linearisation, its rows sorted by fold, move and motor
-    moves: int  #: whole moves that the folds were dealt, whatever pieces the problem's clusters are
+    moves: int  #: number of whole moves distributed over the folds; a cluster may be only a piece of one
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, move and motor of each block
     whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
@@ -241,7 +241,7 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
         motor_score[i] += score
     by_fold = part_hessian.sum(axis=1)
     hessian, score = by_fold.sum(axis=0), motor_score.sum(axis=0)
-    # Two effects may say nearly the same: the direction in which they differ is left as it is.
+    # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + 1e-10
     factors, scores = [], []
     for k in range(count):

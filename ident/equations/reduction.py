@@ -1,8 +1,8 @@
 """Runs, one after the other, reduced to triangles: the observation matrix is never held whole (TSQR).
 
-Rows are reduced in the standard columns [V | W_st], apart for each payload mounting: whatever is chosen afterwards, the
-base parameters or which payload parameters are known, is a choice among these columns, because a payload's columns are
-those of the last link in the rows in which it was mounted.
+Rows are reduced in the standard columns [V | W_st], separately for each payload mounting. The same triangles serve
+every choice of base parameters and of known payload parameters, because a payload has the columns of the last link, in
+the rows in which it was mounted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Column, Model
 
 MAX_CLUSTERS = 256
-"""Moves of very long data are joined with their neighbours: 256 clusters say as much of a scatter as 3000."""
+"""Moves of very long data are joined with their neighbours: 256 clusters estimate the scatter as well as 3000."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,7 +49,7 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
     share = conditioning.standstill_share
     use = (window((~data.moving.T).astype(np.float64)) <= share) & (window((~data.valid.T).astype(np.float64)) == 0.0)
     motor_still = window((~data.motor_moving.T).astype(np.float64)) > share
-    # Motor i's equation mixes the joints in row i of T (Model: g v = T τ); each of them must count.
+    # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must count.
     needed = np.abs(drive_train.to_motor) > 0
     turned = np.abs(drive_train.direction) > 0
     motor_use = np.stack([use[needed[i] | turned[i]].all(axis=0) & ~motor_still[i] for i in range(len(use))])
@@ -60,9 +60,9 @@ def row_masks(drive_train: DriveTrain, data: Dataset, conditioning: Conditioning
 
 
 def chunks(filter_: Decimator, samples: int, chunk_rows: int) -> Iterator[slice]:
-    """Cut a run's samples into pieces with the whole windows of up to so many rows.
+    """Cut a run's samples into pieces that hold the whole windows of at most ``chunk_rows`` rows each.
 
-    A piece ends with a whole block of the decimator, where the run does not end before: it is then filtered in place.
+    Pieces end at a block of the decimator, except at the end of the run, so that the filter needs no padding.
     """
     rows, blocks = filter_.rows(samples), -(-len(filter_.taps) // filter_.factor)
     for first in range(0, rows, chunk_rows):

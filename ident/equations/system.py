@@ -197,7 +197,7 @@ def require_rows(system: System) -> None:
             raise DataUnfit(
                 ", ".join(system.runs),
                 f"joints {' and '.join(str(joint + 1) for joint in joints)}, which motor {motor + 1} is coupled to, "
-                "never move at the same time; let them, or choose another estimator than ml",
+                "never move at the same time; record moves in which they do, or use another estimator than ml",
             )
         if rows <= len(system.unknowns):
             raise DataUnfit(

@@ -103,10 +103,10 @@ def identify(
 
 
 def require_seen_payload(estimate: Estimate, system: System) -> None:
-    """Refuse gains whose common scale nothing sets.
+    """Refuse gains if the data do not fix their common scale.
 
-    The weight of the payload is what sets it. Where a run declared loaded went without it, or the other way round,
-    moves contradict each other about the scale, and leaving them out in turn scatters all gains together.
+    The weight of the payload fixes it. If a run is declared loaded but was not, or the other way round, its moves
+    disagree with the others about the scale, and σ of all gains grows together.
 
     Raises:
         PayloadUnseen: every gain is uncertain by more than LARGEST_STD.

@@ -99,7 +99,7 @@ def noise_of(triangles: Triangles, gamma: FloatArray, parameters: FloatArray, fr
 def _gauss_newton(system: System) -> tuple[FloatArray, int]:
     """γ by variable projection: χ is eliminated for each γ, so that only n unknowns are iterated."""
     count, triangles = system.joint_count, system.motors
-    # From whichever linear estimate makes these data likeliest; each is good somewhere.
+    # Start from the linear estimate under which the data are most likely. Each of them is the best on some data.
     starts = [wls(system), tls(system, Scaling.COLUMNS), tls(system, Scaling.BOTH)]
     gammas = [1.0 / start.gains for start in starts if np.all(np.isfinite(start.gains)) and np.all(start.gains != 0.0)]
     if not gammas:

@@ -1,4 +1,4 @@
-"""Base parameters: the fewest columns that say everything the standard ones can (paper §2.1, QR method)."""
+"""Base parameters: the smallest set of standard columns that spans the same torques (paper §2.1, QR method)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class BaseParameters:
 def base_parameters(triangle: FloatArray, names: tuple[str, ...], tolerance: float = 1e-8) -> BaseParameters:
     """Find them in the triangular factor of an observation matrix.
 
-    A column is independent when what its predecessors leave of it is more than ``tolerance`` of its norm; taking the
-    first ones in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
+    A column is independent if, after projection off the chosen columns before it, more than ``tolerance`` of its norm
+    remains. Taking columns in the given order keeps the paper's regrouping (``Izz1 + Ia1 + …``).
 
     Args:
         triangle: any matrix with the same Gram matrix as the observation matrix, shape (m, c).
         names: of the c standard parameters.
-        tolerance: relative to each column's norm; columns below 1e-9 of the largest count as zero before that, or one
-            of them survives its normalisation and the condition number becomes 1e16.
+        tolerance: relative to each column's norm. Before that, columns below 1e-9 of the largest count as zero:
+            normalised, one of them could be chosen, and the condition number would become 1e16.
     """
     norms = np.linalg.norm(triangle, axis=0)
     present = norms > 1e-9 * float(norms.max(initial=0.0))
