@@ -17,7 +17,7 @@ from drivers.profiles.profile import Axis
 
 @dataclass(frozen=True, slots=True)
 class StreamStatistics:
-    """Counts of frames up to now; a run is sound when all from `missing` to `backlog_dropped` are zero.
+    """Counts of frames up to now; in a sound run all are zero but `cycles`, `frames` and `foreign`.
 
     Attributes:
         cycles: SYNCs sent, or followed.
@@ -31,7 +31,7 @@ class StreamStatistics:
         kernel_dropped: frames of any kind that the kernel dropped because its receive buffer was full.
         interface_dropped: frames dropped by the interface, before the buffer.
         backlog_dropped: frames that the capture process dropped because this process did not read them.
-        foreign: PDOs that are explained: of nodes that are no axes of the cell, or from before the first SYNC.
+        foreign: PDOs that do no harm: of nodes that are no axes of the cell, or from before the first SYNC.
     """
 
     cycles: int = 0
@@ -125,7 +125,7 @@ class Answers:
 
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
-        # With one answer and a debt at the end, the owed frame was lost for good, and the answer is this cycle's.
+        # If only one answer came while two were owed, the older frame is lost; the answer counts for this cycle.
         self._debt = self._all & ~self._now
         self.counts["frames"] += self._now.bit_count()
         absent = 0

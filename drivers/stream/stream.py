@@ -21,11 +21,11 @@ from drivers.stream.socketcan import CapturedMessage, Losses, losses_of, remarks
 from drivers.stream.sync import FollowedSync, LockstepSync, Pacing, SyncRate, TimedSync
 
 SHORTENED, STRAGGLING = 16, 4
-"""Fractions of a lockstep cycle's time: for a cell that was silent before, and for axes after others answered."""
+"""Divisors of a lockstep time-out: if no axis answered the last SYNC, and once another axis has answered this one."""
 
 LARGEST_LAG_NS = 1_000_000_000  #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 FRAMES_PER_S = 50_000
-"""More than two buses of 1 Mbit/s carry: among so many frames a SYNC producer that is alive has been heard."""
+"""Frames per second of time-out to read past the deadline before a producer is dead; two full buses carry fewer."""
 
 
 def _is_plain(message: can.Message) -> bool:
@@ -113,7 +113,7 @@ class SyncStream:
             raise self._watch.faults.popleft()
 
     def advance(self) -> Sample:
-        """Run one cycle even with faults, as stopping the axes needs; faults wait for the next ``next``.
+        """Run one cycle even with faults, as stopping the axes needs; `__next__` raises them later.
 
         Raises:
             BusError: the bus is lost.
@@ -137,7 +137,7 @@ class SyncStream:
         for message in self._waiting():
             fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
             if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
-                self._opened = message  # a reader no faster than the bus would never reach the end
+                self._opened = message  # if frames arrive as fast as they are read, the loop would not end
                 break
             self._between_cycles(message)
         self._base = losses_of(bus)
@@ -164,7 +164,7 @@ class SyncStream:
         return late
 
     def _until_sync(self, pacing: FollowedSync, end_ns: int) -> can.Message | None:
-        """Return the next frame that arrived before a time by the clock: a late reader is no dead producer."""
+        """Return the next frame that arrived before a deadline, even if it is read late; None without any."""
         self._link.beat()
         while (left_ns := end_ns - pacing.clock()) > 0:
             message = self._link.bus.recv(left_ns * 1e-9)
@@ -174,14 +174,14 @@ class SyncStream:
         return self._link.bus.recv(0.0) if self._overdue <= FRAMES_PER_S * pacing.timeout_s else None
 
     def _follow_sync(self, pacing: FollowedSync) -> int:
-        """Send waiting frames, and read until the next SYNC; returns the latest time of the one after it."""
+        """Send waiting frames, and read until the next SYNC; returns the deadline of the SYNC after it."""
         self._link.beat()
         if self.outgoing:
             # As early in the period as possible: all of it should arrive before the next SYNC.
             outgoing, self.outgoing = self.outgoing, []
             self._link.send(outgoing)
         sync, self._opened = self._opened, None
-        # Where answers of the last cycle were missing, the wait for them was a wait for this SYNC already.
+        # If the last cycle waited in vain for missing answers, it waited for this SYNC too: half of it is enough.
         end_ns = pacing.clock() + round(pacing.timeout_s * 1e9) // (2 if self._waited else 1)
         while sync is None:
             message = self._until_sync(pacing, end_ns)
@@ -270,7 +270,7 @@ class SyncStream:
                 continue
             if message.is_rx or not isinstance(message, CapturedMessage):
                 return message
-            if isinstance(self.pacing, TimedSync):  # the kernel's time of our SYNC; a made-up time stays as it is
+            if isinstance(self.pacing, TimedSync):  # the kernel's time of our SYNC; lockstep keeps its made-up time
                 self._too_late(clock() - message.monotonic_ns)
                 if self._cycles == 1:
                     self._first_sync_ns = message.monotonic_ns
