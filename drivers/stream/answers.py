@@ -80,45 +80,45 @@ class Answers:
         self.values = [0] * (3 * len(axes))  #: Last value of each column
         self.counts: Counter[str] = Counter()  #: By their names in StreamStatistics
         self._all = (1 << len(self.slots)) - 1
-        self._debt = 0  # slots whose answer to an earlier SYNC may still come
-        self._open_debt = self._now = 0
+        self._owed_slots = 0  # slots whose answer to an earlier SYNC may still come
+        self._still_owed = self._answered_slots = 0
         self._last_data: dict[int, bytearray] = {}
 
     def begin(self) -> None:
         """Begin a cycle."""
-        self._open_debt, self._now = self._debt, 0
+        self._still_owed, self._answered_slots = self._owed_slots, 0
 
     @property
     def complete(self) -> bool:
         """Whether all answers of the cycle have come, and none of an earlier one is open."""
-        return self._now == self._all and not self._open_debt
+        return self._answered_slots == self._all and not self._still_owed
 
     @property
     def any(self) -> bool:
         """Whether an answer of the cycle has come."""
-        return bool(self._now)
+        return bool(self._answered_slots)
 
     def take(self, identifier: int, slot: Slot, data: bytearray) -> None:
         """Accept an answer within a cycle."""
-        if self._now & slot.bit:
-            if self._open_debt & slot.bit:
+        if self._answered_slots & slot.bit:
+            if self._still_owed & slot.bit:
                 # The first one was the late answer to an earlier SYNC, this one belongs to the current SYNC.
-                self._open_debt &= ~slot.bit
+                self._still_owed &= ~slot.bit
                 self.counts["late"] += 1
             else:
                 self.counts["duplicate"] += 1
                 if self._last_data.get(identifier) == data:
                     return
                 # The second answer differs: the first may have been a repetition of the cycle before.
-        self._now |= slot.bit
+        self._answered_slots |= slot.bit
         self._last_data[identifier] = data
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
             self.values[column] = value
 
     def take_between(self, slot: Slot) -> None:
         """Count an answer that is read before the next SYNC, and so belongs to none that is open."""
-        if self._debt & slot.bit:
-            self._debt &= ~slot.bit
+        if self._owed_slots & slot.bit:
+            self._owed_slots &= ~slot.bit
             self.counts["late"] += 1
         else:
             self.counts["duplicate"] += 1
@@ -126,12 +126,12 @@ class Answers:
     def end(self) -> int:
         """End a cycle; returns the axes without a complete answer, bit i for axis i."""
         # If only one answer came while two were owed, the older frame is lost; the answer counts for this cycle.
-        self._debt = self._all & ~self._now
-        self.counts["frames"] += self._now.bit_count()
+        self._owed_slots = self._all & ~self._answered_slots
+        self.counts["frames"] += self._answered_slots.bit_count()
         absent = 0
-        if self._debt:
+        if self._owed_slots:
             for slot in self.slots.values():
-                if self._debt & slot.bit:
+                if self._owed_slots & slot.bit:
                     absent |= 1 << slot.axis
                     self.counts["missing"] += 1
         return absent

@@ -76,13 +76,13 @@ class SyncStream:
         self._answers = Answers(network.axes)
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
         self._incomplete_cycles = 0
-        self._short: dict[int, int] = {}
+        self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
         self._answered_ns = self._next_sync_ns = self._first_sync_ns = self._last_sync_ns = 0
-        self._opened: can.Message | None = None
+        self._early_sync: can.Message | None = None
         self._rate = SyncRate(pacing.period_ns)
         self._behind = False
-        self._overdue = 0
-        self._waited = self._over = False
+        self._reads_past_deadline = 0
+        self._waited = self._cycle_over = False
         self._base = self._losses = Losses()
         self._watch = Watch(network, on_event)
         self._cycles = self._skipped = 0
@@ -119,7 +119,7 @@ class SyncStream:
             BusError: the bus is lost.
             NodeMisplaced: as `next`.
         """
-        self._over = False
+        self._cycle_over = False
         try:
             with bus_errors(self._link.address):
                 if self._cycles == 0:
@@ -137,7 +137,7 @@ class SyncStream:
         for message in self._waiting():
             fresh = isinstance(message, CapturedMessage) and message.monotonic_ns > begun_ns
             if fresh and isinstance(self.pacing, FollowedSync) and _is_sync(message):
-                self._opened = message  # if frames arrive as fast as they are read, the loop would not end
+                self._early_sync = message  # if frames arrive as fast as they are read, the loop would not end
                 break
             self._between_cycles(message)
         self._base = losses_of(bus)
@@ -170,8 +170,8 @@ class SyncStream:
             message = self._link.bus.recv(left_ns * 1e-9)
             if message is not None:
                 return message
-        self._overdue += 1
-        return self._link.bus.recv(0.0) if self._overdue <= FRAMES_PER_S * pacing.timeout_s else None
+        self._reads_past_deadline += 1
+        return self._link.bus.recv(0.0) if self._reads_past_deadline <= FRAMES_PER_S * pacing.timeout_s else None
 
     def _follow_sync(self, pacing: FollowedSync) -> int:
         """Send waiting frames, and read until the next SYNC; returns the deadline of the SYNC after it."""
@@ -180,8 +180,8 @@ class SyncStream:
             # As early in the period as possible: all of it should arrive before the next SYNC.
             outgoing, self.outgoing = self.outgoing, []
             self._link.send(outgoing)
-        sync, self._opened = self._opened, None
-        # If the last cycle waited in vain for missing answers, it waited for this SYNC too: half of it is enough.
+        sync, self._early_sync = self._early_sync, None
+        # A cycle that waited in vain for answers waited for this SYNC too: half of the time-out is enough.
         end_ns = pacing.clock() + round(pacing.timeout_s * 1e9) // (2 if self._waited else 1)
         while sync is None:
             message = self._until_sync(pacing, end_ns)
@@ -211,7 +211,7 @@ class SyncStream:
         self._last_sync_ns = at_ns
         self.time_ns = pacing.start_ns + at_ns - self._first_sync_ns
         self._cycles += 1
-        self._overdue, self._waited = 0, False
+        self._reads_past_deadline, self._waited = 0, False
         return now_ns + round(pacing.timeout_s * 1e9)
 
     def _lose_sync(self, pacing: FollowedSync) -> int:
@@ -261,7 +261,7 @@ class SyncStream:
             message = self._until_sync(self.pacing, deadline_ns)
             self._waited = message is None
             if message is not None and _is_sync(message):
-                self._opened = message
+                self._early_sync = message
                 return None
             return message
         while (left_ns := deadline_ns - clock()) > 0:
@@ -287,7 +287,7 @@ class SyncStream:
                 break
             slot = self._slot_of(message)
             if slot is None:
-                self._other(message)
+                self._process_other(message)
             elif len(message.data) != slot.length:
                 self._note_length(slot, message.arbitration_id, len(message.data))
             else:
@@ -303,13 +303,13 @@ class SyncStream:
         self._counts["wrong_length"] += 1
         axis = self.network.axes[slot.axis]
         reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
-        if identifier not in self._short or self._short[identifier] < self._cycles - 1:
+        if identifier not in self._last_wrong_length or self._last_wrong_length[identifier] < self._cycles - 1:
             text = f"{node_label(axis)}: {reason}"
             self.emit(CellEvent(self.time_ns, slot.axis, EventKind.PDO_LENGTH, identifier, text))
-        elif self._short[identifier] == self._cycles - 1:
+        elif self._last_wrong_length[identifier] == self._cycles - 1:
             remedy = "did another program change the mapping, or does another device use this COB-ID?"
             self._watch.faults.append(DriveFault(axis, reason, remedy=remedy))
-        self._short[identifier] = self._cycles
+        self._last_wrong_length[identifier] = self._cycles
 
     def read_on(self, seconds: float) -> None:
         """Count the frames left after the last cycle, and losses that are reported late. Sends nothing.
@@ -322,7 +322,7 @@ class SyncStream:
             NodeMisplaced: as `next`.
         """
         clock, followed = self.pacing.clock, isinstance(self.pacing, FollowedSync)
-        over = self._over or self._opened is not None
+        over = self._cycle_over or self._early_sync is not None
         end_ns = clock() + round(seconds * 1e9)
         with bus_errors(self._link.address):
             while (left_ns := end_ns - clock()) > 0:
@@ -331,7 +331,7 @@ class SyncStream:
                 over = over or (followed and _is_sync(late))
                 if not (over and late.arbitration_id in self._answers.slots):
                     self._between_cycles(late)
-        self._over = True
+        self._cycle_over = True
         self._note_losses()
         self._watch.note_events(self.time_ns)
 
@@ -339,7 +339,7 @@ class SyncStream:
         """Process a frame that is read before the next SYNC, and so answers none that is open."""
         slot = self._slot_of(message)
         if slot is None:
-            self._other(message)
+            self._process_other(message)
         elif self._cycles == 0:
             self._counts["foreign"] += 1
         else:
@@ -348,7 +348,7 @@ class SyncStream:
     def _slot_of(self, message: can.Message) -> Slot | None:
         return self._answers.slots.get(message.arbitration_id) if _is_plain(message) else None
 
-    def _other(self, message: can.Message) -> None:
+    def _process_other(self, message: can.Message) -> None:
         if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
             return
         ours = not message.is_extended_id and message.arbitration_id & 0x7F in self.network.node_ids
