@@ -94,7 +94,7 @@ def apply_verb(
         fitted,
         datetime.now(UTC),
         policy=tightened(declared.apply, max_change_percent, max_nameplate_percent, max_std_percent),
-        configuration_changed=configuration_changed,
+        accepts_changed_configuration=configuration_changed,
         entered_kg=entered_masses(payload_mass or (), fitted),
         base=base,
         appliers=actor.names,
@@ -267,12 +267,12 @@ def rollback(
             expected="--cell CELL, which says where the gains are",
             remedy="name the cell whose controller is to be rolled back",
         )
-    now, actor, book = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if audit is not None:
         require_separate_audit(audit, (to,))
+    now, actor, audit = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if drives and declared is not None:
         saving = saving_of(ram_only, save_unknown)
-        rollback_drives(declared, now=now, actor=actor, saving=saving, audit=book, yes=yes, json=json)
+        rollback_drives(declared, now=now, actor=actor, saving=saving, audit=audit, yes=yes, json=json)
         return
     path = to if declared is None else to or declared.controller_path
     if path is None:
@@ -281,15 +281,15 @@ def rollback(
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
     with writing(path):
-        written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=book, who=str(actor))
+        written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=audit, who=str(actor))
     if declared is not None:
         _enter_rollback(declared, written, now, actor)
     if json:
-        print_json({**describe_file_rollback(written), "audit": None if book is None else str(book)})
+        print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
         return
     console = Console(soft_wrap=True, highlight=False)
     show_file_rollback(written, console)
-    if book is None:
+    if audit is None:
         console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
 
 

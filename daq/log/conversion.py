@@ -141,8 +141,8 @@ def run_from_log(log: Log, cell: Cell, lossy: LossyLogs = LossyLogs.REFUSED) -> 
         )
     _check_cycles(log, rate_hz)
     scale = scaling(cell, log.head.readback)
-    counter = [axis.position_rad_per_count is None for axis in log.head.readback.axes]
-    counts = np.where(counter, unwrapped(samples.position_counts), samples.position_counts)
+    is_counter = [axis.position_rad_per_count is None for axis in log.head.readback.axes]
+    counts = np.where(is_counter, unwrapped(samples.position_counts), samples.position_counts)
     position_rad = scale.joint_position(counts)
     bits = [None if axis.profile is None else axis.profile.saturation_bit for axis in cell.axes]
     limited = samples.statusword & np.array([0 if bit is None else 1 << bit for bit in bits], dtype=np.uint16) != 0
@@ -234,13 +234,13 @@ def unwrapped(
 
     Args:
         counts: positions of k samples, shape (k, n).
-        before: counter and unwrapped count of the sample before them, shape (n,) each; None at the start of a log.
+        before: raw and unwrapped position of the sample before them, shape (n,) each; None at the start of a log.
     """
-    counter, count = (counts[0], counts[0].astype(np.int64)) if before is None else before
+    last, total = (counts[0], counts[0].astype(np.int64)) if before is None else before
     # The difference in 32 bits is the step of less than half the range, whether the counter wrapped or not.
-    words = np.concatenate((counter[None, :], counts)).astype(np.int32).view(np.uint32)
+    words = np.concatenate((last[None, :], counts)).astype(np.int32).view(np.uint32)
     steps = np.diff(words, axis=0).view(np.int32)
-    return np.asarray(count + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
+    return np.asarray(total + steps.cumsum(axis=0, dtype=np.int64), dtype=np.int64)
 
 
 def _check_cycles(log: Log, rate_hz: float) -> None:

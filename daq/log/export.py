@@ -119,12 +119,12 @@ def tables(reader: LogReader, cell: Cell, events: tuple[CellEvent, ...]) -> Iter
     first_ns = 0
     for block in reader:
         scale = scaling(cell, reader.head.readback)
-        counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
+        is_counter = np.array([axis.position_rad_per_count is None for axis in reader.head.readback.axes])
         if last is None:
             first_ns = int(block.time_ns[0])
         counted = unwrapped(block.position_counts, last)
         last = block.position_counts[-1], counted[-1]
-        counts = np.where(counter, counted, block.position_counts)
+        counts = np.where(is_counter, counted, block.position_counts)
         joints = scale.joint_position(counts)
         yield _columns(cell, block, counts, joints, scale.current_per_unit, moves(events, block.time_ns), first_ns)
 

@@ -31,7 +31,7 @@ class Request:
         calibration: the identified gains.
         now: wall-clock time, for the age of the logs.
         policy: bounds; those of the cell when None.
-        configuration_changed: the operator accepts that the cell's configuration changed since the recording.
+        accepts_changed_configuration: the operator accepts that the cell's configuration changed since the recording.
         entered_kg: masses weighed again for this write, by the payload's name [kg].
         base: value of --base: `Edit.base` of the reviewed change, or the SHA-256 of the reviewed content alone, for any
             change of it.
@@ -43,7 +43,7 @@ class Request:
     calibration: Calibration
     now: datetime
     policy: ApplyPolicy | None = None
-    configuration_changed: bool = False
+    accepts_changed_configuration: bool = False
     entered_kg: Mapping[str, float] = field(default_factory=dict)
     base: str | None = None
     appliers: Collection[str] = ()

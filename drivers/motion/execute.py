@@ -87,38 +87,38 @@ def execute(
     check_moves(first.position_counts, moves, permission, tuple(axis.name for axis in network.axes))
     if not moves:
         return
-    walk = _Walk(network, stream, bounds, first)
+    execution = _Execution(network, stream, bounds, first)
     network.guard()
     try:
-        yield from walk.enable(permission.granted_by)
+        yield from execution.enable(permission.granted_by)
         for number, move in enumerate(moves):
-            yield from walk.move(number, move)
-        yield from walk.stop()
-        if not walk.problems:  # amplifiers without confirmed standstill go on watching us
+            yield from execution.move(number, move)
+        yield from execution.stop()
+        if not execution.problems:  # amplifiers without confirmed standstill go on watching us
             network.unguard()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs without yielding.
         with network.block_signals():
-            walk.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
+            execution.emit(None, EventKind.ENDED, 0, f"{type(error).__name__}: {error}".removesuffix(": "))
             try:
-                for _ in walk.stop():
+                for _ in execution.stop():
                     pass
             except BaseException as cut:
                 cut.add_note(f"{WHILE}stopping: the stop was cut short")
                 raise
-            if not walk.problems:
+            if not execution.problems:
                 network.unguard()
-        for problem in walk.problems:
+        for problem in execution.problems:
             error.add_note(f"{WHILE}stopping: {problem}")
         raise
-    for problem in walk.problems[1:]:
-        walk.problems[0].add_note(f"{WHILE}stopping: {problem}")
-    if walk.problems:
-        raise walk.problems[0]
+    for problem in execution.problems[1:]:
+        execution.problems[0].add_note(f"{WHILE}stopping: {problem}")
+    if execution.problems:
+        raise execution.problems[0]
     stream.check()  # faults during the stop
 
 
-class _Walk:
+class _Execution:
     """One run of ``execute``: the stream, the last sample and the last command of each axis."""
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:

@@ -146,7 +146,7 @@ def apply_in_drives(
             calibration,
             NOW,
             policy=cell.apply,
-            configuration_changed=True,
+            accepts_changed_configuration=True,
             base=base,
             appliers=ACTOR.names,
             file=Path("calibration.yaml"),

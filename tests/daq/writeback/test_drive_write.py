@@ -63,7 +63,7 @@ def listener(address: BusAddress) -> Iterator[Listener]:
 def _propose(
     cell: Cell, network: CanopenNetwork, calibration: Calibration | None = None, base: str | None = None
 ) -> Proposal[DriveEdit]:
-    request = Request(calibration or demo_calibration(), NOW, configuration_changed=True, base=base)
+    request = Request(calibration or demo_calibration(), NOW, accepts_changed_configuration=True, base=base)
     return propose(DriveTarget(cell, network), request)
 
 

@@ -531,7 +531,7 @@ def test_an_age_below_a_day_is_reported_in_hours(scene: Scene) -> None:
 
 def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(scene: Scene) -> None:
     cell = _payload(mass_kg=5.0)(scene).cell
-    request = Request(scene.calibration, NOW, policy=ApplyPolicy(), configuration_changed=True)
+    request = Request(scene.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True)
     proposal = propose(FileTarget.of(cell, scene.controller), request)
     assert {(one.gate, one.found) for one in proposal.refusals} == {(Gate.MASS, "fitted with 4.59 kg")}
 
