@@ -78,8 +78,8 @@ class RecordFile:
     def unfinished(self) -> Iterator[tuple[int, McapRecord]]:
         """Yield the records before the damage of a file without a valid end, then raise an error with its place.
 
-        Without the end, only the checksums of chunks and attachments remain, and an unknown kind of record is damage.
-        A whole data section ends the iteration without an error.
+        Such a file has only the checksums of chunks and attachments, so an unknown kind of record counts as damage. A
+        whole data section ends the iteration without an error.
         """
         yield from self._opened(self._unfinished_records)
 

@@ -69,8 +69,8 @@ class LogWriter:
     error the `.part` keeps everything up to that moment.
 
     Raises (on entry and later):
-        UsageError: the log, or a `.part` of the same name, already exists; or at the end, if a file of that name has
-            appeared: then the `.part` is the whole log.
+        UsageError: the log, or a `.part` of the same name, already exists. At the end: a file of that name has
+            appeared; the `.part` is then the whole log.
         OutputFailed: the file system refuses.
     """
 

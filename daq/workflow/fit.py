@@ -87,7 +87,7 @@ class Fit:
 
 
 class Reading:
-    """Logs of one cell, read one after the other, and what was met on the way."""
+    """Reads logs of one cell, one after the other, and collects their sources."""
 
     def __init__(self, logs: Sequence[Path], cell: Cell | None, lossy: LossyLogs = LossyLogs.REFUSED) -> None:
         self._given = cell
@@ -281,7 +281,7 @@ def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
 
 
 def close_loop(start: Fit, seed: int, progress: Callable[[str], None] = lambda _: None) -> Fit:
-    """Detect effects that the model misses, and refit with those that pass.
+    """Detect and add missing effects: refit with every effect that passes the gates.
 
     Args:
         start: of method ``ml``; another one is refitted by it, because candidates are judged in its terms.
@@ -333,9 +333,8 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
 def _nameplate_error(fitted: Fit) -> RelativeError | None:
     """Hold-out error with the nameplate's gains: same model, effects included, parameters refitted.
 
-    Without the effects, their share would be credited to the gains. ‖ρ_j‖/‖Y_j‖ of an axis does not depend on the
-    scale of its gain, but ‖Y_j‖ does: the total is put together with the ‖Y_j‖ of the calibration, so that a smaller
-    gain alone makes no total smaller.
+    Without the effects, their share would be credited to the gains. The total weighs the axes by ‖Y_j‖ of the
+    calibration, because smaller gains alone would lower it otherwise.
     """
     final = fitted.final
     unseen = final.holdout
@@ -356,7 +355,7 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
 
 
 def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
-    # The last turn that added it: an idle effect may have gone and come back.
+    # The last turn that added it: an effect may have been dropped and added again.
     for number, step in reversed(list(enumerate(fitted.steps))):
         before = fitted.steps[number - 1].after if number else None
         had = before.effects if before else ()
@@ -393,8 +392,8 @@ def axis_of(placed: PlacedEffect, cell: Cell) -> str:
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:
     """Judge every gain of a fit with free gains, its effects left out; the logs are read again.
 
-    The deviations are the fit's own, by moves left out in turn. What a way of seeing, or further moves, would give is
-    scaled from the prediction as the fit's deviation is: moves determine the ratio, not the size of the noise.
+    σ is that of the fit, by leaving out moves. Predictions for one source alone, or with further moves, are multiplied
+    by σ of the fit / predicted σ: a plan predicts ratios of σ well, but not the noise level.
     """
     found = fitted.identification
     estimate, system = found.estimate, found.system

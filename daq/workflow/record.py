@@ -1,4 +1,4 @@
-"""One run: a plan's moves made by the cell, every sample of them in a log."""
+"""Record one run: make the moves of a plan, and log every sample."""
 
 from __future__ import annotations
 
@@ -50,36 +50,35 @@ from drivers.stream.sync import (
 )
 from ident.model.bodies import Payload
 
-LOCKSTEP_TIMEOUT_S = 3.0
-"""A simulated cell on a busy machine may be that late; one that ended is reported in four seconds."""
+LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
 GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
-"""Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while we are late."""
+"""Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while the recorder is late."""
 SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
-"""Without a SYNC of its producer's, whichever is longer, after which this program sends it, to stop the axes."""
+"""Silence of the SYNC producer, the longer of the two, after which this program sends SYNC itself to stop the axes."""
 ALLOWANCE_S = 10.0
-"""Beside its moves and dwells, for enabling, hand-shakes, settling and the stop: more than a good run takes."""
+"""Time added to moves and dwells for enabling, hand-shakes, settling and the stop; a good run takes less."""
 LATE_LOSSES_S = 0.25
-"""After the last sample: the interface's own counters are read five times a second (drivers/stream/capture.py)."""
-SPACE_CHECK_S = 0.1  #: Of recorded time, between two looks at the room on the disk
-ROUNDING = 1.001  #: Whole counts may ask a drive for this much more than a limit
+"""Time to read on after the last sample: the interface's counters are read five times a second (capture.py)."""
+SPACE_CHECK_S = 0.1  #: Recorded time between two checks of the free space on the disk
+ROUNDING = 1.001  #: Factor by which rounding to whole counts may exceed a limit
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """Where the times come from [ns]."""
+    """Clocks of a recording [ns]."""
 
     wall_ns: Callable[[], int] = time.time_ns
     monotonic_ns: Callable[[], int] = time.monotonic_ns
 
     def wall_minus_monotonic_ns(self) -> int:
-        """The offset of the two now [ns], as near as two readings can be."""
+        """Return the present offset of the two [ns]; the monotonic clock is read before and after the other."""
         before, wall, after = self.monotonic_ns(), self.wall_ns(), self.monotonic_ns()
         return wall - (before + after) // 2
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A finished recording: its log, what the log holds, what the bus did, and what to know of its currents."""
+    """A finished recording: the log with its statistics, those of the stream, and warnings about the currents."""
 
     path: Path
     log: RunStatistics
@@ -88,13 +87,13 @@ class Recorded:
 
 
 def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> CanopenNetwork:
-    """The amplifiers of a cell; use it as a context manager.
+    """Return the amplifiers of a cell, as a context manager.
 
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
     pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
-    # Our heartbeat goes out with the SYNCs: slow ones must not stop the axes.
+    # The heartbeat is sent with SYNC: a long period must not stop the axes.
     guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
     return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, block_signals=block_signals)
 
@@ -120,26 +119,27 @@ def record(
     """Make a plan's moves and log every sample.
 
     Args:
-        cell_file: goes into the log with all it refers to.
+        cell_file: file of the cell; the log gets it with all files that it names.
+        cell: content of this file.
+        plan: moves to make.
         out: log to write; must not exist.
-        payload: what is mounted, None without load.
+        payload: mounted payload; None without load.
         operator: person or job responsible for the recording.
-        granted_by: who allows the motion; None refuses it.
-        speed: share of its planned speed that the moves have been given (`daq.workflow.plan.slowed`), for the log.
-        entered_kg: mass of the payload as it was read off the scale for this recording [kg], None where it was not.
-        block_signals: keeps signals away while the axes are stopped.
-        progress: receives the number of finished moves and of all.
-        before_motion: asked last of all, when only the log's head and a first sample lie before the moves; what it
-            raises leaves the axes without power and no file.
+        granted_by: operator who permits the motion; None refuses it.
+        speed: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for the log.
+        entered_kg: mass of the payload that was weighed for this recording [kg]; None if it was not.
+        block_signals: blocks signals while the axes are stopped.
+        progress: receives the number of finished moves and of all moves.
+        before_motion: last check before the log is opened; if it raises, the axes have no power and no file is made.
 
     Raises:
-        UsageError: the mass from the scale is not the payload's; nothing has moved and no file was made.
+        UsageError: the weighed mass is not the payload's; nothing has moved and no file was made.
         MotionRefused: motion is disabled, or the moves leave the limits; nothing has moved and no file was made.
-        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped and the log is finished and
+        DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the log is complete but
             marked invalid.
         ConfigurationInconsistent, UsageError, OutputFailed: see daq/errors.py.
-        DriverError: from the bus; the axes were stopped. What was recorded until then stays in an unfinished log
-            (`.part`), which no fit reads and `daq.log.salvage` makes a partial log of.
+        DriverError: from the bus; the axes were stopped. The samples until then stay in an unfinished log (`.part`).
+            No fit reads it; `daq.log.salvage` converts it to a partial log.
     """
     clocks = clocks or Clocks()
     if granted_by is None:
@@ -151,8 +151,8 @@ def record(
         readback = readback_of_drives(cell.axis_names, network.ampere_per_unit(), network.readback())
         scale = scaling(cell, readback)
         rate_hz, files = 1e6 / _sync(cell).period_us, bundle(cell_file)
-        # The positions of the axes: a refusal comes before a file exists. A stream of its own asks, because
-        # the schedule of the recording does not wait, and what follows here takes many periods.
+        # Read the positions first, so that a refusal comes before a file exists. This takes a stream of its own: the
+        # checks below last many periods, and the schedule of the recording does not wait.
         if producer is not None:
             producer.start()
         start_counts = _positions(network, _pacing(cell, clocks.wall_ns(), clocks, producer))
@@ -163,7 +163,7 @@ def record(
         longest_s = duration_of(moves, start_counts, rate_hz) + ALLOWANCE_S
         room.require(largest_log_bytes(cell.axis_names, rate_hz, longest_s, files))
         short: DiskSpaceShort | None = None
-        # Not behind the first SYNC of the recording's stream: its schedule would not wait for the answer.
+        # Before the first SYNC of the recording's stream, whose schedule does not wait either.
         before_motion()
         started_ns = clocks.monotonic_ns()
         run = RunInfo(
@@ -208,7 +208,7 @@ def record(
 
 
 def controller_digest(cell: Cell) -> str | None:
-    """SHA-256 of the controller's file as it is now; None where the cell names none, or it is not to be had."""
+    """Return the SHA-256 of the controller's file now; None if the cell names none or it cannot be read."""
     path = cell.controller_path
     try:
         return None if path is None else sha256(read_bytes(path))
@@ -217,10 +217,10 @@ def controller_digest(cell: Cell) -> str | None:
 
 
 def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: DiskRoom, check_every: int) -> None:
-    """Log every sample of a walk, and end the walk when they cannot be kept any more.
+    """Log every sample of a motion; end the motion when logging fails.
 
-    Whatever happens here is thrown into the walk, so that it stops the axes and notes on the error what it could not
-    confirm; if it were only closed, that would be lost.
+    An error is thrown into `execute`, which stops the axes and attaches to the error what it could not confirm. If the
+    generator were only closed, these notes would be lost.
 
     Raises:
         DiskSpaceShort, OutputFailed, DriverError: the axes were stopped.
@@ -236,7 +236,7 @@ def keep_samples(samples: Generator[Sample, None, None], log: LogWriter, room: D
 
 
 def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: float) -> float:
-    """How long the moves of motors take, with their dwells, from the current positions [s]."""
+    """Return the duration of moves of the motors from given positions, dwells included [s]."""
     total_s, here = 0.0, tuple(start_counts)
     for move in moves:
         total_s += max(move.duration_s(here)) + move.dwell_cycles / rate_hz
@@ -245,20 +245,20 @@ def duration_of(moves: Sequence[Move], start_counts: Sequence[int], rate_hz: flo
 
 
 def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
-    """Samples up to the first in which every axis says where it is; before that no move can be planned.
+    """Return the samples up to the first that has the position of every axis; no move can be planned without it.
 
     Raises:
-        SampleLost: there is none within the cycles that the stream tolerates without one.
+        SampleLost: more incomplete cycles in a row than the stream tolerates.
         DriverError: from the bus.
     """
     samples = [next(stream)]
     while samples[-1].missing:
-        samples.append(next(stream))  # the stream's own bound on incomplete cycles in a row ends this
+        samples.append(next(stream))  # ends at the stream's limit of incomplete cycles
     return tuple(samples)
 
 
 def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
-    """Where the axes are, as their PDOs and their objects both say [counts]."""
+    """Return the positions of the axes [counts]; PDOs and objects must agree."""
     asking = SyncStream(network, pacing)
     start = until_complete(asking)[-1]
     asking.check()
@@ -267,10 +267,10 @@ def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
 
 
 def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
-    """Limits of each motor, so that no joint can leave its limits by one motor alone [counts].
+    """Return the limits of each motor, within which no motor alone can move a joint out of its limits [counts].
 
-    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). That each joint keeps its own
-    limits is checked where joints are spoken of: in the plan.
+    A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits of the joints are
+    checked in the plan.
     """
     lower, upper = np.array([axis.limits.position for axis in cell.axes]).T - scale.offset_rad
     forwards, backwards = np.maximum(cell.ratio, 0.0), np.minimum(cell.ratio, 0.0)
@@ -286,7 +286,7 @@ def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
 
 
 def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
-    """A plan's joint trapezoids as the motors make them: R is linear, and all axes share the ramps [counts]."""
+    """Convert the joint trapezoids of a plan to motor moves [counts]: R is linear, and all axes share the ramps."""
     moves = []
     here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
     for planned in plan.moves:
@@ -297,7 +297,7 @@ def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[i
         )
         speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
         ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
-        # The motors' own limits for this move: the fastest trapezoid within them is the joints' one.
+        # Limits for this move alone: the fastest trapezoid within them is that of the joints.
         exact = [AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0) for v, a in zip(speed, ramp, strict=True)]
         dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
         moves.append(synchronised_move(here, target, exact, dwell))
@@ -306,7 +306,7 @@ def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[i
 
 
 def _verdict(statistics: StreamStatistics) -> tuple[bool, str]:
-    """Whether a run may be used: whatever the stream cannot explain makes it invalid."""
+    """Return whether a run is valid, and its losses: a lost or unexplained frame makes it invalid."""
     losses = {
         "missing answers": statistics.missing,
         "late answers": statistics.late,
@@ -331,7 +331,7 @@ def _sync(cell: Cell) -> declared.Sync:
 
 
 def _sync_producer(cell: Cell, network: CanopenNetwork) -> AbstractContextManager[SyncProducer | None]:
-    """Who sends SYNC in place of this program; None where this program does."""
+    """Return the SYNC producer; None if this program sends SYNC."""
     sync = cell.sync
     if sync is None or sync.producer == declared.RECORDER:
         return nullcontext()

@@ -171,7 +171,7 @@ class ControllerDocument(ABC):
 
     @abstractmethod
     def readings(self) -> tuple[Leaves, ...]:
-        """Return the leaves as each of the format's parsers sees them; two that have nothing in common, if possible.
+        """Return the leaves as each parser of the format reads them. Two parsers should share no code.
 
         Raises:
             ControllerUnfit: a parser cannot read the text.
