@@ -35,7 +35,7 @@ from daq.errors import (
 if TYPE_CHECKING:
     from daq.config.cell import Cell
     from daq.config.policy import ApplyPolicy
-    from daq.ledger.judgement import Known
+    from daq.ledger.judgement import Spread
     from daq.ledger.ledger import Ledger
     from daq.writeback.drive_target import DriveTarget
     from daq.writeback.request import GainChange, Request
@@ -385,7 +385,7 @@ def require_separate_audit(audit: Path, others: Iterable[Path | None]) -> None:
             )
 
 
-def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Known:
+def query_history(cell: Cell, target: str, request: Request, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of the cell's history that a change is judged by; none where it cannot be read."""
     from daq.files import sha256
     from daq.ledger.judgement import NOTHING, known_of

@@ -39,7 +39,7 @@ def record_verb(
     """
     from daq.cli.terminal import interruptible, progress_bar
     from daq.config.bus import bus_loads
-    from daq.config.cell import Pacing
+    from daq.config.cell import PacingMode
     from daq.config.cell_file import load_cell
     from daq.environment import login
     from daq.report.bus import load_lines
@@ -88,7 +88,7 @@ def record_verb(
             error.add_note(
                 f"kept: the samples recorded until then are in {part}, which `fit` does not read; {_next_command(part)}"
             )
-        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is Pacing.TIMED:
+        if isinstance(error, SampleLost) and declared.sync is not None and declared.sync.pacing is PacingMode.TIMED:
             error.add_note(
                 "hint: a cell of `drivegain simulate` answers as fast as its computer can and needs `sync.pacing: "
                 "lockstep` in the cell file; on a real cell, check the load of bus and computer"

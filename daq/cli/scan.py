@@ -127,7 +127,7 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
     from daq.report.bus import monitor_document
     from drivers.errors import DriverError
     from drivers.profiles.scale import read_scale
-    from drivers.stream.monitor import QUIET_S, CellMonitor, Source
+    from drivers.stream.monitor import QUIET_S, CellMonitor, ReadingSource
     from drivers.stream.sample import EventKind
 
     monitor = CellMonitor(network.link, network.axes)
@@ -139,7 +139,7 @@ def _readings(cell: Cell, network: CanopenNetwork, interval_s: float) -> Iterato
     while True:
         reading = monitor.watch(interval_s)
         answering = [axis for axis in unknown if reading.axes[axis].current_raw is not None]
-        if reading.source is Source.ASKED and answering:
+        if reading.source is ReadingSource.ASKED and answering:
             monitor.pause()
             for axis in answering:
                 unknown.remove(axis)

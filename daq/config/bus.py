@@ -8,7 +8,7 @@ from math import ceil
 from typing import TYPE_CHECKING
 
 import drivers
-from daq.config.cell import Bus, Cell, Pacing
+from daq.config.cell import Bus, Cell, PacingMode
 from daq.errors import ConfigurationInconsistent
 from drivers.canopen.pdo import HEARTBEAT_MS, SETPOINT_PDOS, STATUSWORD, pack
 from drivers.profiles.profile import Axis, DriveProfile, ObjectEntry
@@ -170,7 +170,7 @@ def bus_loads(cell: Cell) -> tuple[tuple[Bus, BusLoad], ...]:
 
 def load_warnings(cell: Cell) -> tuple[str, ...]:
     """Warn of buses on which the start of a move does not fit between two SYNCs."""
-    if cell.sync is None or cell.sync.pacing is Pacing.LOCKSTEP:
+    if cell.sync is None or cell.sync.pacing is PacingMode.LOCKSTEP:
         return ()
     return tuple(
         f"{bus.name}: when all its axes start, set-points and answers take {100 * load.start:.0f} % of a "

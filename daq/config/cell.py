@@ -47,7 +47,7 @@ def joint_unit(kind: JointKind) -> JointUnit:
     return MILLIMETRE if kind is JointKind.PRISMATIC else DEGREE
 
 
-class Pacing(Enum):
+class PacingMode(Enum):
     """When the next SYNC is sent."""
 
     LOCKSTEP = "lockstep"
@@ -81,7 +81,7 @@ class Sync:
     """Sampling period [µs], its pacing, and the producer of SYNC: RECORDER, KERNEL or the name of an axis."""
 
     period_us: Annotated[int, Field(ge=250, le=1_000_000)]
-    pacing: Pacing = Pacing.TIMED
+    pacing: PacingMode = PacingMode.TIMED
     producer: Name = RECORDER
 
 

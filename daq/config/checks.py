@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from daq.config.bus import LARGEST_MEAN, bus_load, shortest_period_us, split_answers
-from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, Pacing, joint_unit
+from daq.config.cell import DEGREE, KERNEL, MILLIMETRE, RECORDER, Bus, PacingMode, joint_unit
 from daq.config.cell_schema import AxisModel, CellModel, PayloadModel, gain_joints, ratio_of
 from daq.config.clearance import clearance_faults
 from daq.config.controller import controller_faults
@@ -299,7 +299,7 @@ def _bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Itera
                 f"{refresh_us} or more: faster than that, samples repeat old values and motion becomes a staircase",
             )
     for index, bus in enumerate(model.buses):
-        if model.sync.pacing is Pacing.TIMED:
+        if model.sync.pacing is PacingMode.TIMED:
             yield from _load_faults(model, model.sync.period_us, bus, profiles)
         elif bus.interface not in SIMULATED_INTERFACES:
             yield Fault(
@@ -388,7 +388,7 @@ def _producer_faults(model: CellModel) -> Iterator[Fault]:
     if len(interfaces) > 1:
         expected = f"{RECORDER}: no other producer sends SYNC on several buses at once"
         yield Fault(path, f"{producer} with {len(interfaces)} buses", expected)
-    if model.sync.pacing is Pacing.LOCKSTEP:
+    if model.sync.pacing is PacingMode.LOCKSTEP:
         expected = f"{RECORDER}, or pacing timed: in lockstep the next SYNC waits for the answers"
         yield Fault(path, f"{producer} with pacing lockstep", expected)
     if producer == KERNEL:

@@ -15,7 +15,7 @@ from daq.jobs.journal import Level
 from daq.jobs.session import CALIBRATION, Decision, JudgedGain, Outcome, Session, Target
 from daq.ledger.audit import AuditAction, append
 from daq.ledger.audit import read as read_audit
-from daq.ledger.judgement import Known, judge, known_of
+from daq.ledger.judgement import Spread, judge, known_of
 from daq.ledger.ledger import Ledger
 from daq.workflow.calibration_file import read
 from daq.writeback.file_access import resolve_links
@@ -114,7 +114,7 @@ def _note_applied(context: JobContext, ledger: Ledger, digest: str, after_sha256
         context.journal.say(Level.WARNING, "the history does not know of this write", text=str(error))
 
 
-def decision_of(proposal: Proposal[FileEdit], known: Known) -> Decision:
+def decision_of(proposal: Proposal[FileEdit], known: Spread) -> Decision:
     """Judge which gains differ significantly from the controller's (`daq.ledger.judgement`), each among all axes."""
     found = judge(proposal.edit.changes, known)
     changes = {change.axis: change for change in proposal.edit.changes}

@@ -16,7 +16,7 @@ SAME_SIGMAS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class Spread:
     """Figures of a history that a change is judged by; empty without a history."""
 
     #: Σ of the numbers that are in the controller now, by axis [unit of the gain]; a missing one, or 0, is taken as
@@ -26,10 +26,10 @@ class Known:
     dispersions: Mapping[str, float] = field(default_factory=dict)
 
 
-NOTHING = Known()
+NOTHING = Spread()
 
 
-def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Known:
+def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of a history for the gains in a controller.
 
     The σ of a gain is that of the calibration in force where the number is still that calibration's. Else it is that of
@@ -51,10 +51,10 @@ def known_of(store: HistoryStore, target: str, digest: str, changes: Sequence[Ga
         for gain in entry.gains:
             if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
                 stds[gain.axis] = gain.std
-    return Known(stds, dispersions_of(others, tuple(gains)))
+    return Spread(stds, dispersions_of(others, tuple(gains)))
 
 
-def judge(changes: Sequence[GainChange], known: Known) -> ChangeDecision:
+def judge(changes: Sequence[GainChange], known: Spread) -> ChangeDecision:
     """Decide whether any change is more than noise; numbers that are not finite have a gate of their own."""
     comparable = [
         change

@@ -28,7 +28,7 @@ RATE_TOLERANCE = 0.01  #: Largest relative difference between the requested rate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scaling:
+class SiScaling:
     """Factors from raw numbers to SI."""
 
     rad_per_count: FloatArray  #: motor angle of a count [rad], shape (n,)
@@ -46,7 +46,7 @@ class Scaling:
         return [float(value) for value in self.joint_position(np.array(counts, dtype=np.int64))]
 
 
-def scaling(cell: Cell, readback: Readback) -> Scaling:
+def scaling(cell: Cell, readback: Readback) -> SiScaling:
     """Return the scaling of a cell with the answers of its amplifiers.
 
     Raises:
@@ -73,7 +73,7 @@ def scaling(cell: Cell, readback: Readback) -> Scaling:
                 expected="it in the cell configuration, or a count in the log's readback",
                 remedy="add it to the cell file and record or import again",
             )
-    return Scaling(
+    return SiScaling(
         rad_per_count=np.array(angles),
         to_joint=np.asarray(np.linalg.inv(cell.ratio), dtype=np.float64),
         offset_rad=np.array([axis.zero_offset_rad for axis in cell.axes]),

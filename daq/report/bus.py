@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from daq.config.bus import bus_loads, frame_bits
-from daq.config.cell import Pacing
+from daq.config.cell import PacingMode
 from daq.report.text import picked, plain_table, printable
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import TapPoint
@@ -245,6 +245,6 @@ def actual_current_note(cell: Cell) -> str | None:
 
 def load_lines(cell: Cell) -> tuple[str, ...]:
     """Describe the load that a recording puts on each bus."""
-    lockstep = cell.sync is not None and cell.sync.pacing is Pacing.LOCKSTEP
+    lockstep = cell.sync is not None and cell.sync.pacing is PacingMode.LOCKSTEP
     says = "in lockstep; a real bus would be loaded by" if lockstep else "loaded by"
     return tuple(f"{bus.name} ({bus.interface}:{bus.channel}): {says} {load}" for bus, load in bus_loads(cell))

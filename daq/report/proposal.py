@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.syntax import Syntax
 from rich.table import Table
 
-from daq.ledger.judgement import NOTHING, Known, judge
+from daq.ledger.judgement import NOTHING, Spread, judge
 from daq.report.gains import with_deviation
 from daq.report.text import picked, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
@@ -23,7 +23,7 @@ from daq.writeback.target import E, Proposal, Written
 from ident.drift.change import FALSE_ALARM
 
 
-def show(proposal: Proposal[E], console: Console, known: Known = NOTHING) -> None:
+def show(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
     """Print the change as a table and as a diff, judged by the history."""
     edit = proposal.edit
     console.print(change_table(edit.changes, known, _place(edit)))
@@ -40,7 +40,7 @@ def show(proposal: Proposal[E], console: Console, known: Known = NOTHING) -> Non
         _show_diff(terminal_lines(edit.diff), console)
 
 
-def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place: str = "in the file") -> Table:
+def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING, place: str = "in the file") -> Table:
     """Make the table of old and new gains, with the figures to judge a change by; it fits 80 columns."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, collapse_padding=True)
     table.add_column("axis", no_wrap=True)
@@ -64,7 +64,7 @@ def change_table(changes: tuple[GainChange, ...], known: Known = NOTHING, place:
     return table
 
 
-def describe(proposal: Proposal[E], written: Written | None, known: Known = NOTHING) -> dict[str, Any]:
+def describe(proposal: Proposal[E], written: Written | None, known: Spread = NOTHING) -> dict[str, Any]:
     """Make the document of a proposal and its outcome for `--json`."""
     edit = proposal.edit
     refusals = [asdict(refusal) | {"gate": refusal.gate.value} for refusal in proposal.refusals]
@@ -170,7 +170,7 @@ def _place(edit: Edit) -> str:
     return "in the drive" if isinstance(edit, DriveEdit) else "in the file"
 
 
-def _by_axis(changes: Sequence[GainChange], known: Known) -> dict[str, tuple[float, bool]]:
+def _by_axis(changes: Sequence[GainChange], known: Spread) -> dict[str, tuple[float, bool]]:
     """Change in σ of both as calibrations scatter, and whether it is more than noise; of comparable axes."""
     found = judge(changes, known)
     return {

@@ -17,7 +17,7 @@ from daq.config.cell_file import bundle
 from daq.environment import software
 from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
-from daq.log.conversion import Scaling, scaling
+from daq.log.conversion import SiScaling, scaling
 from daq.log.metadata import RunInfo, RunStatistics, readback_of_drives
 from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import path_of
@@ -51,7 +51,7 @@ from drivers.stream.sync import (
 from ident.model.bodies import Payload
 
 LOCKSTEP_TIMEOUT_S = 3.0  #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
-GUARD_MS = {declared.Pacing.TIMED: 500, declared.Pacing.LOCKSTEP: 5000}
+GUARD_MS = {declared.PacingMode.TIMED: 500, declared.PacingMode.LOCKSTEP: 5000}
 """Silence of the recorder after which the amplifiers stop; in lockstep nothing moves while the recorder is late."""
 SYNC_SILENCE_S, SYNC_SILENCE_PERIODS = 0.1, 3
 """Silence of the SYNC producer, the longer of the two, after which this program sends SYNC itself to stop the axes."""
@@ -92,7 +92,7 @@ def network_of(cell: Cell, block_signals: SignalBlocker = nullcontext) -> Canope
     Raises:
         ConfigurationInconsistent: the cell file has no bus, or an axis without amplifier.
     """
-    pacing, period_us = (declared.Pacing.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
+    pacing, period_us = (declared.PacingMode.TIMED, 0) if cell.sync is None else (cell.sync.pacing, cell.sync.period_us)
     # The heartbeat is sent with SYNC: a long period must not stop the axes.
     guard_ms = max(GUARD_MS[pacing], 3 * period_us // 1000)
     return CanopenNetwork(cell_address(cell), drive_axes(cell), guard_ms=guard_ms, block_signals=block_signals)
@@ -266,7 +266,7 @@ def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
     return start.position_counts
 
 
-def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
+def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
     """Return the limits of each motor, within which no motor alone can move a joint out of its limits [counts].
 
     A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits of the joints are
@@ -285,7 +285,7 @@ def motor_limits(cell: Cell, scale: Scaling) -> tuple[AxisLimits, ...]:
     )
 
 
-def motor_moves(cell: Cell, plan: Plan, scale: Scaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
+def motor_moves(cell: Cell, plan: Plan, scale: SiScaling, start_counts: Sequence[int]) -> tuple[Move, ...]:
     """Convert the joint trapezoids of a plan to motor moves [counts]: R is linear, and all axes share the ramps."""
     moves = []
     here_rad, here = scale.joint_position(np.array(start_counts)), tuple(start_counts)
@@ -347,6 +347,6 @@ def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | 
         seen = producer.seen if isinstance(producer, KernelProducer) else None  # a drive keeps its period by itself
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
         return FollowedSync(period_ns, producer.name, seen is not None, silence_s, seen, start_ns, clock)
-    if sync.pacing is declared.Pacing.LOCKSTEP:
+    if sync.pacing is declared.PacingMode.LOCKSTEP:
         return LockstepSync(period_ns, timeout_s=LOCKSTEP_TIMEOUT_S, start_ns=start_ns, clock=clock)
     return TimedSync(period_ns, start_ns=start_ns, clock=clock)

@@ -25,7 +25,7 @@ from daq.errors import CalibrationRefused, ConfigurationInconsistent, Controller
 from daq.files import read_regular, replace_file, sha256
 from daq.ledger.entry import drives_of
 from daq.writeback.file_access import exclusive_writer, next_order
-from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes
+from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes
 from daq.writeback.target import Written
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.parameters import ParameterValue, ParameterWrite, Saving, read_parameters, write_parameters
@@ -371,7 +371,7 @@ def _change(gain: Gain, value: ParameterValue, gain_object: GainObject) -> tuple
     return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(value.axis, parameter, word)
 
 
-def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tuple[Finding, ...]:
+def _changed_since_record(base: tuple[ParameterValue, ...], folder: Path) -> tuple[GateFinding, ...]:
     """Compare the drives with the newest record, as logs do not carry their values.
 
     A drive has the written value, or the one before it, where the write was rolled back or never saved. Before the

@@ -23,7 +23,7 @@ from daq.files import fsync_folder, replace_file, sha256
 from daq.writeback.file_access import back_up, backups, exclusive_writer, require_existing, resolve_links
 from daq.writeback.formats.document import decode, read_bytes
 from daq.writeback.formats.scalar import ControllerDocument, rewrite_gain
-from daq.writeback.request import Edit, Finding, GainChange, is_writable, require_axes, short_digest
+from daq.writeback.request import Edit, GainChange, GateFinding, is_writable, require_axes, short_digest
 from daq.writeback.target import Written
 from ident.calibration import Calibration
 
@@ -237,7 +237,7 @@ class FileTarget:
         return Written(edit, backup)
 
 
-def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[Finding, ...]:
+def _changed_since_recording(calibration: Calibration, file: str, base_sha256: str) -> tuple[GateFinding, ...]:
     """Compare with the first log that was recorded with another content of the file."""
     for log in calibration.sources:
         recorded = None if log.recording is None else log.recording.controller_sha256

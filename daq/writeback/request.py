@@ -108,7 +108,7 @@ class GainChange:
         return _percent(self.std, abs(self.new))
 
 
-Finding = tuple[str, str, str, str]  #: Reason to refuse a write: subject, found, expected, remedy
+GateFinding = tuple[str, str, str, str]  #: Reason to refuse a write: subject, found, expected, remedy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +119,7 @@ class Edit:
     before: bytes | None  #: its content now; None where the file is gone
     after: bytes  #: its content after the change
     changes: tuple[GainChange, ...] = ()  #: one for each gain, in the order of the calibration; none in a rollback
-    unexpected: tuple[Finding, ...] = ()  #: where the content now is not the one that drivegain expects there
+    unexpected: tuple[GateFinding, ...] = ()  #: where the content now is not the one that drivegain expects there
     source: Path | None = None  #: backup or record that a rollback restores; None for a calibration
 
     @property

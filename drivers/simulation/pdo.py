@@ -32,7 +32,7 @@ MAX_ENTRIES = 8
 EVENT_DRIVEN = 254  #: First transmission type that is sent on a change, not on SYNC
 
 
-Source = Callable[[tuple[int, int]], Callable[[], int]]  #: Finds the reader of a mapped value
+Finder = Callable[[tuple[int, int]], Callable[[], int]]  #: Finds the reader of a mapped value
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class Pdo:
         locked: the mapping cannot be written.
     """
 
-    def __init__(self, direction: Mappable, parameters: PdoParameters, dictionary: Dictionary, source: Source) -> None:
+    def __init__(self, direction: Mappable, parameters: PdoParameters, dictionary: Dictionary, source: Finder) -> None:
         self._direction, self._dictionary, self._source = direction, dictionary, source
         self.parameters = parameters
         self.layout = struct.Struct("<")
@@ -210,7 +210,7 @@ class Pdo:
             raise SdoAbort(NOT_MAPPABLE)
 
 
-def default_pdos(node_id: int, dictionary: Dictionary, source: Source) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
+def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[tuple[Pdo, ...], tuple[Pdo, ...]]:
     """Return receive and transmit PDOs with the default mapping of CiA 402-2; only the first of each is valid."""
 
     def default(direction: Mappable, cob_id: int, mapping: tuple[int, ...]) -> Pdo:

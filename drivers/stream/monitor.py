@@ -29,7 +29,7 @@ _EXPEDITED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4, 0x42: 4}
 """Bytes of data by the command byte of an expedited upload answer (CiA 301, SDO upload initiate)."""
 
 
-class Source(Enum):
+class ReadingSource(Enum):
     """Origin of the readings."""
 
     OVERHEARD = "overheard"
@@ -52,7 +52,7 @@ class AxisReading:
 class CellReading:
     """Reading of a cell."""
 
-    source: Source  #: of the values
+    source: ReadingSource  #: of the values
     seconds: float  #: since the last reading
     axes: tuple[AxisReading, ...]  #: in their order
     sync_hz: float  #: SYNCs a second
@@ -133,10 +133,10 @@ class CellMonitor:
         self._began_ns = self._since_ns = link.clock()
 
     @property
-    def source(self) -> Source:
+    def source(self) -> ReadingSource:
         """Origin of the values now; overheard until the absence of another master is certain."""
         last_ns = self._began_ns if self._master_ns is None else self._master_ns
-        return Source.OVERHEARD if self._link.clock() - last_ns < QUIET_S * 1e9 else Source.ASKED
+        return ReadingSource.OVERHEARD if self._link.clock() - last_ns < QUIET_S * 1e9 else ReadingSource.ASKED
 
     def watch(self, seconds: float) -> CellReading:
         """Read the bus for a time and return a reading."""
@@ -144,7 +144,7 @@ class CellMonitor:
         deadline_ns = clock() + round(seconds * 1e9)
         with bus_errors(self._link.address):
             while (left_ns := deadline_ns - clock()) > 0:
-                if self.source is Source.ASKED:
+                if self.source is ReadingSource.ASKED:
                     self._ask()
                 message = self._link.bus.recv(min(left_ns * 1e-9, READING_S / 10))
                 if message is not None:
@@ -204,7 +204,7 @@ class CellMonitor:
 
     def _lead(self) -> None:
         """Note a command of another master."""
-        if self.source is Source.ASKED:
+        if self.source is ReadingSource.ASKED:
             self.pause()
             for axis in self._axes:
                 axis.followed = False

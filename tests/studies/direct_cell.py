@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from daq.config.bus import drive_axes
 from daq.config.cell import Cell
-from daq.log.conversion import Scaling, moves, scaling
+from daq.log.conversion import SiScaling, moves, scaling
 from daq.log.metadata import AxisReadback, Readback
 from daq.workflow.plan import Plan
 from daq.workflow.record import motor_limits, motor_moves
@@ -130,7 +130,7 @@ def run_of(raw: RawRun, cell: Cell) -> Run:
     )
 
 
-def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> Scaling:
+def _scaling(cell: Cell, ampere_per_unit: Iterable[float]) -> SiScaling:
     answers = (AxisReadback(name, float(scale)) for name, scale in zip(cell.axis_names, ampere_per_unit, strict=True))
     return scaling(cell, Readback(tuple(answers)))
 

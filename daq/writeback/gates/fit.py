@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 
 from daq.writeback.gates.gate import GateContext
-from daq.writeback.request import Finding
+from daq.writeback.request import GateFinding
 from ident.calibration import Calibration
 
 NOISE, AXIS_NOISE = 1.01, 1.02
@@ -17,14 +17,14 @@ NOISE, AXIS_NOISE = 1.01, 1.02
 two differ by 0.1 % and 0.3 % (`tests.studies.holdout_study`)."""
 
 
-def cell(context: GateContext) -> Iterator[Finding]:
+def cell(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a calibration of another cell."""
     found = context.calibration.cell
     if context.cell is not None and found != context.cell.name:
         yield "calibration", f"cell {found!r}", f"cell {context.cell.name!r}", "give its own --cell"
 
 
-def configuration(context: GateContext) -> Iterator[Finding]:
+def configuration(context: GateContext) -> Iterator[GateFinding]:
     """Refuse after a change of URDF, drive profile or cell file since the recording, in what a recording depends on."""
     if context.cell is None or context.request.accepts_changed_configuration:
         return
@@ -41,7 +41,7 @@ def configuration(context: GateContext) -> Iterator[Finding]:
         )
 
 
-def finite_errors(context: GateContext) -> Iterator[Finding]:
+def finite_errors(context: GateContext) -> Iterator[GateFinding]:
     """Require relative errors that are finite and not negative."""
     if not _errors_are_finite(context.calibration):
         yield (
@@ -52,7 +52,7 @@ def finite_errors(context: GateContext) -> Iterator[Finding]:
         )
 
 
-def error(context: GateContext) -> Iterator[Finding]:
+def error(context: GateContext) -> Iterator[GateFinding]:
     """Bound the relative error of the torques, on the held-out run if there is one; in total, and on each axis."""
     calibration, policy = context.calibration, context.policy
     if not _errors_are_finite(calibration):
@@ -85,7 +85,7 @@ def error(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def holdout(context: GateContext) -> Iterator[Finding]:
+def holdout(context: GateContext) -> Iterator[GateFinding]:
     """Require a held-out error no worse than with the nameplate's gains, in total and on each axis."""
     calibration = context.calibration
     if not _errors_are_finite(calibration):
@@ -129,7 +129,7 @@ def holdout(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def holdout_log(context: GateContext) -> Iterator[Finding]:
+def holdout_log(context: GateContext) -> Iterator[GateFinding]:
     """Require an error and a log of the held-out run, or neither."""
     calibration = context.calibration
     if context.cell is None or not calibration.sources:
@@ -140,7 +140,7 @@ def holdout_log(context: GateContext) -> Iterator[Finding]:
         yield "calibration", found, "both or neither", "fit the logs again"
 
 
-def holdout_motion(context: GateContext) -> Iterator[Finding]:
+def holdout_motion(context: GateContext) -> Iterator[GateFinding]:
     """Require that every axis moves in the held-out run: otherwise nothing tests its gain."""
     held = context.calibration.holdout_error_percent
     for name, number in zip(context.axis_names, () if held is None else held.axes, strict=False):
@@ -153,7 +153,7 @@ def holdout_motion(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def effect(context: GateContext) -> Iterator[Finding]:
+def effect(context: GateContext) -> Iterator[GateFinding]:
     """Require that each effect lowers the error on held-out data."""
     for one in context.calibration.effects:
         if not one.error_after_percent < one.error_before_percent:

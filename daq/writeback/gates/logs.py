@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from daq.config.cell import WeighedPayload
 from daq.workflow.safeguards import agree, tolerance_kg
 from daq.writeback.gates.gate import GateContext
-from daq.writeback.request import Finding
+from daq.writeback.request import GateFinding
 from ident.calibration import Source
 from ident.data.run import Recording
 
@@ -20,7 +20,7 @@ _CLOCKS_DAYS = 1.0  #: By which the recorder's clock may be ahead of ours
 _LONGEST_DAYS = 1e5  #: Some 270 years: no log is so old
 
 
-def sources(context: GateContext) -> Iterator[Finding]:
+def sources(context: GateContext) -> Iterator[GateFinding]:
     """Require logs with their digests and recording data, for every axis (not those of an earlier drivegain)."""
     if not context.calibration.sources:
         yield "calibration", "no logs it rests on", "at least one", "fit from logs of this cell"
@@ -44,7 +44,7 @@ def sources(context: GateContext) -> Iterator[Finding]:
             yield from _incomplete(source.recording, name, len(context.axis_names))
 
 
-def _incomplete(recording: Recording, name: str, axes: int) -> Iterator[Finding]:
+def _incomplete(recording: Recording, name: str, axes: int) -> Iterator[GateFinding]:
     """Find missing figures: an axis without one must not pass for an axis without a problem."""
     numbers = (
         ("serial numbers", len(recording.serials)),
@@ -62,7 +62,7 @@ def _incomplete(recording: Recording, name: str, axes: int) -> Iterator[Finding]
         yield name, found, "shares from 0 to 100 %, and counts of 0 or more", "fit the logs again"
 
 
-def roles(context: GateContext) -> Iterator[Finding]:
+def roles(context: GateContext) -> Iterator[GateFinding]:
     """Require two logs in the fit, one with a payload; each recording once, with the role `fit` or `holdout`."""
     logs = context.calibration.sources
     if context.cell is None or not logs:
@@ -96,7 +96,7 @@ def roles(context: GateContext) -> Iterator[Finding]:
         first.setdefault(source.sha256, source.name)
 
 
-def partial(context: GateContext) -> Iterator[Finding]:
+def partial(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a log that was salvaged, or whose losses were accepted."""
     for source in context.calibration.sources:
         if source.partial:
@@ -108,7 +108,7 @@ def partial(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def losses(context: GateContext) -> Iterator[Finding]:
+def losses(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a log in which cycles or answers are missing."""
     for source, recording, name in _recordings(context):
         # A log whose losses were accepted is partial: one refusal is enough.
@@ -121,7 +121,7 @@ def losses(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def age(context: GateContext) -> Iterator[Finding]:
+def age(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a log that is too old, dated in the future, or has no valid date (imports)."""
     longest = context.policy.max_age_days
     if context.cell is None or longest is None:
@@ -151,7 +151,7 @@ def _span(days: float) -> str:
     return f"{round(days, 1):g} days" if days >= 1.0 else f"{24.0 * days:.2g} hours"
 
 
-def serials(context: GateContext) -> Iterator[Finding]:
+def serials(context: GateContext) -> Iterator[GateFinding]:
     """Require the drives of the cell file, and the same drives in all logs of the fit."""
     axes = context.axis_names
     of_cell = {} if context.cell is None else {axis.name: axis.identity for axis in context.cell.axes}
@@ -183,7 +183,7 @@ def serials(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def saturation(context: GateContext) -> Iterator[Finding]:
+def saturation(context: GateContext) -> Iterator[GateFinding]:
     """Bound the share of samples of an axis in which a limit of the drive acted."""
     bound = context.policy.max_saturated_percent
     for _, recording, name in _recordings(context):
@@ -197,7 +197,7 @@ def saturation(context: GateContext) -> Iterator[Finding]:
                 )
 
 
-def mass(context: GateContext) -> Iterator[Finding]:
+def mass(context: GateContext) -> Iterator[GateFinding]:
     """Require a mass entered twice, and in the fit and the cell file as it is now, alike within the tolerance."""
     if context.cell is None:
         return
@@ -233,7 +233,7 @@ def mass(context: GateContext) -> Iterator[Finding]:
 
 def _mass_now(
     subject: str, payload: str, fitted_kg: float | None, payloads: tuple[WeighedPayload, ...]
-) -> Iterator[Finding]:
+) -> Iterator[GateFinding]:
     """Compare with the cell file of now: a mass that was corrected there means that the fit used a wrong one."""
     declared = [one for one in payloads if one.name == payload]
     if not declared:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from daq.config.policy import ApplyPolicy
 from daq.writeback.gates import fit, logs, target
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
-from daq.writeback.request import Finding
+from daq.writeback.request import GateFinding
 
 _LIMITS = ApplyPolicy()
 
 
-Check = Callable[[GateContext], Iterator[Finding]]  #: Yields one finding for each reason to refuse
+Check = Callable[[GateContext], Iterator[GateFinding]]  #: Yields one finding for each reason to refuse
 
 
 @dataclass(frozen=True, slots=True)

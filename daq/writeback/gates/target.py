@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from daq.config.cell import Axis
 from daq.errors import SignatureInvalid
 from daq.writeback.gates.gate import GateContext
-from daq.writeback.request import Finding, GainChange, parse_base, short_digest
+from daq.writeback.request import GainChange, GateFinding, parse_base, short_digest
 from daq.writeback.signature import signers_of
 from ident.calibration import Gain
 
@@ -17,7 +17,7 @@ _SPELLING = 1e-9  #: Two spellings of one number are one number
 _CURRENT_SCALE = "check scale and amplitude (RMS or peak) of the current in the drive profile, and the payload's mass"
 
 
-def finite_gains(context: GateContext) -> Iterator[Finding]:
+def finite_gains(context: GateContext) -> Iterator[GateFinding]:
     """Require finite numbers: gain (not zero), σ (not negative), number in the controller, nameplate."""
     for change in context.edit.changes:
         if not _is_finite(change):
@@ -25,7 +25,7 @@ def finite_gains(context: GateContext) -> Iterator[Finding]:
             yield change.axis, found, "finite numbers, not zero", "fit the logs again"
 
 
-def identified(context: GateContext) -> Iterator[Finding]:
+def identified(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a gain that the fit held fixed (σ = 0)."""
     for change in _finite_changes(context):
         if change.std == 0:
@@ -33,7 +33,7 @@ def identified(context: GateContext) -> Iterator[Finding]:
             yield change.axis, "a gain that the fit held fixed (σ = 0)", "an identified one", remedy
 
 
-def uncertainty(context: GateContext) -> Iterator[Finding]:
+def uncertainty(context: GateContext) -> Iterator[GateFinding]:
     """Bound σ, relative to the gain."""
     bound = context.policy.max_std_percent
     for change in _finite_changes(context):
@@ -42,7 +42,7 @@ def uncertainty(context: GateContext) -> Iterator[Finding]:
             yield change.axis, f"σ {change.std_percent:.2f} %", f"at most {bound:g} %", remedy
 
 
-def sign(context: GateContext) -> Iterator[Finding]:
+def sign(context: GateContext) -> Iterator[GateFinding]:
     """Require the sign of the gain in the controller and of the nameplate."""
     for change in _finite_changes(context):
         if not _keeps_sign(change):
@@ -54,7 +54,7 @@ def sign(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def change_bound(context: GateContext) -> Iterator[Finding]:
+def change_bound(context: GateContext) -> Iterator[GateFinding]:
     """Bound the change from the number in the controller."""
     policy = context.policy
     for change in filter(_keeps_sign, _finite_changes(context)):
@@ -67,7 +67,7 @@ def change_bound(context: GateContext) -> Iterator[Finding]:
             yield change.axis, found, f"at most ±{bound:g} {change.unit}", _CURRENT_SCALE
 
 
-def nameplate_bound(context: GateContext) -> Iterator[Finding]:
+def nameplate_bound(context: GateContext) -> Iterator[GateFinding]:
     """Bound the distance from the nameplate."""
     bound = context.policy.max_nameplate_percent
     for change in filter(_keeps_sign, _finite_changes(context)):
@@ -80,7 +80,7 @@ def nameplate_bound(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def same_nameplate(context: GateContext) -> Iterator[Finding]:
+def same_nameplate(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a comparison with another nameplate than the cell's."""
     for gain, axis in _axes_of_cell(context):
         # A nameplate that is no number has a gate of its own.
@@ -93,7 +93,7 @@ def same_nameplate(context: GateContext) -> Iterator[Finding]:
             )
 
 
-def unit(context: GateContext) -> Iterator[Finding]:
+def unit(context: GateContext) -> Iterator[GateFinding]:
     """Refuse a gain in another unit than the cell's."""
     for gain, axis in _axes_of_cell(context):
         if gain.unit != axis.gain_unit:
@@ -121,7 +121,7 @@ def _axes_of_cell(context: GateContext) -> Iterator[tuple[Gain, Axis]]:
             yield gain, declared[gain.axis]
 
 
-def base(context: GateContext) -> Iterator[Finding]:
+def base(context: GateContext) -> Iterator[GateFinding]:
     """Require the content that the target had at the recording, or after the last write; or that of `--base`."""
     edit, base = context.edit, context.request.base
     reviewed, after_digest = (None, None) if base is None else parse_base(base, edit.before or b"")
@@ -145,7 +145,7 @@ def base(context: GateContext) -> Iterator[Finding]:
         )
 
 
-def signature(context: GateContext) -> Iterator[Finding]:
+def signature(context: GateContext) -> Iterator[GateFinding]:
     """Require signatures of others than the operator; `--by` must be a signer or the login.
 
     Names are compared without case and blanks, and however they are encoded (NFKC). The operator's name must be a

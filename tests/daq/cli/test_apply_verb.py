@@ -23,7 +23,7 @@ from daq.environment import login
 from daq.errors import ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
-from daq.ledger.judgement import NOTHING, Known
+from daq.ledger.judgement import NOTHING, Spread
 from daq.ledger.store import HistoryStore
 from daq.report.proposal import change_table
 from daq.workflow.calibration_file import decode, encode, save_calibration
@@ -337,7 +337,7 @@ def _change(axis: str, old: float, new: float, std: float) -> GainChange:
     return GainChange(axis, axis, 1, old, new, std, "Nm/A", old, "")
 
 
-def significant(changes: tuple[GainChange, ...], known: Known = NOTHING) -> set[str]:
+def significant(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> set[str]:
     """Axes whose change is marked as more than noise in the table that the operator reads."""
     shown = io.StringIO()
     Console(file=shown, width=120).print(change_table(changes, known))
@@ -353,7 +353,7 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the number in the file is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
-    assert significant((middle,), Known({"J4": 0.07})) == set()
+    assert significant((middle,), Spread({"J4": 0.07})) == set()
 
 
 def test_the_number_in_the_file_has_the_sigma_of_its_calibration(

@@ -19,7 +19,7 @@ from daq.cli import main
 from daq.cli.app import VERBS
 from daq.cli.terminal import say_written
 from daq.cli.verb import Listed
-from daq.config.cell import Pacing
+from daq.config.cell import PacingMode
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
 from daq.errors import ExitCode
@@ -196,7 +196,7 @@ def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Pa
         ("socketcand", "can0", "127.0.0.1", 29536)
     ]
     assert cell.sync is not None
-    assert cell.sync.pacing is Pacing.LOCKSTEP
+    assert cell.sync.pacing is PacingMode.LOCKSTEP
     one, other = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in (real, simulated))
     assert {key for key in one if one[key] != other[key]} == {"bus", "sync"}
 

@@ -26,7 +26,7 @@ from drivers.canopen.bus import BusAddress, open_bus
 from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.simulation.cell import SimulatedCell
-from drivers.stream.monitor import ANSWER_S, QUIET_S, READING_S, AxisReading, CellMonitor, CellReading, Source
+from drivers.stream.monitor import ANSWER_S, QUIET_S, READING_S, AxisReading, CellMonitor, CellReading, ReadingSource
 from tests.drivers.scripted import FakeClock
 
 CHECKOUT = Path(__file__).parents[3]
@@ -96,7 +96,7 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(b
         bus.coming += _answers(start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle in (200, 201) else None)
     reading = monitor.watch(5.005)
     assert bus.sent == []
-    assert reading.source is Source.OVERHEARD
+    assert reading.source is ReadingSource.OVERHEARD
     assert [axis.position_counts for axis in reading.axes] == [1000 * node + 499 for node in range(1, 7)]
     assert [axis.current_raw for axis in reading.axes] == [-1, -2, -3, -4, -5, -6]
     assert [axis.lost for axis in reading.axes] == [0, 0, 2, 0, 0, 0]
@@ -115,7 +115,7 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     reading = monitor.watch(10 * ANSWER_S)
     assert {message.arbitration_id for message in bus.sent} == {0x600 + node for node in range(1, 7)}
     assert {message.data[0] for message in bus.sent} == {0x40}
-    assert reading.source is Source.ASKED
+    assert reading.source is ReadingSource.ASKED
     assert all(8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0 for axis in reading.axes)
 
 
@@ -144,7 +144,7 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     monitor.watch(QUIET_S + 0.1)
     asked = len(bus.sent)
     bus.coming.append((bus.clock.now_ns, _frame(identifier, bytes(8))))
-    assert monitor.watch(QUIET_S - 0.01).source is Source.OVERHEARD
+    assert monitor.watch(QUIET_S - 0.01).source is ReadingSource.OVERHEARD
     assert len(bus.sent) <= asked + 6  # those that left before it spoke
     asked = len(bus.sent)
     monitor.watch(0.1)
@@ -177,7 +177,7 @@ def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(joints: 
 
 def _reading(counts: list[int | None]) -> CellReading:
     axes = tuple(AxisReading(count, 5, 0x237, 5, 10.0, 0) for count in counts)
-    return CellReading(Source.ASKED, 0.5, axes, 0.0, ((0,) * 9,), ())
+    return CellReading(ReadingSource.ASKED, 0.5, axes, 0.0, ((0,) * 9,), ())
 
 
 def test_what_is_not_known_is_shown_as_that() -> None:

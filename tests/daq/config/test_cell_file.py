@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from daq.config.bus import bus_address, bus_parts, cell_address, drive_axes
-from daq.config.cell import Pacing
+from daq.config.cell import PacingMode
 from daq.config.cell_file import bundle, cell_from_bundle, load_cell
 from daq.config.drive import drive_from_text
 from daq.environment import shipped_configurations
@@ -47,7 +47,7 @@ def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
     assert cell.axes[0].gain_unit == "Nm/A"
     assert cell.payloads[0].payload.known == {"m": 4.59}
     assert cell.sync is not None
-    assert cell.sync.pacing is Pacing.LOCKSTEP
+    assert cell.sync.pacing is PacingMode.LOCKSTEP
     assert cell.controller_path == checkout / "configs/controllers/demo.yaml"
     profile = cell.axes[0].profile
     assert profile is not None
@@ -147,7 +147,7 @@ def test_lockstep_is_for_buses_that_a_simulated_cell_can_be_on(
     path = _spoil(configurations / "cells/demo.yaml", "interface: virtual", f"interface: {interface}")
     cell = load_cell(_spoil(path, "pacing: lockstep", f"pacing: {pacing}"))
     assert cell.sync is not None
-    assert cell.sync.pacing is Pacing(pacing)
+    assert cell.sync.pacing is PacingMode(pacing)
 
 
 @pytest.mark.parametrize(

@@ -16,14 +16,14 @@ from daq.config.cell import Cell
 from daq.errors import CalibrationRefused, UsageError
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.gates.target import base as base_gate
-from daq.writeback.request import Edit, Finding, Request, change_digest, parse_base
+from daq.writeback.request import Edit, GateFinding, Request, change_digest, parse_base
 from drivers.canopen.bus import BusAddress
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
 from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simulated
 
 
-def _findings(base: str | None, before: bytes, after: bytes) -> list[Finding]:
+def _findings(base: str | None, before: bytes, after: bytes) -> list[GateFinding]:
     request = Request(demo_calibration(), datetime(2025, 1, 2, tzinfo=UTC), base=base)
     return list(base_gate(GateContext(request, Edit(subject="x", before=before, after=after))))
 
