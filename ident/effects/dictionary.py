@@ -1,6 +1,6 @@
 """The dictionary of effects beyond rigid links, viscous and dry friction and offset.
 
-To add an effect:
+To add an effect, look for it among the settings of the others first; a test refuses the same columns twice. Then:
 
 1. Write one class in the chapter of its physics (`friction`, `position`, `transmission`, `electrical`). It
    derives from `Effect`; its docstring states equation, sign, source and signature; the class sets `name`, `declares`,

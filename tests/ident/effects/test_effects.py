@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -231,3 +232,37 @@ def test_families_hold_one_name_and_names_are_unique() -> None:
     names = [{effect.name for effect in family} for family in EFFECTS]
     assert all(len(name) == 1 for name in names)
     assert len(set.union(*names)) == len(names)
+
+
+@dataclass(frozen=True, slots=True)
+class Cubic(AsymmetricViscous):
+    """τ = c q̇³: nonlinear-viscous with exponent 3, under a name of its own."""
+
+    name = "cubic"
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        return np.asarray(signals.velocity_rad_s[axis] ** 3)[None]
+
+
+def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str]]:
+    """Pairs of effects of which one's columns span the other's on the robot's joints: they cannot be distinguished."""
+    train, first_run, rest = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS))), random_signals(5), random_signals(6)
+    runs = (first_run, replace(rest, session_s=300.0 + rest.time_s))
+    spans: list[tuple[str, FloatArray]] = []
+    for effect in (effect for family in families for effect in family):
+        torque = np.concatenate([at_joints(effect, 0, effect.columns(run, 0), train) for run in runs], axis=-1)
+        columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
+        settings = ", ".join(f"{value:g}" for value in effect.settings.values())
+        spans.append((f"{effect.name} ({settings})", np.linalg.svd(columns, full_matrices=False)[2]))
+    pairs = []
+    for (one, first), (other, second) in combinations(spans, 2):
+        smallest = np.linalg.svd(first @ second.T, compute_uv=False)[-1]
+        if smallest > 1.0 - 1e-9:
+            pairs.append((one, other))
+    return pairs
+
+
+def test_no_two_effects_are_the_same_under_two_names() -> None:
+    assert _duplicates(EFFECTS) == []
+    assert _duplicates((*EFFECTS, (Cubic(),))) == [("nonlinear-viscous (3)", "cubic ()")]
