@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, Refusal, as_array
 from ident.data.conditioning import Conditioning, low_pass
 from ident.data.run import Run
 from ident.errors import DataUnfit
@@ -71,17 +72,19 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     Raises:
         DataUnfit: wrong shapes, NaN, a sampling rate that is not constant or too low, or too short a recording.
     """
-    run = replace(
-        run,
-        time_s=np.asarray(run.time_s, dtype=np.float64),
-        position_rad=np.asarray(run.position_rad, dtype=np.float64),
-        current_a=np.asarray(run.current_a, dtype=np.float64),
-        move=None if run.move is None else np.asarray(run.move, dtype=np.int64),
-        valid=None if run.valid is None else np.asarray(run.valid, dtype=np.bool_),
-    )
-    _check(run, drive_train, conditioning)
+    refuse = partial(DataUnfit, run.name)
+    time_s = as_array("time_s", run.time_s, refuse=refuse)
+    if time_s.ndim != 1:
+        raise refuse(f"time_s has shape {time_s.shape}; expected (n_samples,), one entry per sample")
+    shape, each = (len(time_s), len(drive_train.ratio)), "one row per entry of time_s, one column per axis"
+    position = as_array("position_rad", run.position_rad, shape, each, refuse)
+    current = as_array("current_a", run.current_a, shape, each, refuse)
+    usable = None if run.valid is None else as_array("valid", run.valid, shape, each, refuse)
+    logged = None if run.move is None else as_array("move", run.move, shape[:1], "one entry per sample", refuse)
+    run = replace(run, time_s=time_s)
+    _check(run, shape[1], conditioning, refuse)
     rate = run.rate_hz
-    raw = np.ascontiguousarray(run.position_rad.T, dtype=np.float64)
+    raw = np.ascontiguousarray(position.T)
     smooth = low_pass(raw, rate, conditioning.position_cutoff_hz, conditioning.position_order)
     position = smooth[:, 1:-1]
     velocity = (smooth[:, 2:] - smooth[:, :-2]) * (0.5 * rate)
@@ -92,10 +95,10 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     moving = np.abs(velocity) >= speed_limit
     # Motor speed divided by the reduction, compared at the motor's own joint, which may have another number.
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
-    valid = np.ones_like(moving).T if run.valid is None else np.asfortranarray(run.valid[1:-1])
+    valid = np.ones_like(moving).T if usable is None else np.asfortranarray(usable[1:-1], dtype=np.bool_)
     # If the log has no moves, a new one begins after every standstill of all joints.
     whole = np.any(moving, axis=0)
-    move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if run.move is None else run.move[1:-1]
+    move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if logged is None else logged[1:-1]
     # Long moves are split: σ and folds need many moves, and continuous motion would be a single one.
     starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
     since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))
@@ -103,11 +106,11 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     return Dataset(
         name=run.name,
         rate_hz=rate,
-        time_s=run.time_s[1:-1],
+        time_s=time_s[1:-1],
         position_rad=np.ascontiguousarray(position).T,
         velocity_rad_s=velocity.T,
         acceleration_rad_s2=acceleration.T,
-        current_a=np.asfortranarray(run.current_a[1:-1], dtype=np.float64),
+        current_a=np.asfortranarray(current[1:-1]),
         moving=moving.T,
         motor_moving=motor_moving.T,
         valid=valid,
@@ -139,7 +142,7 @@ def standstill_speed(raw: FloatArray, smooth: FloatArray, rate_hz: float, condit
     kept = float(np.linalg.norm(0.5 * rate_hz * (response[:, 2:] - response[:, :-2])))
     noise = np.median(np.abs(raw - smooth), axis=1) / 0.6745 / removed
     # A joint that is held exactly still has rounding noise alone.
-    noise = np.maximum(noise, 1e-12 * np.abs(raw).max(axis=1))
+    noise = np.maximum(noise, 1e-12 * np.maximum(np.abs(raw).max(axis=1), 1.0))
     speed = np.quantile(np.abs(0.5 * rate_hz * (smooth[:, 2:] - smooth[:, :-2])), 0.95, axis=1)
     return np.asarray(np.maximum(STANDSTILL_SHARE_OF_SPEED * speed, STANDSTILL_SIGMAS * kept * noise))
 
@@ -155,21 +158,13 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     Raises:
         DataUnfit: the shapes differ, or a number is not finite.
     """
-    states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-    position, velocity, acceleration = (np.asarray(state, dtype=np.float64) for state in states)
+    refuse = partial(DataUnfit, "planned motion")
+    labels = "position_rad", "velocity_rad_s", "acceleration_rad_s2"
+    position, velocity, acceleration = (as_array(label, getattr(motion, label), refuse=refuse) for label in labels)
     shape = position.shape
     if position.ndim != 2 or not shape == velocity.shape == acceleration.shape:
-        raise DataUnfit(
-            "planned motion",
-            f"position, velocity and acceleration have the shapes {shape}, {velocity.shape} and {acceleration.shape}; "
-            "expected (n_samples, n_axes) each",
-        )
-    bad = np.argwhere(~np.isfinite(position + velocity + acceleration))
-    if len(bad):
-        raise DataUnfit(
-            "planned motion",
-            f"{len(bad)} values are not finite, the first in sample {bad[0][0]}, axis {bad[0][1] + 1}; give numbers",
-        )
+        found = f"{shape}, {velocity.shape} and {acceleration.shape}; expected (n_samples, n_axes) each"
+        raise refuse(f"position, velocity and acceleration have the shapes {found}")
     everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
         name="planned motion",
@@ -187,32 +182,24 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
     )
 
 
-def _check(run: Run, drive_train: DriveTrain, conditioning: Conditioning) -> None:
-    count = len(drive_train.ratio)
+def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) -> None:
     samples = len(run.time_s)
-    for label, array in (("position", run.position_rad), ("current", run.current_a)):
-        if array.shape != (samples, count):
-            raise DataUnfit(run.name, f"{label} has shape {array.shape}, expected {(samples, count)}: a column an axis")
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            first = f"the first in sample {bad[0][0]}, axis {bad[0][1] + 1}"
-            raise DataUnfit(run.name, f"{label} holds {len(bad)} non-finite values, {first}")
     if run.payload is not None and "m" in run.payload.known:
         mass_kg = run.payload.known["m"]
         if not 0.0 < mass_kg < np.inf:  # a negative mass would reverse the sign of every gain
-            raise DataUnfit(
-                run.name, f"payload {run.payload.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg"
-            )
+            raise refuse(f"payload {run.payload.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg")
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
-        raise DataUnfit(run.name, f"{speeds} standstill speeds for {count} joints; give one a joint")
+        raise refuse(f"{speeds} standstill speeds for {count} joints; give one a joint")
     step = np.diff(run.time_s)
     if samples < 3 or np.any(step <= 0) or np.ptp(step) > 0.01 * float(np.median(step)):
-        raise DataUnfit(run.name, "the sampling times are not uniform; derivatives need a constant rate without gaps")
-    highest = max(conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz)
-    if run.rate_hz <= 2.5 * highest:
+        raise refuse("the sampling times are not uniform; derivatives need a constant rate without gaps")
+    lowest, highest = sorted((conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz))
+    if not lowest > 0.0:
+        raise refuse(f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning")
+    if not run.rate_hz > 2.5 * highest:
         needed = f"a cut-off of {highest:g} Hz needs more than {2.5 * highest:g} Hz"
-        raise DataUnfit(run.name, f"sampled at {run.rate_hz:g} Hz; {needed}")
+        raise refuse(f"sampled at {run.rate_hz:g} Hz; {needed}")
     if samples < 2.0 * run.rate_hz:
-        long = samples / run.rate_hz
-        raise DataUnfit(run.name, f"only {long:.2g} s long; expected at least 2 s, and about 30 moves for one percent")
+        long = f"only {samples / run.rate_hz:.2g} s long"
+        raise refuse(f"{long}; expected at least 2 s, and about 30 moves for one percent")

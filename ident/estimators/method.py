@@ -1,8 +1,10 @@
-"""Names of the estimators; imports nothing, so that a command line can offer them without loading numerics."""
+"""Names of the estimators; imports no numerics, so that a command line can offer them quickly."""
 
 from __future__ import annotations
 
 from enum import Enum
+
+from ident.errors import ModelError
 
 
 class Method(Enum):
@@ -12,3 +14,7 @@ class Method(Enum):
     WLS = "wls"
     TLS = "tls"
     ML = "ml"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Method:
+        raise ModelError(f"there is no method {value!r}; expected one of {', '.join(method.value for method in cls)}")

@@ -13,10 +13,11 @@ Consistent Inertial Parameter Identification, 2018). P is linear in the ten para
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, require_kind
 from ident.errors import ModelError
 
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
@@ -37,7 +38,7 @@ class Payload:
             (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
 
     Raises:
-        ModelError: a name is not in LINK_PARAMETERS.
+        ModelError: a name is not in LINK_PARAMETERS, or a value is no number.
     """
 
     name: str
@@ -45,6 +46,9 @@ class Payload:
     known: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
+        for name, value in self.known.items():
+            require_kind(f"known[{name!r}]", value, Real, "give numbers in SI units: {'m': 4.59}")
         foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
         if foreign:
             raise ModelError(

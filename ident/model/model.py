@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, as_array, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
 from ident.model.regressor import fill_rigid
@@ -27,10 +27,11 @@ class DriveTrain:
     ratio: FloatArray
 
     def __post_init__(self) -> None:
-        ratio = np.asarray(self.ratio, dtype=np.float64)
+        ratio = as_array("the drive train", self.ratio)
         object.__setattr__(self, "ratio", ratio)
         if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
-            raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}")
+            remedy = "; write np.diag(gear_ratios)" if ratio.ndim == 1 else ""
+            raise ModelError(f"the drive train must be a square matrix, found shape {ratio.shape}{remedy}")
         condition = float(np.linalg.cond(ratio))
         if not np.isfinite(condition) or condition > 1e8:
             raise ModelError(f"the drive train is not invertible (condition {condition:.3g}): {ratio.tolist()}")
@@ -82,6 +83,8 @@ class Model:
     drive_train: DriveTrain
 
     def __post_init__(self) -> None:
+        require_kind("robot", self.robot, Robot, "read it from a URDF: robot_from_urdf(urdf_text)")
+        require_kind("drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))")
         motors, joints = len(self.drive_train.ratio), self.robot.joint_count
         if motors != joints:
             raise ModelError(
@@ -95,20 +98,13 @@ class Model:
         columns: list[Column] = []
         for number, joint in enumerate(self.robot.joints, start=1):
             force, rate, inertia = DRIVE_UNITS[joint.kind]
-            columns += [Column(f"{name}{number}", unit) for name, unit in zip(LINK_PARAMETERS, LINK_UNITS, strict=True)]
-            columns += [
-                Column(f"Ia{number}", inertia),
-                Column(f"fv{number}", f"{force}/({rate})"),
-                Column(f"fs{number}", force),
-                Column(f"off{number}", force),
-            ]
+            link = zip(LINK_PARAMETERS, LINK_UNITS, strict=True)
+            drive = ("Ia", inertia), ("fv", f"{force}/({rate})"), ("fs", force), ("off", force)
+            columns += [Column(f"{name}{number}", unit) for name, unit in (*link, *drive)]
         for motor in self.drive_train.coupled:
             force, rate, inertia = DRIVE_UNITS[self.robot.joints[self.drive_train.joints[motor]].kind]
-            columns += [
-                Column(f"Iam{motor + 1}", inertia),
-                Column(f"fvm{motor + 1}", f"{force}/({rate})"),
-                Column(f"fsm{motor + 1}", force),
-            ]
+            coupling = ("Iam", inertia), ("fvm", f"{force}/({rate})"), ("fsm", force)
+            columns += [Column(f"{name}{motor + 1}", unit) for name, unit in coupling]
         return tuple(columns)
 
     @property

@@ -127,7 +127,9 @@ def _tree(urdf: str) -> tuple[dict[str, Element], dict[str, list[Element]], str]
     """Return the links, the joints behind each (last name first, to be popped), and the link without a parent."""
     try:
         robot = fromstring(urdf)
-    except ParseError as error:
+    except (ParseError, TypeError) as error:
+        if "<" not in str(urdf):
+            raise ModelError(f"{urdf!r} looks like a file name; expected text: pass Path(...).read_text()") from error
         raise ModelError(f"the URDF cannot be read: {error}; expected XML") from error
     space = robot.tag.removesuffix("robot")
     if robot.tag != space + "robot" or (space and not space.startswith("{")):

@@ -48,7 +48,7 @@ def test_moves_part_where_all_joints_rest() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda run: replace(run, current_a=run.current_a[:, :1]), "a column an axis"),
+        (lambda run: replace(run, current_a=run.current_a[:, :1]), "one column per axis"),
         (
             lambda run: replace(run, position_rad=np.where(run.time_s[:, None] == 1.0, np.nan, run.position_rad)),
             "sample 1000",
