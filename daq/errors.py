@@ -4,8 +4,8 @@ DaqError
 ├── UsageError            exit 2
 ├── CalibrationRefused    exit 3    ControllerUnfit, ControllerChanged, SignatureInvalid, AuditUnusable
 ├── DataError             exit 4    CalibrationMissing, CalibrationUnreadable, TableUnfit, HistoryUnreadable,
-│   │                               LogsDiffer, LogRepeated, RolesExchanged, ModelContradicted, RunInvalid,
-│   │                               CyclesLost, ClockImplausible, CurrentSaturated, PositionImplausible
+│   │                               LogsDiffer, LogRepeated, RunInvalid, CyclesLost, ClockImplausible,
+│   │                               CurrentSaturated, PositionImplausible
 │   └── LogUnreadable               LogMissing, LogForeign, LogTruncated, LogCorrupt, LogIncomplete
 ├── ConfigurationError    exit 6    ConfigurationMissing, YamlInvalid, SchemaMismatch, ConfigurationInconsistent
 ├── JobHeld               exit 14   NotReleased (exit 11), BusTaken (exit 12), TimeBoundReached (exit 13)
@@ -137,14 +137,6 @@ class LogsDiffer(DataError):
 
 class LogRepeated(DataError):
     """One recording twice, in the fit or in fit and hold-out."""
-
-
-class RolesExchanged(DataError):
-    """Loaded and unloaded runs are mistaken for each other."""
-
-
-class ModelContradicted(DataError):
-    """The declared model explains less of the data than it leaves."""
 
 
 class RunInvalid(DataError):

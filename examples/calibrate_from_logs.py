@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 import daq
+import ident
 
 
 def main() -> daq.Calibration:
@@ -37,5 +38,5 @@ def main() -> daq.Calibration:
 if __name__ == "__main__":
     try:
         main()
-    except daq.DataError as error:
+    except (daq.DataError, ident.IdentificationError) as error:
         raise SystemExit(f"{error}") from error  # names the log, what was found, and what to do

@@ -41,10 +41,12 @@ if TYPE_CHECKING:
     from ident.errors import DataUnfit as DataUnfit
     from ident.errors import EffectRefused as EffectRefused
     from ident.errors import IdentificationError as IdentificationError
+    from ident.errors import ModelContradicted as ModelContradicted
     from ident.errors import ModelError as ModelError
     from ident.errors import NotConverged as NotConverged
     from ident.errors import PayloadUnseen as PayloadUnseen
     from ident.errors import RankDeficient as RankDeficient
+    from ident.errors import RolesExchanged as RolesExchanged
     from ident.errors import TooFewMoves as TooFewMoves
     from ident.estimators.estimate import Estimate as Estimate
     from ident.estimators.estimate import RelativeError as RelativeError
@@ -68,8 +70,8 @@ _HOMES = {
     "ident.data.dataset": "Dataset differentiate planned",
     "ident.data.run": "Run",
     "ident.discovery.loop": "Evidence Step find_effects gather",
-    "ident.errors": "DataUnfit EffectRefused IdentificationError ModelError NotConverged PayloadUnseen RankDeficient "
-    "TooFewMoves",
+    "ident.errors": "DataUnfit EffectRefused IdentificationError ModelContradicted ModelError NotConverged "
+    "PayloadUnseen RankDeficient RolesExchanged TooFewMoves",
     "ident.estimators.estimate": "Estimate RelativeError",
     "ident.estimators.identify": "Identification identify",
     "ident.estimators.method": "Method",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -12,6 +13,8 @@ from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError
 
 if TYPE_CHECKING:  # reading a calibration needs no estimator
+    from ident.discovery.loop import Step
+    from ident.effects.effect import PlacedEffect
     from ident.estimators.identify import Identification
 
 
@@ -136,21 +139,30 @@ def calibration_of(
     *,
     units: Sequence[str] = (),
     robot: str = "robot",
+    steps: Sequence[Step] = (),
 ) -> Calibration:
-    """Calibration that an identification amounts to, without effects and without the logs that it came from.
+    """Calibration that an identification amounts to, without the logs that it came from.
 
     Its sources name the payloads with their masses and no file.
 
     Args:
-        found: by `ident.identify`.
+        found: by `ident.identify`; with ``steps``, the one that they began with.
         axes: name of each axis.
         nameplate: the manufacturer's gains, one an axis.
         units: of each gain; Nm/A where it is left out.
         robot: name of the robot or cell.
+        steps: by `ident.find_effects`: the calibration is that of the last one, with the effects that it holds.
 
     Raises:
-        ModelError: there is not one name, nameplate gain and unit for each axis.
+        ModelError: there is not one name, nameplate gain and unit for each axis, or the effects come without steps.
     """
+    from ident.effects.signals import session_began_s  # noqa: PLC0415 - reading a calibration needs no effects
+
+    last = steps[-1].after if steps else None
+    start, found = found, found if last is None else last.identification
+    if last is None and len(found.columns) > len(found.system.base.names):
+        effect = f"the identification holds {found.columns[-1].name!r}, a parameter of an effect"
+        raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
     units = units or ("Nm/A",) * len(axes)
     if not len(axes) == len(nameplate) == len(units) == len(estimate.gains):
@@ -158,20 +170,17 @@ def calibration_of(
             f"{len(axes)} axis names, {len(nameplate)} nameplate gains and {len(units)} units for "
             f"{len(estimate.gains)} identified gains; expected one of each for each axis"
         )
+    parameters = tuple(
+        Parameter(column.name, float(value), float(std), column.unit)
+        for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    )
+    gains = zip(axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True)
     return Calibration(
         cell=robot,
         method=estimate.method.value,
-        gains=tuple(
-            Gain(axis, float(value), float(std), unit, float(entered))
-            for axis, value, std, unit, entered in zip(
-                axes, estimate.gains, estimate.gains_std, units, nameplate, strict=True
-            )
-        ),
-        parameters=tuple(
-            Parameter(column.name, float(value), float(std), column.unit)
-            for column, value, std in zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
-        ),
-        effects=(),
+        gains=tuple(Gain(axis, float(g), float(std), unit, float(entered)) for axis, g, std, unit, entered in gains),
+        parameters=parameters,
+        effects=() if last is None else tuple(_accepted(start, steps, one, axes, parameters) for one in last.effects),
         relative_error_percent=found.training_error,
         holdout_error_percent=found.holdout_error,
         condition=estimate.condition,
@@ -184,4 +193,34 @@ def calibration_of(
         configuration_sha256="",
         created="",
         software="",
+        session_began_s=None if last is None else session_began_s(last.trained),
+    )
+
+
+def _accepted(
+    start: Identification, steps: Sequence[Step], placed: PlacedEffect, axes: Sequence[str], found: Sequence[Parameter]
+) -> AcceptedEffect:
+    # The last turn that added it: an effect may have been dropped and added again.
+    for number, step in reversed(list(enumerate(steps))):
+        before = steps[number - 1].after if number else None
+        finding = step.accepted
+        if finding is not None and placed in step.after.effects and not (before and placed in before.effects):
+            break
+    else:
+        raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
+    axis = placed.axis_name(axes)
+    held_out = (before or start).holdout_error, step.after.holdout_error
+    errors = [math.nan if e is None else e.axes[placed.axis] if axis in axes else e.total for e in held_out]
+    if not all(map(math.isfinite, errors)):
+        # Without a run that was held out, the moves that were left out in turn must do.
+        errors = [finding.error_before_percent, finding.error_after_percent]
+    names = {column.name for column in placed.columns}
+    return AcceptedEffect(
+        name=placed.effect.name,
+        axis=axis,
+        settings={name: float(value) for name, value in placed.effect.settings.items()},
+        coefficients=tuple(parameter for parameter in found if parameter.name in names),
+        error_before_percent=errors[0],
+        error_after_percent=errors[1],
+        ambiguity=tuple(rival.name_among(axes) for rival in finding.ambiguity),
     )

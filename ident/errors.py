@@ -3,6 +3,8 @@
 IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
+├── ModelContradicted     the declared model explains less of the data than it leaves
+│   └── RolesExchanged    loaded and unloaded runs are mistaken for each other
 ├── TooFewMoves           uncertainty and left-out moves need more of them
 ├── RankDeficient         the data do not distinguish some unknowns
 ├── PayloadUnseen         runs declared loaded do not differ from the others by the weight of the payload
@@ -27,12 +29,23 @@ class ModelError(IdentificationError):
 
 
 class DataUnfit(IdentificationError):
-    """The recording cannot be used."""
+    """The recording cannot be used; several runs are named with commas."""
 
     def __init__(self, run: str, reason: str) -> None:
-        super().__init__(f"run {run!r}: {reason}")
+        super().__init__(f"runs {run}: {reason}" if ", " in run else f"run {run!r}: {reason}" if run else reason)
         self.run = run
         self.reason = reason
+
+
+class ModelContradicted(IdentificationError):
+    """The declared model explains less of the data than it leaves."""
+
+    def __init__(self, subject: str, *, found: str, expected: str, remedy: str) -> None:
+        super().__init__(f"{subject}: found {found}; expected {expected}; {remedy}")
+
+
+class RolesExchanged(ModelContradicted):
+    """Loaded and unloaded runs are mistaken for each other."""
 
 
 class TooFewMoves(IdentificationError):
@@ -62,7 +75,8 @@ class PayloadUnseen(IdentificationError):
     def __init__(self, std_percent: tuple[float, ...], runs: tuple[str, ...], hint: str = "") -> None:
         super().__init__(
             f"runs {', '.join(runs)}: every gain is uncertain by {min(std_percent):.0f} % or more, expected some 1 %: "
-            "the runs declared loaded and those declared unloaded do not differ by the weight of the payload; "
+            "the runs declared loaded and those declared unloaded do not differ by the weight of the payload, or are "
+            "positions not in rad, or columns in another order than the joints? "
             + (hint or "was it mounted in every loaded run, and in no other? is its mass right?")
         )
         self.std_percent = std_percent
@@ -75,7 +89,7 @@ class NotConverged(IdentificationError):
     def __init__(self, method: str, iterations: int, cost: tuple[float, ...], step: float) -> None:
         super().__init__(
             f"{method} did not converge in {iterations} iterations: the cost went from {cost[0]:.6g} to {cost[-1]:.6g} "
-            f"and the last relative step was {step:.2g}; are roles, payload mass and drive train right?"
+            f"and the last relative step was {step:.2g}; are roles, payload mass, drive train, rad and axis order ok?"
         )
         self.method = method
         self.iterations = iterations

@@ -8,7 +8,7 @@ from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import EFFECTS, UNNAMED
-from ident.effects.effect import PlacedEffect, at_joints, check_settings
+from ident.effects.effect import ALL_AXES, PlacedEffect, Side, at_joints, check_settings
 from ident.effects.signals import declared_signals, payload_parameters
 from ident.errors import DataUnfit, EffectRefused, ModelError
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -99,13 +99,14 @@ def placed_effect(accepted: AcceptedEffect, calibration: Calibration) -> tuple[P
         EffectRefused: no such effect, setting, axis or coefficient exists.
     """
     axes = tuple(gain.axis for gain in calibration.gains)
-    if accepted.axis not in axes:
-        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
-    axis = axes.index(accepted.axis)
     families = {known.name: known for known in (*(family[0] for family in EFFECTS), *UNNAMED)}
     if accepted.name not in families:
         raise EffectRefused(f"there is no effect {accepted.name!r}; there are {', '.join(sorted(families))}")
     known = families[accepted.name]
+    everywhere = known.side is Side.ALL_MOTORS and accepted.axis == ALL_AXES
+    if not everywhere and accepted.axis not in axes:
+        raise EffectRefused(f"effect {accepted.name!r} acts on axis {accepted.axis!r}; there are {', '.join(axes)}")
+    axis = 0 if everywhere else axes.index(accepted.axis)
     if set(accepted.settings) != set(known.settings):
         found, exist = (", ".join(sorted(settings)) or "none" for settings in (accepted.settings, known.settings))
         raise EffectRefused(f"effect {accepted.name!r} is given the settings {found}; it has {exist}")
@@ -156,18 +157,14 @@ def _payload(calibration: Calibration, data: Dataset) -> FloatArray:
 
 
 def _check_mounting(payload: Payload, identified: dict[str, float], mountings: set[str], run: str) -> None:
+    mounting = f"mounting {payload.mounting!r}"
     if not identified and set(payload.known) != set(LINK_PARAMETERS):
         known = ", ".join(sorted(map(repr, mountings))) or "none"
-        raise DataUnfit(
-            run, f"carries mounting {payload.mounting!r}, of which the calibration knows nothing; it knows {known}"
-        )
+        raise DataUnfit(run, f"carries {mounting}, of which the calibration knows nothing; it knows {known}")
     both = sorted(set(identified) & set(payload.known))
     if both:
-        raise DataUnfit(
-            run,
-            f"declares {', '.join(both)} of mounting {payload.mounting!r}, and the calibration identified the same: "
-            "give each way of mounting a name of its own",
-        )
+        same = "the calibration identified the same: give each way of mounting a name of its own"
+        raise DataUnfit(run, f"declares {', '.join(both)} of {mounting}, and {same}")
     foreign = sorted(set(identified) - set(LINK_PARAMETERS))
     if foreign:
-        raise DataUnfit(run, f"mounting {payload.mounting!r} has parameters that no payload has: {', '.join(foreign)}")
+        raise DataUnfit(run, f"{mounting} has parameters that no payload has: {', '.join(foreign)}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from daq.cli.verb import CalibrationArgument, JsonOption, Verb, print_json
-from daq.errors import ConfigurationInconsistent, ModelContradicted, OutputFailed, UsageError
+from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 
 if TYPE_CHECKING:
     from daq.workflow.urdf_export import JointUpdate, PhysicalRobot, Updated
@@ -73,6 +73,7 @@ def export_urdf_verb(
     from daq.workflow.calibration_file import load_calibration
     from daq.workflow.fit import DOUBTFUL_PERCENT
     from daq.workflow.urdf_export import FORMAT, parse_markup, physical_robot, require_solver, update_urdf
+    from ident.errors import ModelContradicted
 
     one_of("give the cell file; --urdf is for a robot without one", cell=cell, urdf=urdf)
     given = cell or urdf or Path()

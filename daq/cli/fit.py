@@ -80,7 +80,8 @@ def fit_verb(
     from daq.log.reader import LossyLogs
     from daq.report.fit import fit_document, fit_view
     from daq.workflow.cases import CaseFit, calibration_of_case, essential_fit, fit_case, reduce_logs
-    from daq.workflow.fit import check_explained, compare_estimators, fit
+    from daq.workflow.fit import compare_estimators, fit
+    from ident.estimators.identify import require_plausible
 
     if cases is not None:
         other = {"known": known is not Known.MASS, "gains": gains is not Gains.FREE}  # every case has its own
@@ -98,7 +99,8 @@ def fit_verb(
         else:
             chosen = method or (Method.WLS if fixed else Method.ML)
             found = fit_case(reduce_logs(logs, holdout or (), described), chosen, known, gains_fixed=fixed)
-            check_explained(found.fitted.identification.training_error, found.fitted.cell.axis_names)
+            one = found.fitted.identification
+            require_plausible(one.estimate, one.training_error, found.fitted.cell.axis_names)
         if essential is not None:
             found = replace(essential_fit(found.fitted, essential), payloads=found.payloads)
         calibration = calibration_of_case(found, datetime.now(UTC))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ident.effects.effect import Effect, PlacedEffect, Side
+from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Periodic, Smooth
 
@@ -27,15 +27,6 @@ WORDS = {
     "gravity-compensator": "a gravity compensator, or another torque that repeats with the joint",
 }
 """Words by family; an effect that is not listed is called by its name."""
-
-
-def placed_name(placed: PlacedEffect, axes: tuple[str, ...]) -> str:
-    """Name an effect and its place: `load-friction on J3`, `coupling on J4 with J5`."""
-    if placed.effect.side is Side.ALL_MOTORS:
-        return f"{placed.effect.name} on all axes"
-    other = other_axis(placed.effect)
-    pair = "" if other is None else f" with {axes[other]}"
-    return f"{placed.effect.name} on {axes[placed.axis]}{pair}"
 
 
 def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from daq.config.cell import MILLIMETRE, Cell, JointUnit
 from daq.files import replace_file
-from daq.report.effect_names import effect_text, other_axis, placed_name, variable_text
+from daq.report.effect_names import effect_text, other_axis, variable_text
 from daq.report.fit import start_of
 from daq.report.gains import plot_gains
 from daq.report.picture import (
@@ -248,7 +248,7 @@ def plot_ranking(
         falls = [findings[row].held_out_fall for row in rows]
         if rows:
             place.barh(rows, falls, color=colour, hatch=hatch, edgecolor="white", label=label)
-    names = [placed_name(PlacedEffect(finding.effect, finding.axis), axes) for finding in findings]
+    names = [PlacedEffect(finding.effect, finding.axis).name_among(axes) for finding in findings]
     place.set_yticks(range(len(names)), [unformatted(name) for name in names])
     place.invert_yaxis()
     place.set_xlabel("fall of the squared error on moves left out [noise variances]", fontsize=8)

@@ -13,7 +13,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from daq.report.effect_names import effect_text, is_unnamed, placed_name
+from daq.report.effect_names import effect_text, is_unnamed
 from daq.report.fit import coefficients, error_document, error_table
 from daq.report.gains import gain_table, partial_note, with_deviation
 from daq.report.text import picked, plain_table
@@ -72,7 +72,7 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
             yield "No candidate passes every gate; nothing is added.\n"
         else:
             placed = PlacedEffect(step.accepted.effect, step.accepted.axis)
-            yield f"Added: {placed_name(placed, fitted.cell.axis_names)}.\n"
+            yield f"Added: {placed.name_among(fitted.cell.axis_names)}.\n"
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -252,7 +252,7 @@ def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> dict[str, Any]:
             }
             for placed in added
         ],
-        "removed": [placed_name(placed, axes) for placed in removed],
+        "removed": [placed.name_among(axes) for placed in removed],
         **(dict.fromkeys(("before", "after", "gain_changes")) if turn is None else _before_after(fitted, turn)),
         "findings": [_finding(finding, axes) for finding in step.findings],
         "structures": [_finding(finding, axes) for finding in step.structures],
@@ -310,5 +310,5 @@ def _finding(finding: Finding, axes: tuple[str, ...]) -> dict[str, Any]:
         ],
         **picked(finding, *names, "held_out_fall", "passed", "share_of_excess"),
         # For findings that failed a gate it would be most of the file and of no use.
-        "ambiguity": [placed_name(rival, axes) for rival in finding.ambiguity] if finding.passed else None,
+        "ambiguity": [rival.name_among(axes) for rival in finding.ambiguity] if finding.passed else None,
     }

@@ -10,7 +10,7 @@ from unicodedata import category
 
 from daq.errors import OutputFailed
 from daq.files import replace_file
-from daq.report.effect_names import effect_text, placed_name, variable_text
+from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
 from daq.report.gains import partial_note, plot_gain_changes, with_deviation
 from daq.report.plots import draw_effect, draw_torques, plot_ranking
@@ -169,9 +169,9 @@ def _effect(fitted: Fit, before: Evidence, step: Step, turn: BeforeAfter, placed
     kept = placed in final.effects
     settings = ", ".join(f"{name} {value:.4g}" for name, value in placed.effect.settings.items())
     rivals = () if step.accepted is None else step.accepted.ambiguity
-    ambiguous = ", ".join(placed_name(rival, axes) for rival in rivals)
+    ambiguous = ", ".join(rival.name_among(axes) for rival in rivals)
     sentences = (
-        f"Effect {placed_name(placed, axes)}" + (f" ({settings})." if settings else "."),
+        f"Effect {placed.name_among(axes)}" + (f" ({settings})." if settings else "."),
         f"These data cannot distinguish it from: {ambiguous}."
         if ambiguous
         else "Every other candidate is clearly worse.",
@@ -234,7 +234,7 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     best = added or next(iter(step.findings), None)
     outcome = "Nothing passed every gate and nothing was added."
     if added is not None:
-        outcome = f"Added: {placed_name(PlacedEffect(added.effect, added.axis), axes)}."
+        outcome = f"Added: {PlacedEffect(added.effect, added.axis).name_among(axes)}."
     ranking = paragraph("No candidate could be tried.")
     if shown:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)

@@ -16,9 +16,8 @@ from daq.workflow.fit import Fit, Reading, calibration_of, check_signs
 from ident.calibration import Calibration, Parameter, Source
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.equations.system import require_distinct
-from ident.errors import DataUnfit
 from ident.estimators.comparison import Essential, essential
-from ident.estimators.identify import Identification, estimate_with, require_seen_payload
+from ident.estimators.identify import Identification, each_run, estimate_with, require_seen_payload
 from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
@@ -76,11 +75,8 @@ def reduce_logs(logs: Sequence[Path], holdout: Sequence[Path] = (), cell: Cell |
     reading = Reading(logs, cell)
     model, conditioning = model_of(reading.cell), reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning)
-    unseen = reduce_runs(model, reading.runs(holdout, "holdout"), conditioning, payloads=used.payloads)
-    for payload in unseen.payloads[len(used.payloads) :]:
-        raise DataUnfit(
-            ", ".join(unseen.runs), f"held out with mounting {payload.mounting!r}, which no run of the fit carries"
-        )
+    rest = each_run(reading.runs(holdout, "holdout"), used.payloads)
+    unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
     return ReducedLogs(reading.cell, tuple(logs), tuple(holdout), tuple(reading.sources), used, unseen)
 
 

@@ -14,19 +14,16 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of
 from daq.environment import software
-from daq.errors import ConfigurationError, LogRepeated, LogsDiffer, ModelContradicted, RolesExchanged, UsageError
+from daq.errors import ConfigurationError, LogRepeated, LogsDiffer, UsageError
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
-from daq.report.effect_names import placed_name
 from daq.workflow.experiment import LAG_ONE, experiment_of, extra_moves
-from ident.calibration import AcceptedEffect, Calibration, Parameter, Source
+from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.loop import Evidence, Step, find_effects, gather
-from ident.effects.effect import PlacedEffect, Side
-from ident.effects.signals import session_began_s
-from ident.errors import IdentificationError, PayloadUnseen
+from ident.errors import IdentificationError, PayloadUnseen, RolesExchanged
 from ident.estimators.comparison import Comparison, compare
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import Identification, estimate_with, identify
@@ -201,7 +198,6 @@ def fit(
         )
         if not gains_fixed:
             check_signs(result.estimate, nameplate)
-        check_explained(result.training_error, declared.axis_names)
         paper = None if gains_fixed else tls(result.system)
         return Fit(declared, tuple(used), tuple(unseen), tuple(reading.sources), result, (), paper, lossy)
 
@@ -244,28 +240,7 @@ def compare_estimators(fitted: Fit, progress: Callable[[str], None] = lambda _: 
     )
 
 
-ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
-LARGEST_TOTAL_PERCENT = 50.0
-LARGEST_AXIS_PERCENT = 100.0
-"""Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
 DOUBTFUL_PERCENT = 25.0  #: In total; the default limit of `apply`
-
-
-def check_explained(error: RelativeError, axes: tuple[str, ...]) -> None:
-    """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
-
-    Raises:
-        ModelContradicted: the relative error is above LARGEST_TOTAL_PERCENT, or LARGEST_AXIS_PERCENT on an axis.
-    """
-    worst = int(np.nanargmax(error.axes))
-    if error.total > LARGEST_TOTAL_PERCENT or error.axes[worst] > LARGEST_AXIS_PERCENT:
-        raise ModelContradicted(
-            "the fit",
-            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}",
-            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis {LARGEST_AXIS_PERCENT:g} %",
-            remedy="look for what contradicts the model: two channels exchanged or one reversed, a wrong drive train, "
-            "gravity or URDF, a payload or drawing (--known cad) that is not the one that was mounted",
-        )
 
 
 def check_signs(estimate: Estimate, nameplate: NDArray[np.float64]) -> None:
@@ -309,22 +284,20 @@ def calibration_of(fitted: Fit, created: datetime) -> Calibration:
         created: when, with its time zone.
     """
     cell = fitted.cell
-    kept = fitted.steps[-1].after.effects if fitted.steps else ()
     found = identified_calibration(
-        fitted.final,
+        fitted.identification,
         cell.axis_names,
         [axis.nameplate_gain for axis in cell.axes],
         units=[axis.gain_unit for axis in cell.axes],
         robot=cell.name,
+        steps=fitted.steps,
     )
     return replace(
         found,
-        effects=tuple(_accepted(fitted, placed, found.parameters) for placed in kept),
         sources=fitted.sources,
         configuration_sha256=cell.digest,
         created=created.isoformat(timespec="seconds"),
         software=software(),
-        session_began_s=session_began_s(fitted.steps[-1].after.trained) if fitted.steps else None,
         nameplate_holdout_error_percent=_nameplate_error(fitted),
         recording_configuration_sha256=cell.recording_digest,
     )
@@ -352,41 +325,6 @@ def _nameplate_error(fitted: Fit) -> RelativeError | None:
     moved = size > 0.0
     left = np.where(moved, (np.array(axes) / 100.0) ** 2 * size, 0.0)
     return RelativeError(axes, of_squares(size, left).total)
-
-
-def _accepted(fitted: Fit, placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
-    # The last turn that added it: an effect may have been dropped and added again.
-    for number, step in reversed(list(enumerate(fitted.steps))):
-        before = fitted.steps[number - 1].after if number else None
-        had = before.effects if before else ()
-        finding = step.accepted
-        if finding is not None and placed in step.after.effects and placed not in had:
-            break
-    else:
-        raise LookupError(f"{placed} is in the model, and no turn of the loop added it")
-    everywhere = placed.effect.side is Side.ALL_MOTORS
-    errors = []
-    for error in ((before or fitted.identification).holdout_error, step.after.holdout_error):
-        percent = np.nan if error is None else error.total if everywhere else error.axes[placed.axis]
-        errors.append(percent)
-    if not np.isfinite(errors).all():
-        # Without a run that was held out, the moves that were left out in turn must do.
-        errors = [finding.error_before_percent, finding.error_after_percent]
-    names = {column.name for column in placed.columns}
-    return AcceptedEffect(
-        name=placed.effect.name,
-        axis=axis_of(placed, fitted.cell),
-        settings={name: float(value) for name, value in placed.effect.settings.items()},
-        coefficients=tuple(parameter for parameter in parameters if parameter.name in names),
-        error_before_percent=errors[0],
-        error_after_percent=errors[1],
-        ambiguity=tuple(placed_name(rival, fitted.cell.axis_names) for rival in finding.ambiguity),
-    )
-
-
-def axis_of(placed: PlacedEffect, cell: Cell) -> str:
-    """Name of the axis that an effect is on; what acts on every motor alike is placed on the first for order only."""
-    return ALL_AXES if placed.effect.side is Side.ALL_MOTORS else cell.axes[placed.axis].name
 
 
 def gain_verdicts(fitted: Fit) -> tuple[GainVerdict, ...]:

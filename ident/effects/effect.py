@@ -166,12 +166,24 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
         )
 
 
+ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
+
+
 @dataclass(frozen=True, slots=True)
 class PlacedEffect:
     """An effect on an axis (index from 0)."""
 
     effect: Effect
     axis: int
+
+    def axis_name(self, axes: Sequence[str]) -> str:
+        """Name of its axis; what acts on every motor alike is placed on the first axis for order only: ALL_AXES."""
+        return ALL_AXES if self.effect.side is Side.ALL_MOTORS else axes[self.axis]
+
+    def name_among(self, axes: Sequence[str]) -> str:
+        """Name of effect and place: `load-friction on J3`, `coupling on J4 with J5`."""
+        other = int(self.effect.settings.get("other_axis", 0))
+        return f"{self.effect.name} on {self.axis_name(axes)}" + (f" with {axes[other - 1]}" if other else "")
 
     @property
     def columns(self) -> tuple[Column, ...]:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, as_array, require_kind
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.reduction import reduce_runs
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, ModelError, NotConverged, PayloadUnseen, RankDeficient, TooFewMoves
+from ident.errors import DataUnfit, IdentificationError, ModelContradicted, ModelError, PayloadUnseen, RolesExchanged
 from ident.estimators.estimate import Estimate, RelativeError
 from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
@@ -23,6 +23,12 @@ from ident.model.model import Column, Model
 
 LARGEST_STD = 0.1
 """Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
+LEAST_WEIGHT = 1e-3
+"""Share of the known payload's torque in a joint's, where it is largest. In a recording it is 0.1 and more."""
+LARGEST_TOTAL_PERCENT = 50.0
+LARGEST_AXIS_PERCENT = 100.0
+"""Of ‖ρ‖/‖Y‖ of a fit. A robot with every effect undeclared stays below 15 and 40; a model of nothing leaves 100."""
+LARGEST_UNKNOWN_PERCENT = 25.0  #: The same, on an axis whose gain is smaller than its own σ
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +71,7 @@ def identify(
     conditioning: Conditioning,
     *,
     holdout: Iterable[Run] = (),
-    method: Method = Method.ML,
+    method: Method | str = Method.ML,
     fixed_gains: FloatArray | None = None,
 ) -> Identification:
     """Identify all gains and parameters in one global step; runs are read one after the other and none is kept.
@@ -75,29 +81,36 @@ def identify(
         runs: of the fit: without load, and with a weighed payload where the gains are free.
         conditioning: the filters.
         holdout: runs that the fit must not see; their payload mountings must be among those of ``runs``.
-        method: estimator.
+        method: estimator, or its name.
         fixed_gains: known gains, shape (n,).
 
     Raises:
-        ModelError: the fixed gains are not one for each motor.
+        ModelError: an argument is of another type, there is no such method, or no gain for each motor.
+        RolesExchanged, ModelContradicted: see `require_plausible`. A reversed current only reverses its gain's sign.
         DataUnfit, RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
+    require_kind("model", model, Model, "write Model(robot, drive_train)")
+    require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
+    method = Method(method)
     if fixed_gains is not None:
-        fixed_gains = np.asarray(fixed_gains, dtype=np.float64)
-        if fixed_gains.shape != (model.robot.joint_count,):
-            raise ModelError(f"fixed_gains has shape {fixed_gains.shape}; expected ({model.robot.joint_count},)")
-    reduction = reduce_runs(model, runs, conditioning)
+        fixed_gains = as_array("fixed_gains", fixed_gains, (model.robot.joint_count,), "one per motor")
+        if not fixed_gains.all():
+            raise ModelError(f"fixed_gains is {fixed_gains.tolist()}; expected no zero: such a motor moves nothing")
+    reduction = reduce_runs(model, each_run(runs), conditioning)
+    if not reduction.runs:
+        raise DataUnfit("", "no run was given; expected one without load and one with a weighed payload")
     system = reduction.system(reduction.base(), reduction.payload_columns())
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
+    judged = estimate
     if fixed_gains is None:
-        judged = estimate
         # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
         # contradict each other; ml's do, where it has an estimate.
-        with suppress(DataUnfit, NotConverged, RankDeficient, TooFewMoves):
+        with suppress(IdentificationError):
             judged = estimate if method is Method.ML else ml(system)
         require_seen_payload(judged, system)
-    rest = reduce_runs(model, _mounted_among(holdout, system.payloads), conditioning, payloads=system.payloads)
+    require_plausible(judged, estimate.relative_error(system), [joint.name for joint in model.robot.joints])
+    rest = reduce_runs(model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)
 
@@ -106,22 +119,63 @@ def require_seen_payload(estimate: Estimate, system: System) -> None:
     """Refuse gains if the data do not fix their common scale.
 
     The weight of the payload fixes it. If a run is declared loaded but was not, or the other way round, its moves
-    disagree with the others about the scale, and σ of all gains grows together.
+    disagree with the others about the scale, and σ of all gains grows together. Gains beside which that weight is
+    nothing have no scale, however small their σ.
 
     Raises:
-        PayloadUnseen: every gain is uncertain by more than LARGEST_STD.
+        PayloadUnseen: every gain is uncertain by more than LARGEST_STD, or the weight is below LEAST_WEIGHT.
     """
-    relative = estimate.gains_std / np.abs(estimate.gains)
-    if float(np.min(relative)) > LARGEST_STD:
+    relative, rows = estimate.gains_std / np.abs(estimate.gains), system.joints.factors
+    torque = [LEAST_WEIGHT * np.linalg.norm(factor[:, : len(relative)] @ estimate.gains) for factor in rows]
+    weightless = all(np.linalg.norm(factor[:, -1]) < least for factor, least in zip(rows, torque, strict=True))
+    if weightless or float(np.min(relative)) > LARGEST_STD:
         raise PayloadUnseen(tuple(float(100.0 * value) for value in relative), system.runs)
 
 
-def _mounted_among(runs: Iterable[Run], payloads: tuple[Payload, ...]) -> Iterator[Run]:
-    known = {payload.mounting for payload in payloads}
+def require_plausible(estimate: Estimate, error: RelativeError, axes: Sequence[str]) -> None:
+    """Refuse a fit whose model contradicts its data: no number of it can be believed, however small its σ.
+
+    The payload's weight sets the sign of all gains. Taken from the wrong runs it reverses them, and all torques with
+    them: the residual stays the same, but the dry friction of every joint then drives the robot.
+
+    Raises:
+        ModelContradicted: the relative error is above one of the LARGEST_..._PERCENT.
+        RolesExchanged: dry friction is negative on every joint, on most of them by more than five σ.
+    """
+    unknown = estimate.gains_std > np.abs(estimate.gains)
+    excess = np.array(error.axes) / np.where(unknown, LARGEST_UNKNOWN_PERCENT, LARGEST_AXIS_PERCENT)
+    worst = int(np.nanargmax(excess))
+    if error.total > LARGEST_TOTAL_PERCENT or excess[worst] > 1.0:
+        raise ModelContradicted(
+            "the fit",
+            found=f"a relative error of {error.total:.3g} % in total, {error.axes[worst]:.3g} % on axis {axes[worst]}, "
+            f"with a gain of {estimate.gains[worst]:.3g} ± {estimate.gains_std[worst]:.2g}",
+            expected=f"some 3 to 15 %, below {LARGEST_TOTAL_PERCENT:g} % and on every axis {LARGEST_AXIS_PERCENT:g} %, "
+            f"{LARGEST_UNKNOWN_PERCENT:g} % where a gain is smaller than its σ",
+            remedy="look for what contradicts the model: two channels exchanged or one reversed, a wrong drive train, "
+            "gravity or URDF, positions not in rad, a payload or drawing that is not of the body that was mounted",
+        )
+    parameters = zip(estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True)
+    dry = [(one.name, v, std) for one, v, std in parameters if one.name.startswith("fs") and one.name[2:].isdigit()]
+    if dry and all(v < 0.0 for _, v, _ in dry) and np.median([v + 5.0 * std for _, v, std in dry]) < 0.0:
+        raise RolesExchanged(
+            "the dry friction of all joints",
+            found=", ".join(f"{name} = {v:.3g} ± {std:.2g}" for name, v, std in dry),
+            expected="above 0, because friction takes energy",
+            remedy="were the payload's run and the run without load exchanged? do fixed gains have the right sign?",
+        )
+
+
+def each_run(runs: Iterable[Run], payloads: tuple[Payload, ...] | None = None) -> Iterator[Run]:
+    """Yield runs with a known mounting, or with any; refuse anything else."""
+    require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
     for run in runs:
-        if run.payload is not None and run.payload.mounting not in known:
-            mounting = f"mounting {run.payload.mounting!r}"
-            raise DataUnfit(run.name, f"held out with {mounting}, which no run of the fit carries: it stays unknown")
+        require_kind("an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)")
+        if run.payload is not None:
+            require_kind(f"payload of {run.name!r}", run.payload, Payload, "write Payload(name, mounting, known)")
+            if payloads is not None and run.payload.mounting not in (known.mounting for known in payloads):
+                mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
+                raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
         yield run
 
 
@@ -131,12 +185,8 @@ def estimate_with(method: Method, system: System, fixed_gains: FloatArray | None
     Raises:
         DataUnfit: ``tls`` with fixed gains: it has nothing to correct then.
     """
-    if method is Method.LS:
-        return ls(system, fixed_gains)
-    if method is Method.WLS:
-        return wls(system, fixed_gains)
-    if method is Method.ML:
-        return ml(system, fixed_gains)
-    if fixed_gains is not None:
-        raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
-    return tls(system)
+    if Method(method) is Method.TLS:
+        if fixed_gains is not None:
+            raise DataUnfit(", ".join(system.runs), "tls needs free gains; with fixed gains choose ls, wls or ml")
+        return tls(system)
+    return {Method.LS: ls, Method.WLS: wls, Method.ML: ml}[Method(method)](system, fixed_gains)

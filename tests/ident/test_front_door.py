@@ -120,7 +120,9 @@ def test_a_payload_of_another_mass_is_not_predicted(example: SimpleNamespace) ->
 def test_a_planned_motion_holds_numbers_of_one_shape() -> None:
     motion = _slow_motion()
     motion.velocity_rad_s[7, 1] = np.nan
-    with pytest.raises(ident.DataUnfit, match="1 values are not finite, the first in sample 7, axis 2"):
+    with pytest.raises(
+        ident.DataUnfit, match="velocity_rad_s holds 1 non-finite values, the first in sample 7, axis 2"
+    ):
         ident.planned(motion, 100.0)
     with pytest.raises(ident.DataUnfit, match=r"\(200, 3\), \(200, 3\) and \(3, 200\); expected \(n_samples, n_axes\)"):
         motion = _slow_motion()
@@ -155,7 +157,9 @@ def test_wrong_sizes_and_transposed_arrays_are_refused_with_their_shapes(example
         ident.Model(found.model.robot, ident.DriveTrain(np.diag([100.0, 100.0])))
     run = example.record(found.model, "run", None, 3)
     turned = ident.Run("turned", run.time_s, run.position_rad.T, run.current_a)
-    with pytest.raises(ident.DataUnfit, match=r"position has shape \(3, \d+\), expected \(\d+, 3\)"):
+    with pytest.raises(
+        ident.DataUnfit, match=r"position_rad has shape \(3, \d+\); expected \(\d+, 3\), one row .*transpose it\?"
+    ):
         ident.identify(found.model, [turned], found.conditioning)
     with pytest.raises(ident.ModelError, match=r"fixed_gains has shape \(2,\); expected \(3,\)"):
         ident.identify(found.model, [run], found.conditioning, fixed_gains=np.ones(2))

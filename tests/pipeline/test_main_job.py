@@ -12,9 +12,10 @@ import yaml
 
 from daq.cli.app import main
 from daq.config.cell import model_of
-from daq.errors import ExitCode, RolesExchanged
+from daq.errors import ExitCode
 from daq.log.conversion import load_run
 from daq.workflow.fit import check_signs
+from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
 
 
@@ -114,10 +115,13 @@ def test_exchanged_roles_turn_all_signs_and_are_named(demonstration: Path) -> No
     (bare, cell), (loaded, _) = (load_run(demonstration / f"{name}.mcap") for name in ("bare-1", "loaded-1"))
     payload = loaded.payload
     exchanged = (replace(bare, payload=payload), replace(loaded, payload=None))
-    estimate = identify(model_of(cell), exchanged, cell.conditioning).estimate
+    with pytest.raises(RolesExchanged, match=r"dry friction.*fs1 = -.*exchanged"):
+        identify(model_of(cell), exchanged, cell.conditioning)
+    estimate = identify(model_of(cell), (bare, loaded), cell.conditioning).estimate
     nameplate = np.array([axis.nameplate_gain for axis in cell.axes])
+    check_signs(estimate, nameplate)
     with pytest.raises(RolesExchanged, match="exchanged"):
-        check_signs(estimate, nameplate)
+        check_signs(replace(estimate, gains=-estimate.gains), nameplate)
 
 
 def test_validate_measures_the_calibration_on_the_holdout_run(

@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 
 from daq.cli.app import main
-from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable, ModelContradicted
+from daq.errors import CalibrationRefused, ExitCode, HistoryUnreadable
 from daq.jobs.session import Outcome
 from daq.ledger.audit import AuditAction
 from daq.ledger.store import HistoryStore
 from daq.writeback.signature import generate
 from drivers.errors import DriveFault
+from ident.errors import ModelContradicted
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import Rig
 

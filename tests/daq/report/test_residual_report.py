@@ -20,7 +20,7 @@ from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputFailed, UsageError
-from daq.report.effect_names import WORDS, effect_text, other_axis, placed_name
+from daq.report.effect_names import WORDS, effect_text, other_axis
 from daq.report.plots import draw_fit
 from daq.report.residual import error_change_text, residual_document, summary
 from daq.report.residual_page import DOCUMENT, PAGE, page, paragraph, residual_page, save_report, table
@@ -272,7 +272,7 @@ def test_what_rises_is_not_said_to_fall() -> None:
 
 def test_effects_are_called_by_words_and_axes_by_names() -> None:
     axes = ("base", "arm", "wrist")
-    assert placed_name(PlacedEffect(Coupling(3, 1), 0), axes) == "coupling on base with wrist"
+    assert PlacedEffect(Coupling(3, 1), 0).name_among(axes) == "coupling on base with wrist"
     assert effect_text(Coupling(3, 1), axes) == "friction shared with wrist"
     term = Smooth(Abscissa.OTHER_VELOCITY, other_axis=2)
     assert effect_text(term, axes) == "a torque that depends on the velocity of arm and that no named effect explains"

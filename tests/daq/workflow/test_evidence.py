@@ -24,7 +24,7 @@ from daq.log.metadata import run_from_record, run_record
 from daq.log.reader import LossyLogs, read_log
 from daq.workflow import fit as fit_module
 from daq.workflow.calibration_file import as_document, decode, encode
-from daq.workflow.fit import ALL_AXES, Fit, Reading, axis_of, calibration_of, close_loop, fit
+from daq.workflow.fit import Fit, Reading, calibration_of, close_loop, fit
 from daq.workflow.plan_file import load_plan
 from daq.workflow.record import Clocks, record
 from daq.workflow.safeguards import check_entered_mass
@@ -33,12 +33,14 @@ from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
 from ident.calibration import Calibration
 from ident.data.run import Recording, Run
-from ident.discovery.loop import find_effects
-from ident.effects.effect import PlacedEffect
+from ident.discovery.loop import find_effects, with_effects
+from ident.effects.effect import ALL_AXES, PlacedEffect
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.friction import Stribeck
+from ident.equations.rows import decimate_rows
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
+from ident.prediction import predict_torque
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
 from tests.daq.workflow.test_record import WALL_NS, Rig
 from tests.ident.recordings import GAINS, MOUNTED, tx40_truth
@@ -223,8 +225,21 @@ def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
 def test_an_effect_on_all_motors_is_not_called_the_first_axis_s(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     assert ALL_AXES not in cell.axis_names
-    assert axis_of(PlacedEffect(TimeSkew(), 0), cell) == ALL_AXES
-    assert axis_of(PlacedEffect(Lag(), 0), cell) == "J1"
+    assert PlacedEffect(TimeSkew(), 0).axis_name(cell.axis_names) == ALL_AXES
+    assert PlacedEffect(Lag(), 0).axis_name(cell.axis_names) == "J1"
+
+
+def test_a_delay_of_all_axes_is_predicted_from_the_file(with_effect: Fit) -> None:
+    first = with_effect.steps[0]
+    assert first.accepted is not None
+    delayed = with_effects(first.after, (PlacedEffect(TimeSkew(), 0),))
+    step = replace(first, accepted=replace(first.accepted, effect=TimeSkew(), axis=0), after=delayed)
+    made = calibration_of(replace(with_effect, steps=(step,)), NOW)
+    assert [effect.axis for effect in made.effects] == [ALL_AXES]
+    read, data = decode(encode(made), "c.yaml"), delayed.datasets[0]
+    torque = decimate_rows(data, delayed.conditioning, predict_torque(read, delayed.model, data).T)
+    fitted = delayed.estimate.predicted_torque(delayed.training)[:, : torque.shape[1]]
+    assert np.max(np.abs(torque - fitted)) < 1e-3 * np.max(np.abs(fitted))
 
 
 @pytest.mark.parametrize("entered", [4.584, 4.596, 9.0, 0.1])

@@ -1,0 +1,96 @@
+"""From arrays to effects to a prediction with `import ident` alone: found effects are part of the calibration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ident
+from ident.data.conditioning import Conditioning
+from ident.effects.effect import ALL_AXES
+from ident.effects.electrical import TimeSkew
+from ident.effects.friction import Coupling
+from ident.equations.rows import decimate_rows
+from ident.prediction import placed_effect
+from tests.ident.recordings import Truth
+
+AXES, NAMEPLATE = ("J1", "J2", "J3"), (32.0, 34.0, -23.0)
+DELAY_S = 0.006
+
+
+@pytest.fixture(scope="module")
+def late(small_runs: tuple[ident.Run, ...]) -> tuple[ident.Run, ...]:
+    """Recordings whose currents were sampled six milliseconds after their positions."""
+    samples = round(DELAY_S * small_runs[0].rate_hz)
+    return tuple(
+        replace(
+            run,
+            name=f"late {run.name}",
+            time_s=run.time_s[samples:],
+            position_rad=run.position_rad[samples:],
+            current_a=run.current_a[:-samples],
+        )
+        for run in small_runs
+    )
+
+
+@pytest.fixture(scope="module")
+def searched(small_truth: Truth, late: tuple[ident.Run, ...]) -> tuple[ident.Identification, tuple[ident.Step, ...]]:
+    """What was identified first, and the turns of the search."""
+    found = ident.identify(small_truth.model, late[:3], Conditioning(), holdout=late[3:])
+    families = ((TimeSkew(),), (Coupling(2, 1), Coupling(3, 1)))
+    evidence = ident.gather(found, late[:3], late[3:])
+    return found, ident.find_effects(evidence, np.random.default_rng(0), families=families)
+
+
+def test_a_skew_found_on_all_axes_is_predicted(
+    searched: tuple[ident.Identification, tuple[ident.Step, ...]], late: tuple[ident.Run, ...]
+) -> None:
+    found, steps = searched
+    calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
+    (skew,) = calibration.effects
+    assert (skew.name, skew.axis) == ("time-skew", ALL_AXES)
+    assert skew.coefficients[0].value == pytest.approx(DELAY_S, rel=0.1)
+    assert skew.error_after_percent < 0.97 * skew.error_before_percent
+    assert calibration.gains[1].value == pytest.approx(steps[-1].after.estimate.gains[1])
+    data = ident.differentiate(late[3], found.model.drive_train, found.conditioning)
+
+    def left(of: ident.Calibration) -> float:
+        rest = np.where(data.moving, ident.predict_current(of, found.model, data) - data.current_a, 0.0)
+        return float(np.linalg.norm(decimate_rows(data, found.conditioning, rest.T)))
+
+    without = ident.calibration_of(found, AXES, NAMEPLATE)
+    assert without.effects == ()
+    assert left(calibration) < 0.98 * left(without)
+
+
+def test_errors_without_a_held_out_run_are_those_of_left_out_moves(
+    searched: tuple[ident.Identification, tuple[ident.Step, ...]],
+) -> None:
+    found, steps = searched
+    blind = tuple(replace(step, after=replace(step.after, holdout=None)) for step in steps)
+    (skew,) = ident.calibration_of(replace(found, holdout=None), AXES, NAMEPLATE, steps=blind).effects
+    assert steps[0].accepted is not None
+    assert skew.error_before_percent == steps[0].accepted.error_before_percent
+
+
+def test_an_identification_with_effects_needs_the_turns_of_the_search(
+    searched: tuple[ident.Identification, tuple[ident.Step, ...]],
+) -> None:
+    _, steps = searched
+    with pytest.raises(ident.ModelError, match=r"'time-skew time 1'.*steps=find_effects"):
+        ident.calibration_of(steps[-1].after.identification, AXES, NAMEPLATE)
+
+
+def test_only_an_effect_on_all_motors_is_on_all_axes(
+    searched: tuple[ident.Identification, tuple[ident.Step, ...]],
+) -> None:
+    found, steps = searched
+    calibration = ident.calibration_of(found, AXES, NAMEPLATE, steps=steps)
+    placed, _ = placed_effect(calibration.effects[0], calibration)
+    assert placed in steps[-1].after.effects
+    spring = replace(calibration.effects[0], name="spring")
+    with pytest.raises(ident.EffectRefused, match="'spring' acts on axis 'all axes'; there are J1, J2, J3"):
+        placed_effect(spring, calibration)

@@ -1,0 +1,120 @@
+"""Wrong arguments of a caller without a type checker: each is refused with what was found, expected, and what to do."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ident
+from tests.ident.arms import THREE_AXES
+from tests.ident.recordings import MOUNTED, Truth, record
+
+DRIVE_TRAIN = ident.DriveTrain(np.diag([40.0, 50.0, -45.0]))
+
+
+@pytest.fixture(scope="module")
+def short(small_truth: Truth) -> tuple[ident.Run, ident.Run]:
+    """A run without load and one with, long enough for a fit."""
+    rng = np.random.default_rng(7)
+    one, two = (record(small_truth, name, rng, payload) for name, payload in (("bare", None), ("loaded", MOUNTED)))
+    return one, two
+
+
+Change = Callable[[Any], Any]
+lax: Any = ident  #: As a notebook sees it
+
+OF_A_RUN: list[tuple[str, Change, str]] = [
+    ("time of two columns", lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)), r"'bare': time_s .*\(n_samples,\)"),
+    ("a rate for the time", lambda r: replace(r, time_s=0.001), r"'bare': time_s has shape \(\); expected"),
+    ("a gap in time", lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)), "time_s holds 1 .* sample 19999;"),
+    (
+        "ragged time",
+        lambda r: replace(r, time_s=[[0.0], [0.1, 0.2]]),
+        "'bare': time_s is no array of numbers.*expected",
+    ),
+    ("short time", lambda r: replace(r, time_s=r.time_s[:-9]), r"position_rad has shape \(\d+, 3\); expected.*one row"),
+    ("ragged positions", lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]), "'bare': position_rad is no array"),
+    ("words", lambda r: replace(r, current_a=[["one", "two", "three"]]), "'bare': current_a is no array of numbers"),
+    ("transposed", lambda r: replace(r, position_rad=r.position_rad.T), r"\(3, \d+\); expected .* transpose it\?"),
+    ("no position", lambda r: replace(r, position_rad=None), "'bare': position_rad .*expected"),
+    ("valid of samples", lambda r: replace(r, valid=np.ones(len(r.time_s))), r"'bare': valid has shape .* expected \("),
+    ("few moves", lambda r: replace(r, move=np.zeros(9)), r"'bare': move has shape \(9,\); expected \(\d+,\)"),
+    ("a mass for the payload", lambda r: replace(r, payload=4.0), "'bare' is of type float; expected Payload; write"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), [case[1:] for case in OF_A_RUN], ids=[case[0] for case in OF_A_RUN])
+def test_a_run_that_is_none_is_refused(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], change: Change, words: str
+) -> None:
+    with pytest.raises(ident.IdentificationError, match=words):
+        ident.identify(small_truth.model, [change(short[0]), short[1]], ident.Conditioning())
+
+
+Call = Callable[[Any, Any], Any]
+
+OF_A_CALL: list[tuple[str, Call, str]] = [
+    ("one run", lambda m, r: lax.identify(m, r[0], lax.Conditioning()), r"type Run; .* give a list: \[bare, load"),
+    ("one held out", lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]), "holdout .* give a list"),
+    ("no run", lambda m, _: lax.identify(m, [], lax.Conditioning()), "^no run was given; expected one without load"),
+    ("arrays", lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()), "type ndarray; expected Run; write"),
+    ("no filters", lambda m, r: lax.identify(m, r, None), "type NoneType; expected Conditioning; write Conditioning"),
+    ("no model", lambda m, r: lax.identify(m.robot, r, lax.Conditioning()), "type Robot; expected Model; write"),
+    ("cut-off", lambda m, r: lax.identify(m, r, lax.Conditioning(0.0)), "'bare': .*cut-off of 0 Hz; expected above"),
+    ("decimation", lambda m, r: lax.identify(m, r, lax.Conditioning(decimation_cutoff_hz=-1)), "of -1 Hz; expected"),
+    ("NaN", lambda m, r: lax.identify(m, r, lax.Conditioning(float("nan"))), "'bare': "),
+    ("method", lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"), "'foo'; expected one of ls, wls"),
+    (
+        "zero gain",
+        lambda m, r: _fixed(m, r, [30.0, 0.0, 20.0]),
+        r"fixed_gains is \[30.0, 0.0, 20.0\]; expected no zero",
+    ),
+    (
+        "NaN gain",
+        lambda m, r: _fixed(m, r, [30.0, float("nan"), 20.0]),
+        "fixed_gains holds 1 .* sample 1; give numbers",
+    ),
+    ("a gain", lambda m, r: _fixed(m, r, 30.0), r"fixed_gains has shape \(\); expected \(3,\), one per motor"),
+    ("words", lambda m, r: _fixed(m, r, ["a", "b", "c"]), r"fixed_gains is no array of numbers.*expected \(3,\)"),
+    ("a mass", lambda *_: lax.Payload("disc", "flange", 4.0), "known is of type float; expected dict; write"),
+    ("text", lambda *_: lax.Payload("disc", "flange", {"m": "4"}), r"known\['m'\] is of type str; .* SI units"),
+    ("URDF", lambda *_: lax.Model(THREE_AXES.urdf, DRIVE_TRAIN), r"type str; expected Robot; .*robot_from_urdf\("),
+    ("ratios", lambda m, _: lax.Model(m.robot, np.diag([40.0] * 3)), r"ndarray; expected DriveTrain; .*np.diag\("),
+    ("vector", lambda *_: lax.DriveTrain([100, -50]), r"found shape \(2,\); write np.diag\(gear_ratios"),
+    ("ragged", lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]), "the drive train is no array of numbers.*expected"),
+    ("file name", lambda *_: lax.robot_from_urdf("robot.urdf"), r"looks like a file name; .* pass Path\(...\).read_te"),
+    ("path", lambda *_: lax.robot_from_urdf(Path("robot.urdf")), "'robot.urdf'.* looks like a file name; expected"),
+    ("plan", lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0), "planned motion.* no array of"),
+]
+
+
+def _fixed(model: ident.Model, runs: list[ident.Run], gains: Any) -> ident.Identification:
+    return ident.identify(model, runs, ident.Conditioning(), fixed_gains=gains)
+
+
+@pytest.mark.parametrize(("call", "words"), [case[1:] for case in OF_A_CALL], ids=[case[0] for case in OF_A_CALL])
+def test_an_argument_of_another_kind_is_refused(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], call: Call, words: str
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ident.IdentificationError, match=words):
+            call(small_truth.model, list(short))
+
+
+def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+    for method in ident.Method:
+        found = ident.identify(small_truth.model, short, ident.Conditioning(), method=method.value)
+        assert found.estimate.method is method
+
+
+def test_several_runs_are_named_one_by_one(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+    still = [replace(run, position_rad=run.position_rad * [1.0, 0.0, 1.0]) for run in short]
+    with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: joint 2 never moves"):
+        ident.identify(small_truth.model, still, ident.Conditioning())
