@@ -128,17 +128,24 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+class _QuickDumper(yaml.CSafeDumper):
+    """The same by libyaml, four times as fast, and the same bytes where no text is `_UNUSUAL`."""
+
+    ignore_aliases = _Dumper.ignore_aliases
+
+
+_UNUSUAL = re.compile(r'\\|"":|[\U00010000-\U0010ffff]')  #: In JSON: escaped characters, an empty key, rare scripts
+_NUMBER = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$")
+
+
+def _represent_text(dumper: _Dumper | _QuickDumper, text: str) -> yaml.ScalarNode:
     # Line breaks of Unicode (U+0085, U+2028) survive in double quotes only.
     return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=None if text.isprintable() else '"')
 
 
-_Dumper.add_representer(str, _represent_text)
-_Dumper.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$"),
-    list("-+0123456789."),
-)
+for _kind in (_Dumper, _QuickDumper):
+    _kind.add_representer(str, _represent_text)
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", _NUMBER, list("-+0123456789."))
 
 
 def as_document(calibration: Calibration) -> dict[str, Any]:
@@ -180,12 +187,9 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     def check(content: bytes) -> None:
         # Compared as documents: NaN, for an axis that did not move, is not equal to itself.
         if as_document(decode(content, str(path))) != as_document(calibration):
-            raise CalibrationUnreadable(
-                str(path),
-                found="another content on reading back",
-                expected="what was written",
-                remedy="check the disk; the file was not replaced",
-            )
+            found, expected = "another content on reading back", "what was written"
+            remedy = "check the disk; the file was not replaced"
+            raise CalibrationUnreadable(str(path), found=found, expected=expected, remedy=remedy)
 
     replace_file(path, encode(calibration), check=check)
 
@@ -194,10 +198,9 @@ def encode(calibration: Calibration) -> bytes:
     """Return the content of the file."""
     body = as_document(calibration)
     document = {"format": "drivegain-calibration", "version": VERSION, **body, "digests": _digests(body)}
+    kind = _Dumper if _UNUSUAL.search(json.dumps(body, ensure_ascii=False)) else _QuickDumper
     # One entry a line: leaf collections in flow style, lines never folded.
-    text = yaml.dump(
-        document, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf
-    )
+    text = yaml.dump(document, Dumper=kind, sort_keys=False, default_flow_style=None, allow_unicode=True, width=2**30)
     return (_HEADER + text).encode()
 
 
@@ -221,12 +224,9 @@ def read(path: Path) -> bytes:
     try:
         return read_regular(path, MAX_BYTES)
     except OSError as error:
-        raise CalibrationMissing(
-            str(path),
-            found=(error.strerror or type(error).__name__).lower(),
-            expected="the file that `drivegain fit` wrote",
-            remedy="check the name",
-        ) from error
+        found = (error.strerror or type(error).__name__).lower()
+        wanted = "the file that `drivegain fit` wrote"
+        raise CalibrationMissing(str(path), found=found, expected=wanted, remedy="check the name") from error
 
 
 def decode(content: bytes, name: str) -> Calibration:
