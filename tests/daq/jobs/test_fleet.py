@@ -48,7 +48,7 @@ CREATED = datetime(2025, 1, 2, tzinfo=UTC)
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Short logs of simulated cells; to make them takes most of the time here."""
     folder = tmp_path_factory.mktemp("fleet")
-    (plans,) = plans_of(1, exchanges=40, duration_s=7.0)
+    (plans,) = plans_of(1, exchanges=40, duration_s=5.5)
     for number in range(CELLS):
         make_cell(FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2))
     return folder

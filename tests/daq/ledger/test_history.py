@@ -83,9 +83,21 @@ def _place(cell: Path) -> HistoryPlace:
     return place
 
 
+_stores: dict[tuple[tuple[float, ...], ...], tuple[tuple[str, ...], bytes]] = {}
+"""Digests of the calibrations and content of the file, by the true factors of each week."""
+
+
 def _filled(cell: Path, weeks: int, true: Callable[[int], tuple[float, ...]]) -> tuple[str, ...]:
-    with HistoryStore(_place(cell).store) as store:
-        return fill(store, weeks, true)
+    """Fill the history, which has no file yet; the digests of its calibrations. Equal ones are filled once."""
+    path, key = _place(cell).store, tuple(map(true, range(weeks)))
+    assert not path.exists()
+    if key not in _stores:
+        with HistoryStore(path) as store:
+            digests = fill(store, weeks, true)
+        _stores[key] = digests, path.read_bytes()
+    digests, content = _stores[key]
+    path.write_bytes(content)
+    return digests
 
 
 def _series(cell: Path) -> tuple[Series, ...]:

@@ -190,11 +190,12 @@ def _write_on(path: Path, week: int, written: Any, begun: Any) -> None:
 
 def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) -> None:
     """Committed entries are there, others are not, and none is half."""
-    path = tmp_path / "h"
     rng = random.Random(7)
-    written = FORK.RawValue("i", 0)  # without a lock, which a killed writer would keep
-    known = 0
-    for week in range(40):
+    for kill in range(40):
+        path, week = tmp_path / f"h{kill // 10}", kill % 10  # another file now and then: all of it is read each time
+        if week == 0:
+            written = FORK.RawValue("i", 0)  # without a lock, which a killed writer would keep
+            known = 0
         begun = FORK.Event()
         writer = FORK.Process(target=_write_on, args=(path, week, written, begun))
         writer.start()
@@ -318,15 +319,22 @@ def test_another_version_is_refused_and_left_alone(tmp_path: Path, version: int)
     assert path.read_bytes() == before
 
 
+@pytest.fixture(scope="module")
+def four(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Content of a file with four calibrations."""
+    path = tmp_path_factory.mktemp("four") / "h"
+    with HistoryStore(path) as store:
+        for week in range(4):
+            enter(store, calibration_of(week))
+    return path.read_bytes()
+
+
 @settings(max_examples=30, deadline=None)
-@given(st.randoms(use_true_random=False))
-def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random) -> None:
+@given(random_=st.randoms(use_true_random=False))
+def test_a_damaged_file_is_reported_and_never_a_surprise(four: bytes, random_: random.Random) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "h"
-        with HistoryStore(path) as store:
-            for week in range(4):
-                enter(store, calibration_of(week))
-        damaged = bytearray(path.read_bytes())
+        damaged = bytearray(four)
         for _ in range(random_.randint(1, 400)):
             damaged[random_.randrange(len(damaged))] = random_.randrange(256)
         path.write_bytes(damaged[: random_.randint(1, len(damaged))] if random_.random() < 0.3 else damaged)

@@ -46,6 +46,8 @@ from tests.daq.drives import REAL, Listener, demo_cell, entered_gain, network_of
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 IN_DRIVES = pytest.approx(NAMEPLATE)
 NEW = pytest.approx(IDENTIFIED)
+WRITERS = multiprocessing.get_context("forkserver")
+WRITERS.set_forkserver_preload([__name__])
 
 
 @pytest.fixture
@@ -569,9 +571,7 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(tmp_path: Pa
     cell = demo_cell(tmp_path)
     assert cell.history is not None
     with Hub(("can0",)) as hub, simulated(hub.address()) as simulation:
-        process = multiprocessing.get_context("spawn").Process(
-            target=_write_until_killed, args=(tmp_path, hub.address(), writes)
-        )
+        process = WRITERS.Process(target=_write_until_killed, args=(tmp_path, hub.address(), writes))
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
