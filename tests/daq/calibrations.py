@@ -72,6 +72,25 @@ def with_recordings(calibration: Calibration, **changes: object) -> Calibration:
     )
 
 
+def of_first_axes(calibration: Calibration, count: int) -> Calibration:
+    """The same of so many axes."""
+
+    def first(error: RelativeError | None) -> RelativeError | None:
+        return None if error is None else replace(error, axes=error.axes[:count])
+
+    error = calibration.relative_error_percent
+    cut = replace(
+        calibration,
+        gains=calibration.gains[:count],
+        relative_error_percent=replace(error, axes=error.axes[:count]),
+        holdout_error_percent=first(calibration.holdout_error_percent),
+        nameplate_holdout_error_percent=first(calibration.nameplate_holdout_error_percent),
+    )
+    return with_recordings(
+        cut, serials=tuple(range(1001, 1001 + count)), saturated_percent=(0.0,) * count, missing=(0,) * count
+    )
+
+
 _numbers = st.floats(allow_nan=False, allow_infinity=False)
 _deviations = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
 _texts = st.text(max_size=12)

@@ -22,9 +22,8 @@ from daq.writeback.formats.scalar import spell
 from daq.writeback.formats.yaml_document import YamlDocument
 from daq.writeback.request import Request
 from daq.writeback.target import apply, propose
-from ident.calibration import Calibration, Gain
-from ident.estimators.estimate import RelativeError
-from tests.daq.calibrations import demo_calibration, with_recordings
+from ident.calibration import Gain
+from tests.daq.calibrations import demo_calibration, of_first_axes
 
 _words = st.text("abcdefghijklmnopqrstuvwxyzé_", min_size=1, max_size=6).filter(
     lambda word: word not in ("y", "n", "no", "on", "off", "yes", "true", "false", "null", "gain")
@@ -113,25 +112,6 @@ def test_only_the_numbers_meant_change(case: _Case, data: st.DataObject) -> None
     assert file.with_values({}).text == file.text
 
 
-def _of_axes(gains: tuple[Gain, ...]) -> Calibration:
-    """The demo calibration with other gains, and its facts on each axis for as many."""
-    count, demo = len(gains), demo_calibration()
-
-    def first(error: RelativeError | None) -> RelativeError | None:
-        return None if error is None else replace(error, axes=error.axes[:count])
-
-    cut = replace(
-        demo,
-        gains=gains,
-        relative_error_percent=RelativeError(demo.relative_error_percent.axes[:count], 3.2),
-        holdout_error_percent=first(demo.holdout_error_percent),
-        nameplate_holdout_error_percent=first(demo.nameplate_holdout_error_percent),
-    )
-    return with_recordings(
-        cut, serials=tuple(range(1, count + 1)), saturated_percent=(0.0,) * count, missing=(0,) * count
-    )
-
-
 @settings(max_examples=500, deadline=None)
 @given(_cases(), st.data())
 def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, data: st.DataObject) -> None:
@@ -150,7 +130,7 @@ def test_of_500_files_on_the_disk_nothing_but_the_gains_changes(case: _Case, dat
     with tempfile.TemporaryDirectory() as folder:
         file, audit = Path(folder) / "robot.yaml", Path(folder) / "audit.jsonl"
         file.write_bytes(case.text(case.numbers).encode())
-        calibration = _of_axes(gains)
+        calibration = of_first_axes(replace(demo_calibration(), gains=gains), len(gains))
         keys = dict(zip(axes, case.keys, strict=True))
         # Its own file is not under test, and to spell it would take as long as all the rest.
         now = datetime(2025, 1, 2, tzinfo=UTC)
