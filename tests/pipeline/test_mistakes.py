@@ -10,11 +10,18 @@ from daq.cli.app import main
 from daq.errors import ExitCode
 
 
-@pytest.fixture
-def copied_log(tmp_path: Path, checkout: Path, shared_data: Path) -> Path:
-    log = tmp_path / "tx40.mcap"
+@pytest.fixture(scope="module")
+def tx40_log(tmp_path_factory: pytest.TempPathFactory, checkout: Path, shared_data: Path) -> bytes:
+    log = tmp_path_factory.mktemp("tx40") / "tx40.mcap"
     description = checkout / "configs" / "imports" / "tx40.yaml"
     assert main(["import", str(description), "--data", str(shared_data / "tx40"), "--out", str(log)]) == ExitCode.OK
+    return log.read_bytes()
+
+
+@pytest.fixture
+def copied_log(tmp_path: Path, tx40_log: bytes) -> Path:
+    log = tmp_path / "tx40.mcap"
+    log.write_bytes(tx40_log)
     return log
 
 

@@ -290,7 +290,7 @@ def test_the_command_line_writes_cases_and_tables(tmp_path: Path, capsys: pytest
     assert checked["payloads"][0]["masses"]["ml"]["error_percent"] < 1.0
     page = (out / "tables.md").read_text(encoding="utf-8")
     assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [f"Table {n}" for n in (5, 6, 7, 8)]
-    assert main(["validate", ml, *runs]) == 0
+    assert main(["validate", ml, *runs[1:]]) == 0
     text = capsys.readouterr().out
     assert "Table 7: payload mass of disc (a), 4.59 kg" in text
     assert "leaves its mass open" in text
