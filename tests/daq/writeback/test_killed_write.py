@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import re
 import shutil
 import stat
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import cache
@@ -102,6 +104,10 @@ class Place:
         return {name.rpartition(".")[2] for name in names}
 
 
+Prepare = Callable[[Path], Place]
+Work = Callable[[Place], Callable[[], object]]
+
+
 def _unflushed(_descriptor: int) -> None:
     """For what comes before the kill and after it: a kill is no power cut, and flushing takes most of the time."""
 
@@ -143,6 +149,13 @@ def _reported_content(verdict: AuditVerdict) -> Content:
     )
 
 
+@pytest.fixture(scope="module")
+def small() -> Iterator[Executor]:
+    """A process that has imported this module alone: to fork one that has run other tests takes far longer."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        yield pool
+
+
 @pytest.mark.parametrize(
     ("prepare", "work"),
     [
@@ -153,13 +166,26 @@ def _reported_content(verdict: AuditVerdict) -> Content:
     ],
 )
 def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_reports_which(
-    tmp_path: Path,
-    prepare: Callable[[Path], Place],
-    work: Callable[[Place], Callable[[], object]],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, prepare: Prepare, work: Work, capsys: pytest.CaptureFixture[str], small: Executor
 ) -> None:
-    model = prepare(tmp_path / "model")
+    calls, outcomes, left, states = small.submit(_kill_everywhere, tmp_path, prepare, work).result()
+    with capsys.disabled():
+        reported = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
+        print(f"\n  killed at each of {calls} system calls: {reported}; left behind: {', '.join(sorted(left))}")  # noqa: T201
+    assert calls >= MIN_CALLS
+    assert states >= MIN_STATES
+    assert set(outcomes) == {Content.BEFORE, Content.AFTER}
+    # Otherwise no writer was killed half-way.
+    assert {"lock", "tmp"} <= left
+
+
+def _kill_everywhere(folder: Path, prepare: Prepare, work: Work) -> tuple[int, Counter[Content], set[str], int]:
+    """Kill one writer at each of its system calls, and check what each leaves.
+
+    Returns:
+        number of calls, outcomes, endings of what was left, and how many different states the next writer met.
+    """
+    model = prepare(folder / "model")
     before = model.content()
     work(model)()
     after = model.content()
@@ -167,7 +193,7 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
     outcomes: Counter[Content] = Counter()
     left: set[str] = set()
     written_on: set[State] = set()
-    place, kept = prepare(tmp_path / "place"), tmp_path / "kept"
+    place, kept = prepare(folder / "place"), folder / "kept"
     shutil.copytree(place.folder, kept)
     number = 0
     gc.disable()  # of the child: when it collects is not part of the path
@@ -182,21 +208,14 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
             left |= place.kinds_left()
             if (state := place.state()) not in written_on:  # most calls change no file: the next writer finds the same
                 written_on.add(state)
-                with monkeypatch.context() as patch:
+                with pytest.MonkeyPatch.context() as patch:
                     patch.setattr(os, "fsync", _unflushed)
                     _check_next_write(place, before, after)
             if not killed:
                 break
     finally:
         gc.enable()
-    with capsys.disabled():
-        reported = ", ".join(f"{count} × {content.name.lower()}" for content, count in outcomes.items())
-        print(f"\n  killed at each of {number - 1} system calls: {reported}; left behind: {', '.join(sorted(left))}")  # noqa: T201
-    assert number > MIN_CALLS
-    assert len(written_on) >= MIN_STATES
-    assert set(outcomes) == {Content.BEFORE, Content.AFTER}
-    # Otherwise no writer was killed half-way.
-    assert {"lock", "tmp"} <= left
+    return number - 1, outcomes, left, len(written_on)
 
 
 @pytest.mark.parametrize(("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)])
