@@ -14,10 +14,13 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from queue import Empty, Queue, SimpleQueue
+from typing import cast
 
 import can
+from can.interfaces.virtual import VirtualBus
 
 from drivers.errors import BusError
 from drivers.stream.socketcan import BurstBus, open_socketcan
@@ -100,6 +103,8 @@ def open_bus(address: BusAddress, *, answering: bool = False) -> can.BusABC:
         if address.interface == "socketcan" and not answering:
             # python-can's own loses frames while this interpreter is busy, and cannot count them.
             return open_socketcan(address.channel)
+        if address.interface == "virtual":
+            return VirtualEnd(address.channel)
         try:
             # A user's python-can configuration file must not change the cell's configuration.
             return can.Bus(
@@ -121,6 +126,31 @@ def send_burst(bus: can.BusABC, messages: Sequence[can.Message]) -> None:
     else:
         for message in messages:
             bus.send(message)
+
+
+class VirtualEnd(BurstBus, VirtualBus):
+    """One end of python-can's bus of one process; its deep copies and its queue took half of a simulated cycle."""
+
+    def __init__(self, channel: str) -> None:
+        self._received = deque()
+        super().__init__(channel)
+        self.channel[self.channel.index(self.queue)] = self.queue = cast("Queue[can.Message]", SimpleQueue())
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self._check_if_open()
+        for queue in self.channel:
+            if queue is not self.queue:
+                frame = msg.__copy__()
+                frame.data, frame.timestamp = msg.data[:], time.time()
+                frame.channel, frame.is_rx = self.channel_id, True
+                queue.put(frame)
+
+    def _fill(self, timeout_s: float | None) -> None:
+        self._check_if_open()
+        with suppress(Empty):
+            self._received.append(self.queue.get(timeout=timeout_s))
+            while True:
+                self._received.append(self.queue.get_nowait())
 
 
 class SocketcandBus(BurstBus):

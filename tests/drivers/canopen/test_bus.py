@@ -33,6 +33,30 @@ class TestVirtual(BusContract):
         yield from three_ends(BusAddress("virtual", request.node.nodeid))
 
 
+def test_an_end_of_python_cans_own_is_on_the_same_bus() -> None:
+    frame = can.Message(arbitration_id=0x81, is_extended_id=False, data=b"\x01\xab")
+    with can.Bus(interface="virtual", channel="mixed") as theirs, open_bus(BusAddress("virtual", "mixed")) as ours:
+        ours.send(frame)
+        assert same(theirs.recv(WAIT_S), frame)
+        theirs.send(frame)
+        assert same(ours.recv(WAIT_S), frame)
+
+
+def test_a_frame_that_changes_after_it_was_sent_arrives_as_it_was_sent() -> None:
+    address = BusAddress("virtual", "changed")
+    with open_bus(address) as near, open_bus(address) as far:
+        frame = can.Message(arbitration_id=0x81, is_extended_id=False, data=b"\x01")
+        near.send(frame)
+        frame.data[0], frame.arbitration_id = 2, 0x82
+        heard = far.recv(WAIT_S)
+    assert heard is not None
+    assert (heard.arbitration_id, bytes(heard.data), heard.is_rx, heard.channel) == (0x81, b"\x01", True, "changed")
+    with pytest.raises(can.CanOperationError, match="closed"):
+        far.recv(0.0)
+    with pytest.raises(can.CanOperationError, match="closed"):
+        near.send(frame)
+
+
 class TestHub(BusContract):
     @pytest.fixture
     def ends(self) -> Iterator[Ends]:
