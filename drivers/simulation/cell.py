@@ -129,14 +129,15 @@ class SimulatedCell:
         self._substeps, self._period_us = spec.substeps, spec.sync_period_us
         self._bus, self._clock = bus, clock
         self._burst: list[can.Message] | None = None
+        self._disturbance = Disturbance(spec.faults)
         self.nodes = tuple(
-            Node(index, axis, self._amplifiers, partial(self._send_of, index)) for index, axis in enumerate(spec.axes)
+            Node(index, axis, self._amplifiers, partial(self._send_of, index) if spec.faults else self._send)
+            for index, axis in enumerate(spec.axes)
         )
         self._wires, there = _wires(bus, ids)
         self._on_wire = tuple(tuple(node for node in self.nodes if node.node_id in some) for some in there)
         self._gate = SyncGate(len(self._wires))
         _refuse_error_frames(spec.faults, bus)
-        self._disturbance = Disturbance(spec.faults)
         for index, node in enumerate(self.nodes):
             for kind in FaultKind:
                 if self._disturbance.active(kind, index):
@@ -192,8 +193,7 @@ class SimulatedCell:
                     self._advance(wires)
             wall_s, now_us = self._clock(), self.time_us
             for node in self.nodes:
-                node.watch(wall_s)
-                node.beat(now_us, wall_s)
+                node.keep_time(now_us, wall_s)
             if message is None and self._disturbance:
                 self._interfere()  # other masters do not wait for our SYNC
 
@@ -301,7 +301,7 @@ class SimulatedCell:
             self._interfere()
         loops = amplifiers.loops
         loops["limited"] = 0
-        if not np.array_equal(loops["enabled"], self._enabled):
+        if (loops["enabled"] != self._enabled).any():
             self._enabled = loops["enabled"].copy()
             plant.set_brakes(self._enabled == 0)
         current_a = loops["current_a"]
@@ -317,9 +317,6 @@ class SimulatedCell:
         self._send_together(synchronised, now_us)
 
     def _send_of(self, index: int, can_id: int, data: bytes) -> None:
-        if not self._disturbance:
-            self._send(can_id, data)
-            return
         for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):
             self._send(*frame)
 

@@ -65,7 +65,7 @@ class Mechanics(NamedTuple):
 
 @compiled
 def advance(
-    mechanics: Mechanics,
+    constants: tuple[Any, ...],
     mass: FloatArray,
     bias: FloatArray,
     viscous: FloatArray,
@@ -84,7 +84,7 @@ def advance(
     pins a coordinate, its speed becomes exactly zero here, so that a resting axis does not creep.
 
     Args:
-        mechanics: constants of the plant.
+        constants: of the plant, its Mechanics as a plain tuple, which numba recognises faster.
         mass, bias: M and c of the links, shapes (n, n) and (n,); the coordinates after the n-th have no link.
         viscous, torque: on each coordinate, shape (N,).
         motor_torque: along the rows of P, shape (n,).
@@ -94,6 +94,7 @@ def advance(
         load_torque: torque of the links on each joint, M a + c(q, q̇) [Nm], shape (n,), output.
         motor_rad: rotor angles at the end of the step, shape (n,), output.
     """
+    mechanics = Mechanics(*constants)
     directions, step_s = mechanics.directions, mechanics.step_s
     total = len(velocity)
     inertia, free_velocity = _assemble(mechanics, mass, bias, viscous, motor_torque, torque, velocity)

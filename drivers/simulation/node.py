@@ -123,14 +123,22 @@ class Node:
         if self._number(0x1016, 1) >> 16 & 0x7F == producer:
             self._heard_wall_s = wall_s
 
-    def watch(self, wall_s: float) -> None:
-        """React by 6007h when the monitored heartbeat is overdue by wall time: without SYNC, plant time is stopped."""
-        allowed_ms = self._number(0x1016, 1) & 0xFFFF
+    def keep_time(self, now_us: int, wall_s: float) -> None:
+        """React by 6007h when the monitored heartbeat is overdue, and send the own one when it is due."""
+        # Without SYNC plant time is stopped: the first is judged by wall time, the second by the faster of both.
+        allowed_ms = self._values[0x1016, 1] & 0xFFFF
         if not allowed_ms:
             self._heard_wall_s = None
         elif self._heard_wall_s is not None and (wall_s - self._heard_wall_s) * 1e3 >= allowed_ms:
             self._heard_wall_s = None
             self.fall_back()
+        self._now_us = now_us
+        period_ms = self._values[0x1017, 0]
+        if period_ms == 0 or self.nmt is NmtState.INITIALISING:
+            return
+        if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
+            self._beat_us, self._beat_wall_s = now_us, wall_s
+            self._send(0x700 + self.node_id, bytes([self.nmt]))
 
     def fall_back(self) -> None:
         """React to a heartbeat error: EMCY, the reaction of 6007h, and PRE-OPERATIONAL (the default of 1029h)."""
@@ -161,16 +169,6 @@ class Node:
             self._refused.add(GAIN)
         elif kind is FaultKind.REFUSES_SAVE:
             self._refused.add(STORE)
-
-    def beat(self, now_us: int, wall_s: float) -> None:
-        """Send a heartbeat when one is due by plant time or by wall time, whichever runs faster."""
-        self._now_us = now_us
-        period_ms = self._values[0x1017, 0]
-        if period_ms == 0 or self.nmt is NmtState.INITIALISING:
-            return
-        if now_us - self._beat_us >= 1000 * period_ms or (wall_s - self._beat_wall_s) * 1e3 >= period_ms:
-            self._beat_us, self._beat_wall_s = now_us, wall_s
-            self._send(0x700 + self.node_id, bytes([self.nmt]))
 
     def receive_pdo(self, can_id: int, data: bytes) -> None:
         """Accept a receive PDO of this node: at once if event-driven, else with the next SYNC."""

@@ -195,14 +195,9 @@ class SdoServer:
             self._upload = self._download = None
         if command == 4:
             return None
-        serve = {
-            0: self._continue_download,
-            1: self._start_download,
-            2: self._start_upload,
-            3: self._continue_upload,
-        }.get(command, self._refuse)
+        serve = (self._continue_download, self._start_download, self._start_upload, self._continue_upload)
         try:
-            return serve(request)
+            return (serve[command] if command < len(serve) else self._refuse)(request)
         except SdoAbort as abort:
             self._upload = self._download = None
             return _HEAD.pack(0x80, *self._entry) + struct.pack("<I", abort.code)

@@ -51,7 +51,8 @@ class Pdo:
     """One PDO; its parameters can be changed only in the order that CiA 301 allows, and decide when it is sent.
 
     Attributes:
-        parameters: last values written.
+        valid: the PDO exists.
+        can_id: CAN identifier.
         layout: struct of the mapped values.
         mapped: (index, subindex) of each mapped value.
         locked: the mapping cannot be written.
@@ -67,14 +68,14 @@ class Pdo:
         self.restore(parameters)
 
     @property
-    def valid(self) -> bool:
-        """Whether the PDO exists."""
-        return not self.parameters.cob_id & INVALID
+    def parameters(self) -> PdoParameters:
+        """Last values written."""
+        return self._parameters
 
-    @property
-    def can_id(self) -> int:
-        """CAN identifier."""
-        return self.parameters.cob_id & 0x7FF
+    @parameters.setter
+    def parameters(self, parameters: PdoParameters) -> None:
+        self._parameters = parameters
+        self.valid, self.can_id = not parameters.cob_id & INVALID, parameters.cob_id & 0x7FF
 
     def restore(self, parameters: PdoParameters) -> None:
         """Replace all parameters by defaults or saved ones."""
@@ -95,7 +96,7 @@ class Pdo:
 
     def on_sync(self, now_us: int) -> bytes | None:
         """Return the data to send on this SYNC, or None."""
-        kind = self.parameters.transmission
+        kind = self._parameters.transmission
         if kind >= EVENT_DRIVEN:
             return self.on_event(now_us)
         data = self._data()
@@ -112,7 +113,7 @@ class Pdo:
 
     def on_event(self, now_us: int) -> bytes | None:
         """Return the data of an event-driven PDO to send after a possible change, or None."""
-        parameters = self.parameters
+        parameters = self._parameters
         if parameters.transmission < EVENT_DRIVEN:
             return None
         data = self._data()
@@ -162,7 +163,7 @@ class Pdo:
         kind, name = self._fields[subindex]
         if name == "inhibit_100us" and self.valid:
             raise SdoAbort(UNSUPPORTED_ACCESS)  # the inhibit time shall not change while the PDO exists
-        value = _unsigned(data, kind)
+        value = Entry(kind).decode(data)
         if name == "cob_id":
             if value & (1 << 29) or not 0x180 < (value & 0x7FF) < 0x580 or value >> 11 & 0x3FFFF:
                 raise SdoAbort(INVALID_VALUE)  # base frames alone, and no identifier that CiA 301 restricts
@@ -181,7 +182,7 @@ class Pdo:
         if self.valid:
             raise SdoAbort(UNSUPPORTED_ACCESS)
         if subindex == 0:
-            count = _unsigned(data, Kind.U8)
+            count = Entry(Kind.U8).decode(data)
             if count > MAX_ENTRIES:
                 raise SdoAbort(INVALID_VALUE)
             used = self.parameters.entries[:count]
@@ -195,7 +196,7 @@ class Pdo:
             raise SdoAbort(NO_SUBINDEX)
         if self.parameters.count:
             raise SdoAbort(UNSUPPORTED_ACCESS)
-        entry = _unsigned(data, Kind.U32)
+        entry = Entry(Kind.U32).decode(data)
         if entry:
             self._check(entry)
         entries = list(self.parameters.entries)
@@ -225,7 +226,3 @@ def default_pdos(node_id: int, dictionary: Dictionary, source: Finder) -> tuple[
         tuple(default(Mappable.RECEIVE, 0x200 + node_id + k, m) for k, m in zip(offsets, receive, strict=True)),
         tuple(default(Mappable.TRANSMIT, first + k, m) for k, m in zip(offsets, transmit, strict=True)),
     )
-
-
-def _unsigned(data: bytes, kind: Kind) -> int:
-    return Entry(kind).decode(data)

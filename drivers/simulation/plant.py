@@ -121,6 +121,7 @@ class Plant:
             )
         effects = [build_effect(effect, n) for effect in spec.effects]
         self._mechanics, flexible = lay_out(spec, effects)
+        self._constants = tuple(self._mechanics)
         m, total = self._mechanics.directions.shape
         axes, added = spec.axes, [0.0] * len(flexible)
         self.time_s = 0.0
@@ -207,7 +208,7 @@ class Plant:
             for act in self._acting:
                 act(moment)
         residual = advance(
-            self._mechanics,
+            self._constants,
             np.ascontiguousarray(pin.crba(self._model, self._data, position)),
             pin.nonLinearEffects(self._model, self._data, position, self.velocity_rad_s[:n]),
             moment.viscous_nm_s_rad,

@@ -83,7 +83,7 @@ class SyncStream:
         self._behind = False
         self._reads_past_deadline = 0
         self._waited = self._cycle_over = False
-        self._base = self._losses = Losses()
+        self._base = self._counted = self._losses = Losses()
         self._watch = Watch(network, on_event)
         self._cycles = self._skipped = 0
         self._counts = self._answers.counts
@@ -140,7 +140,7 @@ class SyncStream:
                 self._early_sync = message  # if frames arrive as fast as they are read, the loop would not end
                 break
             self._between_cycles(message)
-        self._base = losses_of(bus)
+        self._base = self._counted = losses_of(bus)
         for remark in remarks_of(bus):
             self.emit(CellEvent(self.time_ns, None, EventKind.CAPTURE, 0, remark))
 
@@ -285,7 +285,7 @@ class SyncStream:
             message = self._next_frame(deadline_ns)
             if message is None:
                 break
-            slot = self._slot_of(message)
+            slot = self._answers.slots.get(message.arbitration_id) if _is_plain(message) else None
             if slot is None:
                 self._process_other(message)
             elif len(message.data) != slot.length:
@@ -337,16 +337,13 @@ class SyncStream:
 
     def _between_cycles(self, message: can.Message) -> None:
         """Process a frame that is read before the next SYNC, and so answers none that is open."""
-        slot = self._slot_of(message)
+        slot = self._answers.slots.get(message.arbitration_id) if _is_plain(message) else None
         if slot is None:
             self._process_other(message)
         elif self._cycles == 0:
             self._counts["foreign"] += 1
         else:
             self._answers.take_between(slot)
-
-    def _slot_of(self, message: can.Message) -> Slot | None:
-        return self._answers.slots.get(message.arbitration_id) if _is_plain(message) else None
 
     def _process_other(self, message: can.Message) -> None:
         if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
@@ -355,19 +352,20 @@ class SyncStream:
         self._counts["surplus" if ours and self._cycles else "foreign"] += 1
 
     def _finish_cycle(self) -> Sample:
-        names, values = [axis.name for axis in self.network.axes], self._answers.values
-        axes = len(names)
+        values, axes = self._answers.values, len(self.network.axes)
         # A skipped period has a number too, so that a gap is visible in the samples.
         cycle = self._cycles - 1 + self._skipped
         missing = self._answers.end()
         self._incomplete_cycles = self._incomplete_cycles + 1 if missing else 0
-        silent = tuple(axis for axis in range(axes) if missing >> axis & 1)
-        for axis in silent:
-            text = f"no complete answer from {names[axis]} to cycle {cycle}"
-            self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
-        if self._incomplete_cycles > self.max_missing_cycles:
-            silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == axes else None
-            self._watch.faults.append(SampleLost(cycle, silent, [names[axis] for axis in silent], silent_s))
+        if missing:
+            silent = tuple(axis for axis in range(axes) if missing >> axis & 1)
+            names = [self.network.axes[axis].name for axis in silent]
+            for axis, name in zip(silent, names, strict=True):
+                text = f"no complete answer from {name} to cycle {cycle}"
+                self.emit(CellEvent(self.time_ns, axis, EventKind.SAMPLE_LOST, cycle, text))
+            if self._incomplete_cycles > self.max_missing_cycles:
+                silent_s = (self.pacing.clock() - self._answered_ns) * 1e-9 if len(silent) == axes else None
+                self._watch.faults.append(SampleLost(cycle, silent, names, silent_s))
         self._note_losses()
         statuswords = tuple(values[2 * axes :])
         self._watch.cycle(self.time_ns, self.pacing.clock(), statuswords, missing)
@@ -375,10 +373,10 @@ class SyncStream:
 
     def _note_losses(self) -> None:
         """Report frames that this machine lost; their content is unknown."""
-        losses = losses_of(self._link.bus).since(self._base)
-        if losses == self._losses:
+        counted = losses_of(self._link.bus)
+        if counted == self._counted:
             return
-        new, self._losses = losses.since(self._losses), losses
+        new, self._counted, self._losses = counted.since(self._counted), counted, counted.since(self._base)
         for count, where in (
             (new.kernel, "in the kernel's receive buffer, which was full"),
             (new.interface, "by the interface, before the receive buffer"),
