@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from queue import Queue
 from typing import Protocol, TypeVar
 
 import can
@@ -145,7 +144,7 @@ class SynchronousSdoClient(SdoClient):
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError, SdoCommunicationError."""
         self._bus.pump(0.0)
-        self.responses = Queue()
+        self.responses.queue.clear()
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])
         names_object = sdo_request[0] >> 5 in (_INITIATE_DOWNLOAD, _INITIATE_UPLOAD)
