@@ -15,9 +15,9 @@ ROBOTS = ("seven-axis", "gantry")
 
 @pytest.fixture(scope="module", params=ROBOTS)
 def job(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Job:
-    """One run of 20 s without load and one with; longer ones are in tests/studies/any_robot.py."""
+    """One run of 12 s without load and one with; longer ones are in tests/studies/any_robot.py."""
     name: str = request.param
-    return run_job(name, tmp_path_factory.mktemp(name), seconds=20.0, pairs=1, seed=1)
+    return run_job(name, tmp_path_factory.mktemp(name), seconds=12.0, pairs=1, seed=1)
 
 
 def test_every_gain_is_found_within_what_it_claims(job: Job) -> None:

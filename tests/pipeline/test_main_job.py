@@ -23,14 +23,14 @@ from ident.estimators.identify import identify
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One demonstration with short runs; the full length is `make demo`."""
     out = tmp_path_factory.mktemp("demo") / "out"
-    assert main(["demo", "--out", str(out), "--duration", "15", "--seed", "2"]) == ExitCode.OK
+    assert main(["demo", "--out", str(out), "--duration", "10", "--seed", "2"]) == ExitCode.OK
     return out
 
 
 def test_the_summary_reports_the_whole_story(demonstration: Path) -> None:
     summary = json.loads((demonstration / "summary.json").read_text())
     assert [gain["axis"] for gain in summary["gains"]] == [f"J{number}" for number in range(1, 7)]
-    # Runs of 15 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by the root of that ratio.
+    # Runs of 10 s instead of 40 s: the bound of the full demonstration, 1.5 %, widened by less than the root of that.
     for gain in summary["gains"]:
         assert abs(gain["error_percent"]) < 2.5
         assert gain["error_percent"] == pytest.approx(100 * (gain["identified"] / gain["truth"] - 1))
