@@ -123,12 +123,9 @@ class _Execution:
 
     def __init__(self, network: CanopenNetwork, stream: SyncStream, bounds: MotionBounds, first: Sample) -> None:
         self.problems: list[DriverError] = []  #: Failures to confirm the last stop
-        self._network = network
-        self._stream = stream
-        self._bounds = bounds
-        self._sample = first
-        self._nodes = network.axes
-        self._axes = range(len(network.axes))
+        self._network, self._stream = network, stream
+        self._bounds, self._sample = bounds, first
+        self._nodes, self._axes = network.axes, range(len(network.axes))
         self._targets = list(first.position_counts)
         self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
 

@@ -65,10 +65,7 @@ class Node:
         self.node_id = axis.node_id
         self.nmt = NmtState.INITIALISING
         self.drive = Drive(index, amplifiers, self._number)
-        self._index = index
-        self._axis = axis
-        self._amplifiers = amplifiers
-        self._send = send
+        self._index, self._axis, self._amplifiers, self._send = index, axis, amplifiers, send
         self._dictionary = amplifier_dictionary(axis)
         self._signals = {current.key: current.source(amplifiers, index) for current in vendor(axis).currents}
         self._values = {key: entry.default for key, entry in self._dictionary.items()}
@@ -283,16 +280,13 @@ class Node:
             0x1001: lambda: int(drive.error is not ErrorCode.NONE),
             0x603F: lambda: int(drive.error),
             0x6040: lambda: drive.controlword,
-            0x2240: lambda: amplifiers.readings.position[i],
             0x6041: lambda: drive.statusword() | self._toggle,
             0x6061: lambda: self._number(0x6060),
             0x6062: lambda: amplifiers.readings.demand[i],
-            0x6063: lambda: amplifiers.readings.position[i],
-            0x6064: lambda: amplifiers.readings.position[i],
+            **dict.fromkeys((0x2240, 0x6063, 0x6064), lambda: amplifiers.readings.position[i]),
             0x606C: lambda: amplifiers.readings.velocity[i],
             0x6074: lambda: amplifiers.readings.current_demand[i],
-            0x6077: lambda: amplifiers.readings.current[i],
-            0x6078: lambda: amplifiers.readings.current[i],
+            **dict.fromkeys((0x6077, 0x6078), lambda: amplifiers.readings.current[i]),
             0x60F4: lambda: amplifiers.readings.demand[i] - amplifiers.readings.position[i],
         }
         index, subindex = key

@@ -176,8 +176,7 @@ class SdoServer:
     """SDO server of one node: expedited and segmented transfers (CiA 301 §7.2.4.3)."""
 
     def __init__(self, read: Callable[[int, int], bytes], write: Callable[[int, int, bytes], None]) -> None:
-        self._read = read
-        self._write = write
+        self._read, self._write = read, write
         self._entry = (0, 0)
         self._upload: bytes | None = None
         self._download: bytearray | None = None

@@ -138,8 +138,7 @@ class Plant:
         self._torque = np.array([-a.offset_nm for a in axes] + added)
         self._free_bound = np.zeros(m)
         self._free_bound[:n] = [a.coulomb_nm for a in axes]
-        for row, axis in zip(self._mechanics.own_row, axes, strict=True):
-            self._free_bound[row] += axis.motor_coulomb_nm
+        np.add.at(self._free_bound, self._mechanics.own_row, [a.motor_coulomb_nm for a in axes])
         self._brake_nm = np.array([BRAKE_FACTOR * abs(a.gain_nm_per_a) * a.peak_current_a for a in axes])
         self._bound = self._free_bound.copy()
         self._moment = Moment(
@@ -161,9 +160,7 @@ class Plant:
     def set_brakes(self, closed: NDArray[np.bool_]) -> None:
         """Close or open the brake of each motor, shape (n,)."""
         self._bound[:] = self._free_bound
-        for row, brake_nm, shut in zip(self._mechanics.own_row, self._brake_nm, closed, strict=True):
-            if shut:
-                self._bound[row] += brake_nm
+        np.add.at(self._bound, self._mechanics.own_row, np.where(closed, self._brake_nm, 0.0))
 
     def mount(self, spec: CellSpec) -> None:
         """Replace the payload by that of another description of the same cell; the state is kept."""

@@ -75,17 +75,14 @@ class SyncStream:
         self._link = network.link
         self._answers = Answers(network.axes)
         self._sync = can.Message(arbitration_id=SYNC_COB_ID, is_extended_id=False)
-        self._incomplete_cycles = 0
         self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
         self._answered_ns = self._next_sync_ns = self._first_sync_ns = self._last_sync_ns = 0
         self._early_sync: can.Message | None = None
         self._rate = SyncRate(pacing.period_ns)
-        self._behind = False
-        self._reads_past_deadline = 0
-        self._waited = self._cycle_over = False
+        self._behind = self._waited = self._cycle_over = False
         self._base = self._counted = self._losses = Losses()
         self._watch = Watch(network, on_event)
-        self._cycles = self._skipped = 0
+        self._cycles = self._skipped = self._reads_past_deadline = self._incomplete_cycles = 0
         self._counts = self._answers.counts
 
     @property
