@@ -86,7 +86,9 @@ def test_errors_are_those_of_the_residual_of_each_motor(start: Evidence, compare
 
 def test_an_uncoupled_axis_has_the_error_of_table_6(start: Evidence, compared: Account) -> None:
     """Motors 1 to 4 drive their joints alone: ‖e‖/‖v‖ is ‖ρ‖/‖Y‖ there."""
-    assert compared.total.before.in_sample.axes[:4] == pytest.approx(start.training_error.axes[:4], rel=1e-6)
+    assert compared.total.before.in_sample.axes[:4] == pytest.approx(
+        start.identification.training_error.axes[:4], rel=1e-6
+    )
 
 
 def test_parts_of_the_data_add_up(start: Evidence) -> None:
