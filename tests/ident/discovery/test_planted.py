@@ -186,9 +186,8 @@ class Arm:
 
 
 @pytest.fixture(scope="module")
-def arm(truth: Truth, noisy_runs: tuple[Run, ...]) -> Arm:
-    clean = gathered(truth, noisy_runs)
-    return Arm(truth, clean, {}, {data.name: _true(truth, data) for data in clean.datasets})
+def arm(truth: Truth, noisy: Evidence) -> Arm:
+    return Arm(truth, noisy, {}, {data.name: _true(truth, data) for data in noisy.datasets})
 
 
 @pytest.fixture(scope="module")
