@@ -259,6 +259,10 @@ def _drawn_wald(trial: Trial, signs: FloatArray) -> FloatArray:
     x, gram = trial.scatter, trial.gram
     p = x.shape[1]
     sums = signs @ x
+    if p == 1:  # the same with numbers for matrices: most candidates, in a tenth of the time
+        fitted = sums / gram.sum()
+        left = x.T @ x - 2.0 * fitted * (signs @ (x * gram[:, 0])) + fitted**2 * np.sum(gram**2)
+        return np.asarray(sums**2 / left)[:, 0]
     fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
     crossed = (signs @ np.einsum("ma,mbc->mabc", x, gram).reshape(len(x), -1)).reshape(-1, p * p, p)
     mixed = np.matmul(crossed, fitted[:, :, None]).reshape(-1, p, p)
@@ -343,12 +347,8 @@ def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArr
     recording noise raises it.
     """
     problem = search_problem.folds.problem
-    noise_a = np.array(
-        [
-            problem.noise[i] * float(np.sqrt(np.mean(problem.residual[problem.motor == i] ** 2)))
-            for i in range(search_problem.axes)
-        ]
-    )
+    square = np.bincount(problem.motor, problem.residual**2) / np.bincount(problem.motor)
+    noise_a = problem.noise * np.sqrt(square)
     return np.asarray(noise_a / np.abs(problem.gamma) * np.sqrt(gates.smallest_share))
 
 

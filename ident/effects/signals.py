@@ -148,12 +148,12 @@ def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> Flo
     samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
     position = data.position_rad[postures]
-    still, mass = np.zeros_like(position), np.empty((count, count, samples))
-    weight, *_ = model.torques(Motion(position, still, still), standard)
-    for joint, unit in enumerate(np.eye(count)):
-        column = model.torques(Motion(position, still, still + unit), standard)[0] - weight
-        for row in range(joint, count):
-            mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, column[row])
+    units = np.repeat(np.eye(count + 1, count, -1), len(postures), axis=0)  # none, then of each joint
+    moved = Motion(np.tile(position, (count + 1, 1)), np.zeros_like(units), units)
+    torque, mass = model.torques(moved, standard)[0].reshape(count, count + 1, -1), np.empty((count, count, samples))
+    for row, joint in zip(*np.tril_indices(count), strict=True):
+        coarse = torque[row, joint + 1] - torque[row, 0]
+        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse)
     return mass
 
 
