@@ -321,16 +321,16 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
         identify(truth.model, short, never_still)
 
 
-def test_sigma_is_true_for_correlated_noise(arm: Arm) -> None:
+def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
     rng = np.random.default_rng(5)
-    clean = arm.clean
+    clean = small_arm.clean
     bare, estimate = clean.bare, clean.estimate
-    exact = arm.truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
+    exact = small_arm.truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
     gains, claimed = [], []
     for _ in range(24):
         noise = np.empty_like(exact)
-        noise[:, 0] = rng.normal(size=6)
+        noise[:, 0] = rng.normal(size=len(exact))
         drawn = rng.normal(size=exact.shape)
         for row in range(1, exact.shape[1]):
             noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
