@@ -139,15 +139,8 @@ class Model:
         Raises:
             ModelError: the motion is not one of n joints.
         """
-        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-        position, velocity, acceleration = (np.ascontiguousarray(np.transpose(state)) for state in states)
-        count, samples = self.robot.joint_count, position.shape[-1]
-        if not position.shape == velocity.shape == acceleration.shape == (count, samples):
-            found = ", ".join(str(np.shape(state)) for state in states)
-            raise ModelError(
-                f"position, velocity and acceleration have the shapes {found}; expected (n_samples, {count}) each: a "
-                "row a sample, a column a joint"
-            )
+        position, velocity, acceleration = self._joint_first(motion)
+        count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
@@ -173,8 +166,7 @@ class Model:
             motion: of n joints over k samples.
             standard: χ_st, shape (c,).
         """
-        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-        position, velocity, acceleration = (np.ascontiguousarray(np.transpose(state)) for state in states)
+        position, velocity, acceleration = self._joint_first(motion)
         own, motors = np.split(standard, [14 * self.robot.joint_count])
         own, motors = own.reshape(-1, 14), motors.reshape(-1, 3, 1)
         load = rigid_torque(self.robot, position, velocity, acceleration, own[:, :10])
@@ -185,3 +177,13 @@ class Model:
             cross = np.outer(r, r) - np.diag(r**2)
             whole += cross @ (inertia * acceleration + viscous * velocity) + r[:, None] * dry * np.sign(r @ velocity)
         return load, geared, whole
+
+    def _joint_first(self, motion: Motion) -> list[FloatArray]:
+        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        count, shapes = self.robot.joint_count, [np.shape(state) for state in states]
+        if shapes != [(np.shape(states[0])[0], count)] * 3:
+            raise ModelError(
+                f"position, velocity and acceleration have the shapes {', '.join(map(str, shapes))}; expected "
+                f"(n_samples, {count}) each: a row a sample, a column a joint"
+            )
+        return [np.ascontiguousarray(np.transpose(state)) for state in states]

@@ -62,10 +62,7 @@ def fill_rigid(
 def rigid_torque(
     robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, parameters: FloatArray
 ) -> FloatArray:
-    """Torque of the rigid links [Nm or N], shape (n, k): the columns of `fill_rigid` times ``parameters``, (n, 10).
-
-    A wrench is carried back from link to link by Xᵀ: no column is made, in a fraction of the time.
-    """
+    """Torque of the rigid links [Nm or N], shape (n, k): the columns of `fill_rigid` times ``parameters``, (n, 10)."""
     links, out = _links(robot), np.empty_like(position)
     inertias = [_inertia(own) for own in parameters]
     for first in range(0, position.shape[1], BLOCK_SAMPLES):
