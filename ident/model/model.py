@@ -181,7 +181,7 @@ class Model:
     def _joint_first(self, motion: Motion) -> list[FloatArray]:
         states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
         count, shapes = self.robot.joint_count, [np.shape(state) for state in states]
-        if shapes != [(np.shape(states[0])[0], count)] * 3:
+        if shapes != [(*shapes[0][:1], count)] * 3:
             raise ModelError(
                 f"position, velocity and acceleration have the shapes {', '.join(map(str, shapes))}; expected "
                 f"(n_samples, {count}) each: a row a sample, a column a joint"
