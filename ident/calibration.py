@@ -160,8 +160,8 @@ def calibration_of(
 
     last = steps[-1].after if steps else None
     start, found = found, found if last is None else last.identification
-    if last is None and len(found.columns) > len(found.system.base.names):
-        effect = f"the identification holds {found.columns[-1].name!r}, a parameter of an effect"
+    if last is None and len(found.system.columns) > len(found.system.base.names):
+        effect = f"the identification holds {found.system.columns[-1].name!r}, a parameter of an effect"
         raise ModelError(f"{effect}; give the one without effects, and steps=find_effects(...)")
     estimate = found.estimate
     units = units or ("Nm/A",) * len(axes)

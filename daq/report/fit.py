@@ -42,7 +42,7 @@ def fit_view(found: CaseFit, calibration: Calibration, comparison: Comparison | 
     yield error_table("Relative error ‖ρ‖/‖Y‖ [%]", axes, errors)
     filter_ = fitted.identification.conditioning
     yield (
-        f"{estimate.rows} rows, {len(fitted.final.columns)} base parameters and effects, condition "
+        f"{estimate.rows} rows, {len(fitted.final.system.columns)} base parameters and effects, condition "
         f"{estimate.condition:.0f}; position filter {filter_.position_cutoff_hz:g} Hz, decimation "
         f"{filter_.decimation_cutoff_hz:g} Hz. Compare relative errors only under the same filters."
     )

@@ -203,22 +203,26 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
         one trial a candidate; None where the declared model contains it already.
     """
     made = _products(folds, columns)
-    f = len(folds.motor_score[0])
+    motor_jacobian, fold_jacobian = made.part_jacobian.sum(axis=0), made.part_jacobian.sum(axis=1)
+    motor_gram, gram_sum = made.part_gram.sum(axis=0), made.move_gram.sum(axis=0)
+    whole_jacobian = motor_jacobian.sum(axis=0)
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each move and of each motor.
-    along = linalg.cho_solve(folds.whole, made.move_jacobian.sum(axis=0))
+    along = linalg.cho_solve(folds.whole, whole_jacobian)
+    move_pushed, motor_pushed = folds.move_hessian @ along, folds.part_hessian.sum(axis=0) @ along
     move_score = made.move_score - folds.move_score @ along
     motor_score = made.part_score.sum(axis=0) - folds.motor_score @ along
-    moved = [
-        linalg.cho_solve(factor, made.part_jacobian.sum(axis=(0, 1)) - made.part_jacobian[k].sum(axis=0))
-        for k, factor in enumerate(folds.factors)
-    ]
-    before = folds.square_sum(folds.residual)
-    squares = np.einsum("mqq->q", made.move_gram)
+    # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
+    coupling = whole_jacobian - fold_jacobian
+    steps = np.stack([linalg.cho_solve(*pair) for pair in zip(folds.factors, coupling, strict=True)])
+    pushed = folds.part_hessian @ steps[:, None]
+    drive = made.part_score.sum(axis=(0, 1)) - made.part_score.sum(axis=1) - (folds.scores[:, None] @ steps)[:, 0]
+    shown = made.part_held - folds.part_score @ steps
+    before, squares = folds.square_sum(folds.residual), np.diag(gram_sum)
     trials: list[Trial | None] = []
     for chosen in candidates:
-        w = along[:, chosen].reshape(f, -1)
+        w, step = along[:, chosen], steps[:, :, chosen]
         move_gram = _projected_gram(
-            made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w, folds.move_hessian
+            made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w[None], move_pushed[:, :, chosen]
         )
         gram = move_gram.sum(axis=0)
         root = np.sqrt(np.maximum(np.diag(gram), 0.0))
@@ -228,22 +232,25 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
             continue
         score = move_score[:, chosen].sum(axis=0)
         coefficients = np.linalg.solve(gram, score)
-        motor_gram = _projected_gram(
-            made.part_gram[:, :, chosen, chosen].sum(axis=0),
-            made.part_jacobian[:, :, :, chosen].sum(axis=0),
-            w,
-            folds.part_hessian.sum(axis=0),
-        )
-        fallen = 2.0 * motor_score[:, chosen] @ coefficients - np.einsum(
-            "p,npq,q->n", coefficients, motor_gram, coefficients
-        )
-        training_fall, held_out = _left_out(folds, made, chosen, [step[:, chosen] for step in moved], before)
+        own = motor_gram[:, chosen, chosen], motor_jacobian[:, :, chosen], w[None], motor_pushed[:, :, chosen]
+        explained = np.einsum("p,npq,q->n", coefficients, _projected_gram(*own), coefficients)
+        # Without fold k; what the other folds do not show at all is left as it is: in its own unit, the shortest of
+        # all solutions.
+        unit = np.sqrt(squares[chosen])
+        part_gram = made.part_gram[:, :, chosen, chosen]
+        rest = motor_gram[:, chosen, chosen].sum(axis=0) - part_gram.sum(axis=1)
+        schur = rest - np.swapaxes(coupling[:, :, chosen], 1, 2) @ step
+        inverse = np.linalg.pinv(schur / np.outer(unit, unit), rcond=UNSEEN)
+        fitted = (inverse @ (drive[:, chosen] / unit)[:, :, None])[:, :, 0] / unit
+        # r − (Φ − J w_k) fitted, squared motor by motor.
+        inside = _projected_gram(part_gram, made.part_jacobian[:, :, :, chosen], step[:, None], pushed[:, :, :, chosen])
+        rose = np.einsum("kp,knpq,kq->kn", fitted, inside, fitted)
         trials.append(
             Trial(
                 coefficients=coefficients,
-                fallen=fallen,
-                training_fall=training_fall,
-                held_out=held_out,
+                fallen=2.0 * motor_score[:, chosen] @ coefficients - explained,
+                training_fall=np.sum(drive[:, chosen] * fitted, axis=1),
+                held_out=before - 2.0 * np.einsum("knp,kp->kn", shown[:, :, chosen], fitted) + rose,
                 score=score,
                 scatter=move_score[:, chosen] - move_gram @ coefficients,
                 gram=move_gram,
@@ -252,34 +259,10 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     return tuple(trials)
 
 
-def _left_out(
-    folds: Folds, made: _Products, chosen: slice, moved: Sequence[FloatArray], before: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Fall of ‖e‖² on the other folds, and ‖e‖² on each fold with coefficients from the others."""
-    training_fall, held_out = np.empty(folds.count), np.empty_like(before)
-    gram, score = made.part_gram[:, :, chosen, chosen], made.part_score[:, :, chosen]
-    jacobian = made.part_jacobian[:, :, :, chosen]
-    whole_gram, whole_score, whole = gram.sum(axis=(0, 1)), score.sum(axis=(0, 1)), jacobian.sum(axis=(0, 1))
-    for k in range(folds.count):
-        step = moved[k]
-        coupling = whole - jacobian[k].sum(axis=0)
-        schur = whole_gram - gram[k].sum(axis=0) - coupling.T @ step
-        drive = whole_score - score[k].sum(axis=0) - step.T @ folds.scores[k]
-        # What the other folds do not show at all is left as it is: in its own unit, the shortest of all solutions.
-        unit = np.sqrt(np.diag(whole_gram))
-        fitted = np.linalg.lstsq(schur / np.outer(unit, unit), drive / unit, rcond=UNSEEN)[0] / unit
-        training_fall[k] = float(drive @ fitted)
-        # r − (Φ − J step) fitted, squared motor by motor.
-        inside = _projected_gram(gram[k], jacobian[k], step, folds.part_hessian[k])
-        shown = made.part_held[k][:, chosen] - folds.part_score[k] @ step
-        held_out[k] = before[k] - 2.0 * shown @ fitted + np.einsum("p,npq,q->n", fitted, inside, fitted)
-    return training_fall, held_out
-
-
-def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, hessian: FloatArray) -> FloatArray:
-    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (parts, p, p)."""
-    crossed = np.swapaxes(jacobian, 1, 2) @ along
-    return np.asarray(gram - crossed - np.swapaxes(crossed, 1, 2) + along.T @ (hessian @ along))
+def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed: FloatArray) -> FloatArray:
+    """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p), with ``pushed`` = JᵀJ w."""
+    crossed = np.swapaxes(jacobian, -1, -2) @ along
+    return np.asarray(gram - crossed - np.swapaxes(crossed, -1, -2) + np.swapaxes(along, -1, -2) @ pushed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,15 +282,8 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
     problem, n = folds.problem, len(folds.problem.gamma)
     f, q = problem.jacobian.shape[1], columns.shape[1]
     moves, count = problem.moves, folds.count
-    made = _Products(
-        np.zeros((moves, f, q)),
-        np.zeros((moves, q, q)),
-        np.zeros((moves, q)),
-        np.zeros((count, n, f, q)),
-        np.zeros((count, n, q, q)),
-        np.zeros((count, n, q)),
-        np.zeros((count, n, q)),
-    )
+    shapes = [(*parts, *shape) for parts in ((moves,), (count, n)) for shape in ((f, q), (q, q), (q,))]
+    made = _Products(*map(np.zeros, (*shapes, shapes[-1])))
     felt = [bool(np.any(columns[problem.motor == motor])) for motor in range(n)]
     for rows, k, m, i in folds.blocks:
         if not felt[i]:

@@ -80,11 +80,6 @@ class Evidence:
         return Identification(self.model, self.conditioning, self.training.system(), holdout, self.estimate)
 
     @property
-    def training_error(self) -> RelativeError:
-        """Error on the rows of the fit [%]."""
-        return self.estimate.relative_error(self.training.system())
-
-    @property
     def holdout_error(self) -> RelativeError | None:
         """Error on held-out rows [%]."""
         return None if self.holdout is None else self.estimate.relative_error(self.holdout.system())

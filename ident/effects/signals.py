@@ -17,7 +17,6 @@ from ident.model.model import Model
 from ident.model.robot import Motion
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
-CHUNK_SAMPLES = 4096
 POSTURE_SAMPLES = 20  #: Samples between two postures in which the mass matrix is computed
 
 
@@ -118,18 +117,9 @@ def declared_signals(
         gains: g of each motor [Nm at the joint per A], shape (n,).
         session_began_s: start of the first run by the clock of `Dataset.started_s`; None if unknown.
     """
-    names = tuple(column.name for column in model.columns)
     # A base parameter is named after its leading standard one; Ia of J1, regrouped into Izz1, thus counts as load.
-    inertial = np.array([not name.startswith(("Ia", "fv", "fs", "off")) for name in names])
-    friction = np.array([name.startswith(("fv", "fs")) and not name.startswith(("fvm", "fsm")) for name in names])
-    load, total, geared = [], [], []
-    for first in range(0, len(data.time_s), CHUNK_SAMPLES):
-        columns = model.regressor(data.motion(slice(first, first + CHUNK_SAMPLES)))
-        torques = np.matmul(np.stack((inertial, np.ones_like(inertial), inertial | friction)) * standard, columns)
-        load.append(torques[:, 0])
-        total.append(torques[:, 1])
-        geared.append(torques[:, 2])
-    motor = model.drive_train.to_motor @ np.concatenate(total, axis=1)
+    load, geared, total = model.torques(data.motion(), standard)
+    motor = model.drive_train.to_motor @ total
     began = None if data.started_s is None or session_began_s is None else data.started_s - session_began_s
     return Signals(
         rate_hz=data.rate_hz,
@@ -139,9 +129,9 @@ def declared_signals(
         velocity_rad_s=data.velocity_rad_s.T,
         acceleration_rad_s2=data.acceleration_rad_s2.T,
         motor_position_rad=model.drive_train.ratio @ data.position_rad.T,
-        inertia_kg_m2=_inertia_of_joints(model, data, standard * inertial),
-        load_torque_nm=np.concatenate(load, axis=1),
-        geared_torque_nm=np.concatenate(geared, axis=1),
+        inertia_kg_m2=_inertia_of_joints(model, data, standard),
+        load_torque_nm=load,
+        geared_torque_nm=geared,
         motor_torque_nm=motor,
         current_a=motor / gains[:, None],
     )
@@ -153,19 +143,17 @@ def session_began_s(datasets: Sequence[Dataset]) -> float | None:
     return min(starts_s) if starts_s and len(starts_s) == len(datasets) else None
 
 
-def _inertia_of_joints(model: Model, data: Dataset, load: FloatArray) -> FloatArray:
+def _inertia_of_joints(model: Model, data: Dataset, standard: FloatArray) -> FloatArray:
     """Mass matrix of links and payload, shape (n, n, k), interpolated between postures because it changes slowly."""
     samples, count = data.position_rad.shape
     postures = np.linspace(0, samples - 1, max(2, samples // POSTURE_SAMPLES)).round().astype(np.int64)
     position = data.position_rad[postures]
-    still = np.zeros_like(position)
-    weight = load @ model.regressor(Motion(position, still, still))
-    mass = np.empty((count, count, samples))
-    for joint, unit in enumerate(np.eye(count)):
-        moved = Motion(position, still, np.repeat(unit[None], len(postures), axis=0))
-        column = load @ model.regressor(moved) - weight
-        for row, along in enumerate(column):
-            mass[row, joint] = np.interp(np.arange(samples), postures, along)
+    units = np.repeat(np.eye(count + 1, count, -1), len(postures), axis=0)  # none, then of each joint
+    moved = Motion(np.tile(position, (count + 1, 1)), np.zeros_like(units), units)
+    torque, mass = model.torques(moved, standard)[0].reshape(count, count + 1, -1), np.empty((count, count, samples))
+    for row, joint in zip(*np.tril_indices(count), strict=True):
+        coarse = torque[row, joint + 1] - torque[row, 0]
+        mass[row, joint] = mass[joint, row] = np.interp(np.arange(samples), postures, coarse)
     return mass
 
 

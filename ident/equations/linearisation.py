@@ -197,9 +197,9 @@ class Folds:
 
     def square_sum(self, residual: FloatArray) -> FloatArray:
         """‖e‖² of each fold and motor, shape (folds, n)."""
+        rows, fold, _, motor = zip(*self.blocks, strict=True)
         total = np.zeros((self.count, len(self.problem.gamma)))
-        for rows, fold, _, motor in self.blocks:
-            total[fold, motor] += float(residual[rows] @ residual[rows])
+        np.add.at(total, (fold, motor), np.add.reduceat(residual**2, [part.start for part in rows]))
         return total
 
 

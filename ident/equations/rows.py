@@ -117,6 +117,10 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         )
 
 
+OF_ROWS = ("current", "robot", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
+"""Fields of an observation that have a row last."""
+
+
 @dataclass(frozen=True, slots=True)
 class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
@@ -162,18 +166,7 @@ class Observation(Equations):
 
     def only(self, rows: BoolArray | IntArray) -> Observation:
         """Keep some of the rows, in the order of their indices."""
-        return replace(
-            self,
-            current=self.current[:, rows],
-            robot=self.robot[:, :, rows],
-            flange=self.flange[:, :, rows],
-            use=self.use[:, rows],
-            motor_use=self.motor_use[:, rows],
-            time_s=self.time_s[rows],
-            run=self.run[rows],
-            move=self.move[rows],
-            mounting=self.mounting[rows],
-        )
+        return replace(self, **{name: getattr(self, name)[..., rows] for name in OF_ROWS})
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
         """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
@@ -225,7 +218,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
     mountings = [payload.mounting for payload in like.payloads]
     parts: list[tuple[Rows, FloatArray, FloatArray]] = []
     run, move, mounting = [], [], []
-    first_move = 0
+    first_move, shared = 0, ("current", "use", "motor_use", "time_s")
     for index, data in enumerate(datasets):
         last, mounted = first_move, -1 if data.payload is None else mountings.index(data.payload.mounting)
         for rows in rows_of(model, data, conditioning):
@@ -239,12 +232,8 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         drive_train=model.drive_train,
         columns=like.columns[: len(base)],
         base=like.base,
-        current=np.concatenate([rows.current for rows, _, _ in parts], axis=1),
         robot=np.concatenate([robot for _, robot, _ in parts], axis=2),
         flange=np.concatenate([flange for _, _, flange in parts], axis=2),
-        use=np.concatenate([rows.use for rows, _, _ in parts], axis=1),
-        motor_use=np.concatenate([rows.motor_use for rows, _, _ in parts], axis=1),
-        time_s=np.concatenate([rows.time_s for rows, _, _ in parts]),
         run=np.concatenate(run),
         move=np.concatenate(move),
         mounting=np.concatenate(mounting),
@@ -252,4 +241,5 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         payload_columns=like.payload_columns,
         runs=tuple(data.name for data in datasets),
         conditioning=conditioning,
+        **{name: np.concatenate([getattr(rows, name) for rows, _, _ in parts], axis=-1) for name in shared},
     )

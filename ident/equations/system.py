@@ -70,8 +70,8 @@ def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
     return np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64) if len(rows) > columns else rows
 
 
-def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least squares with unit-norm columns inside: solution, (MᵀM)⁻¹ and singular values of M as given.
+def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
 
     Scaling columns changes no least-squares solution, but spares digits where kilograms are beside kg m².
     """
@@ -80,7 +80,7 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
     u, s, vt = np.linalg.svd(matrix / norms, full_matrices=False)
     keep = s > s[0] * 1e-13
     half = vt[keep].T / s[keep] / norms[:, None]
-    return half @ (u[:, keep].T @ right), half @ half.T, singular_values(matrix)
+    return half @ (u[:, keep].T @ right), half @ half.T
 
 
 def singular_values(matrix: FloatArray) -> FloatArray:

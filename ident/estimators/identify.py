@@ -19,7 +19,7 @@ from ident.estimators.least_squares import ls, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.model.bodies import Payload
-from ident.model.model import Column, Model
+from ident.model.model import Model
 
 LARGEST_STD = 0.1
 """Relative σ of every gain at once. Twenty short moves give 0.02; a payload in the wrong runs 0.25 and more."""
@@ -48,11 +48,6 @@ class Identification:
     system: System
     holdout: System | None
     estimate: Estimate
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Columns of W: base parameters, then effects."""
-        return self.system.columns
 
     @property
     def training_error(self) -> RelativeError:

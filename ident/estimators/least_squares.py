@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.equations.system import System, Triangles, require_known_payload, solve
+from ident.equations.system import System, Triangles, require_known_payload, singular_values, solve
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
 
@@ -42,7 +42,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
         matrix, right = stacked[:, :-1], -stacked[:, -1]
     else:
         matrix, right = -stacked[:, count:-1], stacked[:, :count] @ fixed + stacked[:, -1]
-    solution, inverse, singular = solve(matrix, right)
+    solution, inverse = solve(matrix, right)
     full = np.concatenate((solution, [1.0])) if fixed is None else np.concatenate((fixed, solution, [1.0]))
     rows = int(triangles.rows.sum())
     # Eq. (9) on the weighted rows, then eq. (10).
@@ -59,7 +59,7 @@ def _solve(system: System, weight: FloatArray, method: Method, fixed: FloatArray
         parameters=full[count:-1],
         covariance=covariance,
         axis_noise=triangles.residual_std(full, matrix.shape[1]),
-        singular_values=singular,
+        singular_values=singular_values(matrix),
         condition=float(weighted[0] / weighted[-1]),
         rows=rows,
     )

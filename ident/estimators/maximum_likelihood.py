@@ -13,6 +13,7 @@ change when a current is given in another unit or the columns are scaled.
 from __future__ import annotations
 
 import numpy as np
+from scipy import linalg
 
 from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
@@ -117,14 +118,10 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
         parameters = _parameters(triangles, gamma, noise)
         residual = np.concatenate([e / s for e, s in zip(_residuals(triangles, gamma, parameters), noise, strict=True)])
         linear = _scaled_linear(triangles, gamma, noise)
-        sizes = [len(factor) for factor in triangles.factors]
-        towards = np.zeros((sum(sizes), count))
-        first = 0
-        for motor, factor in enumerate(triangles.factors):
-            predicted = factor @ np.concatenate(([0.0], parameters, [1.0]))
-            # Relative steps of γ, so that motors of different units are alike.
-            towards[first : first + sizes[motor], motor] = predicted * gamma[motor] / noise[motor]
-            first += sizes[motor]
+        vector = np.concatenate(([0.0], parameters, [1.0]))
+        # Relative steps of γ, so that motors of different units are alike.
+        steps = zip(triangles.factors, gamma / noise, strict=True)
+        towards = linalg.block_diag(*((factor @ vector * step)[:, None] for factor, step in steps))
         q, _ = np.linalg.qr(linear / np.linalg.norm(linear, axis=0))
         projected = towards - q @ (q.T @ towards)
         gram, gradient = projected.T @ projected, projected.T @ residual

@@ -9,7 +9,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, as_array, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
-from ident.model.regressor import fill_rigid
+from ident.model.regressor import fill_rigid, rigid_torque
 from ident.model.robot import JointKind, Motion, Robot
 
 DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATIC: ("N", "m/s", "kg")}
@@ -139,15 +139,8 @@ class Model:
         Raises:
             ModelError: the motion is not one of n joints.
         """
-        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
-        position, velocity, acceleration = (np.ascontiguousarray(np.transpose(state)) for state in states)
-        count, samples = self.robot.joint_count, position.shape[-1]
-        if not position.shape == velocity.shape == acceleration.shape == (count, samples):
-            found = ", ".join(str(np.shape(state)) for state in states)
-            raise ModelError(
-                f"position, velocity and acceleration have the shapes {found}; expected (n_samples, {count}) each: a "
-                "row a sample, a column a joint"
-            )
+        position, velocity, acceleration = self._joint_first(motion)
+        count, samples = position.shape
         sign = np.sign(velocity)
         out = np.zeros((count, len(self.columns), samples))
         by_link = out[:, : 14 * count].reshape(count, count, 14, samples)
@@ -165,3 +158,32 @@ class Model:
             out[:, first + 1] = cross @ velocity
             out[:, first + 2] = r[:, None] * np.sign(motor_speed[motor])
         return out
+
+    def torques(self, motion: Motion, standard: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Joint torque of links and payload, the same with friction of the joints, and all [Nm or N], each (n, k).
+
+        Args:
+            motion: of n joints over k samples.
+            standard: χ_st, shape (c,).
+        """
+        position, velocity, acceleration = self._joint_first(motion)
+        own, motors = np.split(standard, [14 * self.robot.joint_count])
+        own, motors = own.reshape(-1, 14), motors.reshape(-1, 3, 1)
+        load = rigid_torque(self.robot, position, velocity, acceleration, own[:, :10])
+        geared = load + own[:, 11, None] * velocity + own[:, 12, None] * np.sign(velocity)
+        whole = geared + own[:, 10, None] * acceleration + own[:, 13, None]
+        for motor, (inertia, viscous, dry) in zip(self.drive_train.coupled, motors, strict=True):
+            r = self.drive_train.direction[motor]
+            cross = np.outer(r, r) - np.diag(r**2)
+            whole += cross @ (inertia * acceleration + viscous * velocity) + r[:, None] * dry * np.sign(r @ velocity)
+        return load, geared, whole
+
+    def _joint_first(self, motion: Motion) -> list[FloatArray]:
+        states = motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2
+        count, shapes = self.robot.joint_count, [np.shape(state) for state in states]
+        if shapes != [(*shapes[0][:1], count)] * 3:
+            raise ModelError(
+                f"position, velocity and acceleration have the shapes {', '.join(map(str, shapes))}; expected "
+                f"(n_samples, {count}) each: a row a sample, a column a joint"
+            )
+        return [np.ascontiguousarray(np.transpose(state)) for state in states]

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Robot, skew
 
 BLOCK_SAMPLES = 1024  #: Samples computed at once: their screws and products stay in a core's own cache
 
@@ -59,6 +59,39 @@ def fill_rigid(
                 np.einsum("dk,dck->ck", screw, work.moments, out=row[6:])
 
 
+def rigid_torque(
+    robot: Robot, position: FloatArray, velocity: FloatArray, acceleration: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """Torque of the rigid links [Nm or N], shape (n, k): the columns of `fill_rigid` times ``parameters``, (n, 10)."""
+    links, out = _links(robot), np.empty_like(position)
+    inertias = [_inertia(own) for own in parameters]
+    for first in range(0, position.shape[1], BLOCK_SAMPLES):
+        block = slice(first, first + BLOCK_SAMPLES)
+        states = list(zip(position[:, block], velocity[:, block], acceleration[:, block], strict=True))
+        work = _work(robot, links, len(states[0][0]), movers=False)
+        factors = [_move(link, work, index, *states[index]) for index, link in enumerate(links)]
+        wrenches = np.zeros((len(links) + 1, 6, len(states[0][0])))  # the last one is what the base bears
+        for own, screws, inertia in zip(wrenches, work.screws, inertias, strict=False):
+            v, (momentum, own[:]) = screws[:, 0], inertia @ np.swapaxes(screws, 0, 1)
+            own[:3] += _cross(v[:3], momentum[:3]) + _cross(v[3:], momentum[3:])
+            own[3:] += _cross(v[:3], momentum[3:])
+        for link, own, given, row in reversed(list(zip(links, wrenches, factors, out, strict=False))):
+            row[block] = link.own @ own
+            wrenches[link.parent] += link.transforms.T @ np.concatenate((own, *(factor * own for factor in given)))
+    return out
+
+
+def _cross(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Cross products of vectors of shape (3, k)."""
+    return first[[1, 2, 0]] * second[[2, 0, 1]] - first[[2, 0, 1]] * second[[1, 2, 0]]
+
+
+def _inertia(parameters: FloatArray) -> FloatArray:
+    """Momentum of a link per unit of its screw, from its ten parameters (LINK_PARAMETERS), shape (6, 6)."""
+    first, mass = skew(parameters[6:9]), parameters[9] * np.eye(3)
+    return np.block([[parameters[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3), first], [-first, mass]])
+
+
 @dataclass(frozen=True, slots=True)
 class _Link:
     """Constants of a link: X_f below each other, shape (6 f, 6), S, and C with V × S = C V."""
@@ -86,14 +119,14 @@ def _links(robot: Robot) -> tuple[_Link, ...]:
     links: list[_Link] = []
     for index, joint in enumerate(robot.joints):
         revolute = joint.kind is JointKind.REVOLUTE
-        fixed, skew = _blocks(joint.rotation.T, -joint.rotation.T @ _skew(joint.translation_m)), _skew(joint.axis)
+        fixed, turned = _blocks(joint.rotation.T, -joint.rotation.T @ skew(joint.translation_m)), skew(joint.axis)
         if revolute:
             # exp(−skew θ) = e eᵀ + cos θ (1 − e eᵀ) − sin θ skew (Rodrigues).
             outer = np.outer(joint.axis, joint.axis)
-            parts = [_blocks(turn) @ fixed for turn in (outer, np.eye(3) - outer, -skew)]
+            parts = [_blocks(turn) @ fixed for turn in (outer, np.eye(3) - outer, -turned)]
         else:
             # Slid along the axis e, u + w × (p + R e q): the second term is all that changes.
-            parts = [fixed, _blocks(np.zeros((3, 3)), -skew @ joint.rotation.T)]
+            parts = [fixed, _blocks(np.zeros((3, 3)), -turned @ joint.rotation.T)]
         own = np.zeros(6)
         own[slice(0, 3) if revolute else slice(3, 6)] = joint.axis
         links.append(
@@ -103,25 +136,26 @@ def _links(robot: Robot) -> tuple[_Link, ...]:
                 revolute=revolute,
                 transforms=np.concatenate(parts),
                 own=own,
-                cross=_blocks(-_skew(own[:3]), -_skew(own[3:])),
+                cross=_blocks(-skew(own[:3]), -skew(own[3:])),
             )
         )
     return tuple(links)
 
 
-def _work(robot: Robot, links: tuple[_Link, ...], samples: int) -> _Work:
+def _work(robot: Robot, links: tuple[_Link, ...], samples: int, *, movers: bool = True) -> _Work:
     base = np.zeros((6, 2, samples))
     base[3:, 1] = -robot.gravity_m_s2[:, None]
-    screws = [np.empty((6, 2 + len(link.movers), samples)) for link in links]
+    screws = [np.empty((6, 2 + movers * len(link.movers), samples)) for link in links]
     for link, array in zip(links, screws, strict=True):
-        array[:, -1] = link.own[:, None]
+        array[:, 2:] = link.own[:, None, None]  # the last one stays
     products = np.empty(18 * (1 + robot.joint_count) * samples)
     return _Work((*screws, base), products, np.zeros((3, 6, samples)), np.zeros((6, 4, samples)))
 
 
 def _move(
     link: _Link, work: _Work, index: int, position: FloatArray, velocity: FloatArray, acceleration: FloatArray
-) -> None:
+) -> tuple[FloatArray, ...]:
+    """Carry the parent's screws to a link; return the f(q) of its X_f, from the second one on."""
     before, here = work.screws[link.parent], work.screws[index]
     factors = (np.cos(position), np.sin(position)) if link.revolute else (position,)
     flat = before.reshape(6, -1)
@@ -131,11 +165,12 @@ def _move(
     for number, factor in enumerate(factors, start=1):
         parts[number] *= factor
         carried += parts[number]
-    here[:, :-1] = carried
+    here[:, : before.shape[1]] = carried
     v, a = here[:, 0], here[:, 1]
     # S × S is nothing: V may be that before S q̇ is added.
     a += np.outer(link.own, acceleration) + (link.cross @ v) * velocity
     v += np.outer(link.own, velocity)
+    return factors
 
 
 def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray:
@@ -145,11 +180,6 @@ def _blocks(diagonal: FloatArray, lower: FloatArray | None = None) -> FloatArray
     if lower is not None:
         out[3:, :3] = lower
     return out
-
-
-def _skew(vector: FloatArray) -> FloatArray:
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def _fill_wrench(inertia: FloatArray, moments: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> None:

@@ -334,16 +334,20 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     origin = np.empty((count + 1, samples, 3))
     rotation[0], origin[0] = np.eye(3), 0.0
     for index, joint in enumerate(robot.joints):
-        parent = rotation[joint.parent + 1]
-        offset = np.broadcast_to(joint.translation_m, (samples, 3))
-        turn = np.broadcast_to(joint.rotation, (samples, 3, 3))
+        parent, position = rotation[joint.parent + 1], position_rad[:, index, None]
+        origin[index + 1] = origin[joint.parent + 1] + parent @ joint.translation_m
         if joint.kind is JointKind.PRISMATIC:
-            offset = offset + position_rad[:, index, None] * (joint.rotation @ joint.axis)
+            origin[index + 1] += position * (parent @ (joint.rotation @ joint.axis))
+            rotation[index + 1] = parent @ joint.rotation
         else:
-            x, y, z = joint.axis  # Rodrigues' formula
-            skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            angle, outer = position_rad[:, index, None, None], np.outer(joint.axis, joint.axis)
-            turn = joint.rotation @ (outer + np.cos(angle) * (np.eye(3) - outer) + np.sin(angle) * skew)
-        origin[index + 1] = origin[joint.parent + 1] + np.einsum("kij,kj->ki", parent, offset)
-        rotation[index + 1] = parent @ turn
+            outer = np.outer(joint.axis, joint.axis)  # Rodrigues' formula
+            turns = joint.rotation @ np.stack((outer, np.eye(3) - outer, skew(joint.axis)))
+            factors = np.concatenate((np.ones_like(position), np.cos(position), np.sin(position)), axis=1)
+            np.matmul(parent, (factors @ turns.reshape(3, 9)).reshape(-1, 3, 3), out=rotation[index + 1])
     return Poses(rotation, origin)
+
+
+def skew(vector: FloatArray) -> FloatArray:
+    """Matrix of the cross product with a vector, shape (3, 3)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

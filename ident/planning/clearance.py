@@ -83,6 +83,7 @@ class Checker:
         self._ends = np.array(ends).reshape(-1, 2, 3).swapaxes(1, 2)
         self._radius = np.array([capsule.radius_m for capsule in capsules] + [0.0] * len(boxes))
         self._sphere = self._radius + 0.5 * np.linalg.norm(self._ends[:, :, 1] - self._ends[:, :, 0], axis=1)
+        self._everywhere = np.full(len(self._pairs) + len(self._confined), np.inf)
         self._first, self._second = np.array(self._pairs, dtype=np.int64).reshape(-1, 2).T
 
     def margins(self, position: FloatArray) -> FloatArray:
@@ -129,10 +130,6 @@ class Checker:
             open_ = middles[unsure.any(axis=0)]
             middles = np.concatenate((open_ - half, open_ + half))
         return None
-
-    @property
-    def _everywhere(self) -> FloatArray:
-        return np.full(len(self._pairs) + len(self._confined), np.inf)
 
     def _margins(self, position: FloatArray, needed: FloatArray) -> FloatArray:
         """Margin of each pair, then of each confined capsule, shape (pairs + confined, k).

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ident.data.run import Run
-from ident.discovery.loop import Evidence
-from tests.ident.recordings import MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
+from ident.discovery.loop import Evidence, gather
+from ident.estimators.identify import Identification, identify
+from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, gathered, record, three_axes_truth, tx40_truth
 
 
 @pytest.fixture(scope="session")
@@ -31,6 +32,24 @@ def noisy_runs(truth: Truth) -> tuple[Run, ...]:
         record(truth, f"run{index}", rng, MOUNTED if index % 2 else None, noise_a=0.3, seconds=22.0)
         for index in range(4)
     )
+
+
+@pytest.fixture(scope="session")
+def clean_found(truth: Truth, clean_runs: tuple[Run, ...]) -> Identification:
+    """The runs without noise, identified."""
+    return identify(truth.model, clean_runs, CONDITIONING)
+
+
+@pytest.fixture(scope="session")
+def noisy_found(truth: Truth, noisy_runs: tuple[Run, ...]) -> Identification:
+    """The noisy runs, identified."""
+    return identify(truth.model, noisy_runs, CONDITIONING)
+
+
+@pytest.fixture(scope="session")
+def noisy(noisy_found: Identification, noisy_runs: tuple[Run, ...]) -> Evidence:
+    """The same with their rows; nothing undeclared is in them."""
+    return gather(noisy_found, noisy_runs)
 
 
 @pytest.fixture(scope="session")

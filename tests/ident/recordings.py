@@ -15,6 +15,7 @@ from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
 from ident.discovery.loop import Evidence, gather
 from ident.equations.rows import decimate_rows
+from ident.estimators.estimate import RelativeError, relative_error
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -166,3 +167,9 @@ def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
 def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
     """The residual of the runs of the fit."""
     return prepare_search(evidence.model, evidence.trained, evidence.training, evidence.estimate, cache)
+
+
+def training_error(evidence: Evidence) -> RelativeError:
+    """Error on the rows of the fit [%]."""
+    estimate, rows = evidence.estimate, evidence.training
+    return relative_error(rows.torque(estimate.gains), estimate.predicted_torque(rows), rows.use)

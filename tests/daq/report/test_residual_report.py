@@ -20,6 +20,7 @@ from daq.cli.fit import check_report
 from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import ExitCode, OutputFailed, UsageError
+from daq.report import residual_page as residual_page_module
 from daq.report.effect_names import WORDS, effect_text, other_axis
 from daq.report.plots import draw_fit
 from daq.report.residual import error_change_text, residual_document, summary
@@ -159,8 +160,14 @@ class Reader(HTMLParser):
         return " ".join(self.texts)
 
 
-def test_the_page_is_self_contained(closed: Closed) -> None:
-    page = Reader(closed.page())
+@pytest.fixture(scope="module")
+def shown(closed: Closed) -> Reader:
+    """Its page, taken apart."""
+    return Reader(closed.page())
+
+
+def test_the_page_is_self_contained(shown: Reader) -> None:
+    page = shown
     tags = {element.tag for element in page.elements}
     assert not tags & {"script", "link", "iframe", "object", "embed", "base", "form", "a"}
     for element in page.elements:
@@ -175,12 +182,12 @@ def test_the_page_is_self_contained(closed: Closed) -> None:
     assert sum(element.tag == "img" for element in page.elements) == 5  # effect, torques, gains, two turns
 
 
-def test_the_page_says_the_outcome_first(closed: Closed) -> None:
+def test_the_page_says_the_outcome_first(closed: Closed, shown: Reader) -> None:
     reported = closed.account.total
     assert reported.before.holdout is not None
     assert reported.after.holdout is not None
     before, after = reported.before.holdout.axes[2], reported.after.holdout.axes[2]
-    page = Reader(closed.page())
+    page = shown
     first = next(text for text in page.texts if text.startswith("J3 has"))
     assert first.startswith(
         f"J3 has a spring: the error of J3 on held-out runs falls from {before:.1f} to {after:.1f} % ("
@@ -343,6 +350,7 @@ def test_a_disk_that_fails_leaves_the_old_report(
     def fail(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr(residual_page_module, "residual_page", lambda *_: "another page")
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(OutputFailed, match="no space"):
         save_report(closed.fitted, closed.account, calibration, tmp_path)

@@ -31,6 +31,7 @@ from tests.ident.recordings import (
     bent,
     gathered,
     search_problem_of,
+    training_error,
     with_current,
 )
 
@@ -56,7 +57,7 @@ class TrueSignals:
     time_s: FloatArray
     started_s: float
     rate_hz: float
-    pull: Callable[[], FloatArray]
+    pulls: Callable[[int], FloatArray]
 
     @property
     def position(self) -> FloatArray:
@@ -82,6 +83,10 @@ class TrueSignals:
     def motor_angle(self) -> FloatArray:
         """Motor angle of the axis."""
         return np.asarray(self.motor_angles[self.axis])
+
+    def pull(self) -> FloatArray:
+        """Torque of every joint per unit of acceleration of the axis, at every sample."""
+        return self.pulls(self.axis)
 
     def accelerated(self, of_time: FloatArray) -> FloatArray:
         """Second derivative."""
@@ -170,30 +175,30 @@ SMALL_CASES = (
 """On the arm of three axes, which needs a third of the time."""
 
 
-@pytest.fixture(scope="module")
-def clean(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
-    return gathered(truth, noisy_runs)
+@dataclass(frozen=True)
+class Arm:
+    """A robot with nothing undeclared, and what all cases of its one motion share."""
+
+    truth: Truth
+    clean: Evidence
+    cache: ColumnCache
+    signals: dict[str, TrueSignals]
 
 
 @pytest.fixture(scope="module")
-def small_session(small_truth: Truth, small_runs: tuple[Run, ...]) -> Evidence:
-    """One in which every run began a while after the one before."""
-    return gathered(small_truth, tuple(replace(run, started_s=PAUSE_S * index) for index, run in enumerate(small_runs)))
+def arm(truth: Truth, noisy: Evidence) -> Arm:
+    return Arm(truth, noisy, {}, {data.name: _true(truth, data) for data in noisy.datasets})
 
 
 @pytest.fixture(scope="module")
-def cache() -> ColumnCache:
-    """Columns of the one motion that all cases share."""
-    return {}
+def small_arm(small_truth: Truth, small_runs: tuple[Run, ...]) -> Arm:
+    """In a session in which every run began a while after the one before."""
+    runs = tuple(replace(run, started_s=PAUSE_S * index) for index, run in enumerate(small_runs))
+    clean = gathered(small_truth, runs)
+    return Arm(small_truth, clean, {}, {data.name: _true(small_truth, data) for data in clean.datasets})
 
 
-@pytest.fixture(scope="module")
-def small_cache() -> ColumnCache:
-    """The same for the small arm."""
-    return {}
-
-
-def _true(truth: Truth, data: Dataset, axis: int) -> TrueSignals:
+def _true(truth: Truth, data: Dataset) -> TrueSignals:
     names = [column.name for column in truth.model.columns]
     parameters = truth.parameters.copy()
     if data.payload is not None:
@@ -203,8 +208,7 @@ def _true(truth: Truth, data: Dataset, axis: int) -> TrueSignals:
     motion = data.motion()
     columns = truth.model.regressor(motion)
 
-    def pull() -> FloatArray:
-        """Torque of every joint per unit of acceleration of the axis, at every sample."""
+    def pulls(axis: int) -> FloatArray:
         still = np.zeros_like(motion.position_rad)
         one = still.copy()
         one[:, axis] = 1.0
@@ -215,7 +219,7 @@ def _true(truth: Truth, data: Dataset, axis: int) -> TrueSignals:
         return np.asarray(moved - at_rest)
 
     return TrueSignals(
-        axis=axis,
+        axis=0,
         positions=motion.position_rad.T,
         velocities=motion.velocity_rad_s.T,
         accelerations=motion.acceleration_rad_s2.T,
@@ -226,19 +230,19 @@ def _true(truth: Truth, data: Dataset, axis: int) -> TrueSignals:
         time_s=data.time_s - data.time_s[0],
         started_s=data.started_s or 0.0,
         rate_hz=data.rate_hz,
-        pull=pull,
+        pulls=pulls,
     )
 
 
-def _with(clean: Evidence, truth: Truth, planted: Planted) -> Evidence:
+def _with(arm: Arm, planted: Planted) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
-        made = planted.torque(_true(truth, data, planted.axis))
-        on_all = made if made.ndim == 2 else acting_on(planted.axis, len(truth.gains), made)
+        made = planted.torque(replace(arm.signals[data.name], axis=planted.axis))
+        on_all = made if made.ndim == 2 else acting_on(planted.axis, len(arm.truth.gains), made)
         if _family(planted.family)[0].side in {Side.MOTOR, Side.ALL_MOTORS}:
-            return np.asarray(truth.model.drive_train.direction.T @ on_all)
+            return np.asarray(arm.truth.model.drive_train.direction.T @ on_all)
         return on_all
 
-    return bent(clean, truth, torque)
+    return bent(arm.clean, arm.truth, torque)
 
 
 def _family(name: str) -> tuple[Effect, ...]:
@@ -250,21 +254,18 @@ def test_every_family_is_planted() -> None:
 
 
 @pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
-def test_it_is_named_with_its_size_and_sign(
-    clean: Evidence, truth: Truth, planted: Planted, cache: ColumnCache
-) -> None:
-    _is_named(_with(clean, truth, planted), planted, cache)
+def test_it_is_named_with_its_size_and_sign(arm: Arm, planted: Planted) -> None:
+    _is_named(arm, planted)
 
 
 @pytest.mark.parametrize("planted", SMALL_CASES, ids=lambda planted: f"{planted.family}-{planted.axis}")
-def test_so_it_is_on_a_smaller_arm(
-    small_session: Evidence, small_truth: Truth, planted: Planted, small_cache: ColumnCache
-) -> None:
-    _is_named(_with(small_session, small_truth, planted), planted, small_cache)
+def test_so_it_is_on_a_smaller_arm(small_arm: Arm, planted: Planted) -> None:
+    _is_named(small_arm, planted)
 
 
-def _is_named(start: Evidence, planted: Planted, cache: ColumnCache) -> None:
-    findings = rank_effects(search_problem_of(start, cache), np.random.default_rng(0), GATES)
+def _is_named(arm: Arm, planted: Planted) -> None:
+    start = _with(arm, planted)
+    findings = rank_effects(search_problem_of(start, arm.cache), np.random.default_rng(0), GATES)
     best = findings[0]
     assert best.passed
     names = [(placed.effect.name, placed.axis) for placed in (PlacedEffect(best.effect, best.axis), *best.ambiguity)]
@@ -274,13 +275,13 @@ def _is_named(start: Evidence, planted: Planted, cache: ColumnCache) -> None:
     count = len(planted.expected)
     found = after.estimate.parameters[len(after.bare.columns) :][:count]
     assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))
-    assert after.training_error.axes[planted.axis] < start.training_error.axes[planted.axis]
+    assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
 
 
-def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth, cache: ColumnCache) -> None:
+def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     """A spring on joint 2 must pass its gates on whichever motor gives the torque."""
     order = np.array([2, 0, 1, 3, 5, 4])
-    start = _with(clean, truth, CASES[0])
+    start = _with(arm, CASES[0])
     train = DriveTrain(RATIO[order])
     training = replace(
         start.training,
@@ -288,11 +289,13 @@ def test_motors_in_another_order_change_no_verdict(clean: Evidence, truth: Truth
         current=start.training.current[order],
         motor_use=start.training.motor_use[order],
     )
-    turned = replace(start, model=Model(truth.model.robot, train), training=training, estimate=ml(training.system()))
+    turned = replace(
+        start, model=Model(arm.truth.model.robot, train), training=training, estimate=ml(training.system())
+    )
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
     findings = rank_effects(search_problem_of(turned), np.random.default_rng(0), GATES, families)
     assert (findings[0].effect.name, findings[0].axis, findings[0].passed) == ("spring", 1, True)
-    same = rank_effects(search_problem_of(start, cache), np.random.default_rng(0), GATES, families)
+    same = rank_effects(search_problem_of(start, arm.cache), np.random.default_rng(0), GATES, families)
     assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
 
 
@@ -318,15 +321,16 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
         identify(truth.model, short, never_still)
 
 
-def test_sigma_is_true_for_correlated_noise(clean: Evidence, truth: Truth) -> None:
+def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
     rng = np.random.default_rng(5)
+    clean = small_arm.clean
     bare, estimate = clean.bare, clean.estimate
-    exact = truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
+    exact = small_arm.truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
     gains, claimed = [], []
     for _ in range(24):
         noise = np.empty_like(exact)
-        noise[:, 0] = rng.normal(size=6)
+        noise[:, 0] = rng.normal(size=len(exact))
         drawn = rng.normal(size=exact.shape)
         for row in range(1, exact.shape[1]):
             noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
@@ -339,7 +343,7 @@ def test_sigma_is_true_for_correlated_noise(clean: Evidence, truth: Truth) -> No
     assert np.all(ratio < 1.6)
 
 
-def test_the_loop_ends_where_nothing_is_left(small_session: Evidence, small_truth: Truth) -> None:
-    start = _with(small_session, small_truth, next(case for case in SMALL_CASES if case.family == "load-friction"))
+def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
+    start = _with(small_arm, next(case for case in SMALL_CASES if case.family == "load-friction"))
     steps = find_effects(start, np.random.default_rng(1))
     assert [step.accepted is not None for step in steps] == [True, False]

@@ -17,7 +17,7 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import Smooth
-from tests.ident.recordings import Truth, acting_on, bent, search_problem_of
+from tests.ident.recordings import Truth, acting_on, bent, search_problem_of, training_error
 
 FloatArray = NDArray[np.float64]
 Torque = Callable[[Dataset], FloatArray]
@@ -80,7 +80,7 @@ def test_what_has_no_name_is_found_on_its_axis_against_its_variable(
     assert step.accepted is not None
     assert (step.accepted.effect.name, step.accepted.axis) == (case.name, case.axis)
     # Most of the excess of that axis' squared error is gone.
-    before, after, clean = (e.training_error.axes[case.axis] ** 2 for e in (start, step.after, small))
+    before, after, clean = (training_error(e).axes[case.axis] ** 2 for e in (start, step.after, small))
     assert before - after > 0.6 * (before - clean)
 
 

@@ -9,22 +9,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident.data.run import Run
 from ident.equations.system import System
 from ident.estimators.comparison import Essential, essential, relative_std_percent
 from ident.estimators.estimate import Estimate
-from ident.estimators.identify import identify
+from ident.estimators.identify import Identification
 from ident.estimators.least_squares import tls, wls
 from ident.estimators.maximum_likelihood import ml
-from tests.ident.recordings import CONDITIONING, GAINS, Truth
+from tests.ident.recordings import GAINS
 
 ESTIMATORS = (wls, tls, ml)
 
 
 @pytest.fixture(scope="module")
-def system(truth: Truth, noisy_runs: tuple[Run, ...]) -> System:
+def system(noisy_found: Identification) -> System:
     """System of noisy runs."""
-    return identify(truth.model, noisy_runs, CONDITIONING).system
+    return noisy_found.system
 
 
 def _robot_std_percent(found: Essential) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

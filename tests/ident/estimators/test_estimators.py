@@ -12,7 +12,7 @@ from ident.data.run import Run
 from ident.equations.system import require_distinct
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimators.estimate import Estimate
-from ident.estimators.identify import estimate_with, identify
+from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import Scaling, tls, wls
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
@@ -23,13 +23,13 @@ from tests.ident.recordings import CONDITIONING, GAINS, MOUNTED, PAYLOAD_TRUTH, 
 FloatArray = NDArray[np.float64]
 
 
-def _fit(truth: Truth, runs: tuple[Run, ...], method: Method = Method.ML) -> Estimate:
-    return identify(truth.model, runs, CONDITIONING, method=method).estimate
+def _fit(truth: Truth, runs: tuple[Run, ...]) -> Estimate:
+    return identify(truth.model, runs, CONDITIONING).estimate
 
 
 @pytest.mark.parametrize("method", Method)
 def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: tuple[Run, ...], method: Method) -> None:
-    estimate = _fit(truth, clean_runs, method)
+    estimate = identify(truth.model, clean_runs, CONDITIONING, method=method).estimate
     assert estimate.gains == pytest.approx(GAINS, rel=2e-4)
     names = [column.name for column in estimate.unknowns]
     for name in ("mx", "my", "mz", "Izz"):
@@ -38,40 +38,45 @@ def test_without_noise_every_method_finds_every_gain(truth: Truth, clean_runs: t
 
 
 def test_fixed_gains_give_the_classical_identification(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    system = identify(truth.model, clean_runs[:1], CONDITIONING, fixed_gains=GAINS).system
+    expected = system.base.grouping @ truth.parameters
     for method in (Method.LS, Method.WLS, Method.ML):
-        result = identify(truth.model, clean_runs[:1], CONDITIONING, method=method, fixed_gains=GAINS)
-        expected = result.system.base.grouping @ truth.parameters
-        assert result.estimate.parameters == pytest.approx(expected, rel=1e-3, abs=2e-3)
-        assert np.all(result.estimate.gains_std == 0.0)
+        estimate = estimate_with(method, system, GAINS)
+        assert estimate.parameters == pytest.approx(expected, rel=1e-3, abs=2e-3)
+        assert np.all(estimate.gains_std == 0.0)
 
 
-def test_ml_beats_the_papers_tls_and_both_beat_wls(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    errors = {m: float(np.mean(np.abs(_fit(truth, noisy_runs, m).gains / GAINS - 1.0))) for m in Method}
+def test_ml_beats_the_papers_tls_and_both_beat_wls(noisy_found: Identification) -> None:
+    errors = {m: float(np.mean(np.abs(estimate_with(m, noisy_found.system).gains / GAINS - 1.0))) for m in Method}
     assert errors[Method.ML] < errors[Method.TLS] < errors[Method.WLS]
     assert errors[Method.ML] < 0.012
 
 
-def test_gains_scale_with_the_payload_mass(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_gains_scale_with_the_payload_mass(
+    truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
+) -> None:
     heavier = Payload("disc", "a", {"m": 4.59 * 1.05})
     runs = tuple(replace(run, payload=heavier) if run.payload else run for run in noisy_runs)
-    assert _fit(truth, runs).gains == pytest.approx(1.05 * _fit(truth, noisy_runs).gains, rel=1e-6)
+    assert _fit(truth, runs).gains == pytest.approx(1.05 * noisy_found.estimate.gains, rel=1e-6)
 
 
 @pytest.mark.parametrize("factor", [1000.0, 2.0**-0.5, -1.0])
 def test_a_change_of_current_unit_scales_exactly_that_gain(
-    truth: Truth, noisy_runs: tuple[Run, ...], factor: float
+    truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification, factor: float
 ) -> None:
     scale = np.ones(6)
     scale[3] = factor
-    before = _fit(truth, noisy_runs)
+    before = noisy_found.estimate
     after = _fit(truth, tuple(replace(run, current_a=run.current_a * scale) for run in noisy_runs))
     assert after.gains == pytest.approx(before.gains / scale, rel=1e-6)
     assert after.parameters == pytest.approx(before.parameters, rel=1e-5, abs=1e-8)
     assert after.gains_std == pytest.approx(before.gains_std / np.abs(scale), rel=1e-4)
 
 
-def test_the_order_of_runs_does_not_matter(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    before, after = _fit(truth, noisy_runs), _fit(truth, noisy_runs[::-1])
+def test_the_order_of_runs_does_not_matter(
+    truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
+) -> None:
+    before, after = noisy_found.estimate, _fit(truth, noisy_runs[::-1])
     assert after.gains == pytest.approx(before.gains, rel=1e-9)
     assert after.gains_std == pytest.approx(before.gains_std, rel=1e-6)
 
@@ -87,17 +92,16 @@ def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple
     assert after.parameters == pytest.approx(before.parameters, rel=1e-7, abs=1e-9)
 
 
-def test_the_covariance_covers_the_error(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    estimate = _fit(truth, noisy_runs)
+def test_the_covariance_covers_the_error(noisy_found: Identification) -> None:
+    estimate = noisy_found.estimate
     scores = (estimate.gains - GAINS) / estimate.gains_std
     assert np.all(np.abs(scores) < 4.0)
     assert np.all(estimate.gains_std / np.abs(GAINS) < 0.02)
 
 
-def test_ml_solves_the_instrumental_variable_equations(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_ml_solves_the_instrumental_variable_equations(noisy_found: Identification) -> None:
     """Instruments are the columns of W and the predicted currents (docs/decisions/0010)."""
-    system = identify(truth.model, noisy_runs, CONDITIONING).system
-    estimate = ml(system)
+    system, estimate = noisy_found.system, noisy_found.estimate
     gamma = 1.0 / estimate.gains
     columns = np.zeros(len(estimate.parameters))
     size = np.zeros_like(columns)
@@ -111,15 +115,17 @@ def test_ml_solves_the_instrumental_variable_equations(truth: Truth, noisy_runs:
 
 
 @pytest.mark.parametrize("scaling", Scaling)
-def test_tls_scalings_agree_without_noise(truth: Truth, clean_runs: tuple[Run, ...], scaling: Scaling) -> None:
-    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
-    assert tls(system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
+def test_tls_scalings_agree_without_noise(clean_found: Identification, scaling: Scaling) -> None:
+    assert tls(clean_found.system, scaling).gains == pytest.approx(GAINS, rel=2e-4)
 
 
 def test_without_a_known_payload_there_is_no_scale(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
+    with pytest.raises(DataUnfit, match="weighed payload"):
+        _fit(truth, clean_runs[:1])
+    system = identify(truth.model, clean_runs[:1], CONDITIONING, fixed_gains=GAINS).system
     for method in Method:
         with pytest.raises(DataUnfit, match="weighed payload"):
-            _fit(truth, clean_runs[:1], method)
+            estimate_with(method, system)
 
 
 def test_loaded_runs_alone_are_rank_deficient(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
@@ -139,23 +145,20 @@ def test_a_mounting_has_one_payload(truth: Truth) -> None:
         _fit(truth, runs)
 
 
-def test_tls_has_nothing_to_do_with_fixed_gains(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
-    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.LS).system
+def test_tls_has_nothing_to_do_with_fixed_gains(clean_found: Identification) -> None:
     with pytest.raises(DataUnfit, match="free gains"):
-        estimate_with(Method.TLS, system, GAINS)
+        estimate_with(Method.TLS, clean_found.system, GAINS)
 
 
-def test_more_runs_of_one_mounting_share_its_unknowns(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    system = identify(truth.model, noisy_runs, CONDITIONING).system
+def test_more_runs_of_one_mounting_share_its_unknowns(noisy_found: Identification) -> None:
+    system = noisy_found.system
     assert len(system.unknowns) == 61 + 9
-    assert ml(system).rows == int(system.motors.rows.sum())
+    assert noisy_found.estimate.rows == int(system.motors.rows.sum())
 
 
-def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(
-    truth: Truth, clean_runs: tuple[Run, ...]
-) -> None:
+def test_coupled_joints_that_never_move_together_are_named_and_only_ml_minds(clean_found: Identification) -> None:
     """Joint 6 rests while joint 5 moves: no row of the coupled motors is free of an undetermined dry friction."""
-    system = identify(truth.model, clean_runs, CONDITIONING, method=Method.WLS).system
+    system = clean_found.system
     apart = replace(
         system,
         motors=replace(

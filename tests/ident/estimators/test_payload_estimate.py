@@ -10,8 +10,9 @@ import pytest
 from ident.data.run import Run
 from ident.equations.reduction import Reduction, reduce_runs
 from ident.errors import DataUnfit, RankDeficient, TooFewMoves
-from ident.estimators.identify import identify
+from ident.estimators.identify import Identification, estimate_with, identify
 from ident.estimators.least_squares import wls
+from ident.estimators.maximum_likelihood import ml
 from ident.estimators.method import Method
 from ident.estimators.payload_estimate import as_one_body, joined, payload_beside_bare_runs, payload_on_known_robot
 from ident.model.bodies import LINK_PARAMETERS, Payload
@@ -25,7 +26,8 @@ PLATE = dict(zip(LINK_PARAMETERS, (0.013, -0.001, 0.003, 0.014, 0.002, 0.01, 0.0
 
 
 def _reduced(truth: Truth, *runs: Run) -> Reduction:
-    return reduce_runs(truth.model, runs, CONDITIONING)
+    speeds_rad_s = CONDITIONING.standstill_rad_s[: len(truth.gains)]
+    return reduce_runs(truth.model, runs, replace(CONDITIONING, standstill_rad_s=speeds_rad_s))
 
 
 def _record(
@@ -55,9 +57,21 @@ def mixed(truth: Truth) -> tuple[Run, ...]:
     )
 
 
-def test_each_mounting_has_its_own_unknowns(truth: Truth, mixed: tuple[Run, ...]) -> None:
+@pytest.fixture(scope="module")
+def identified(truth: Truth, mixed: tuple[Run, ...]) -> Identification:
+    """All of them together."""
+    return identify(truth.model, mixed, CONDITIONING)
+
+
+@pytest.fixture(scope="module")
+def parts(truth: Truth, mixed: tuple[Run, ...]) -> tuple[Reduction, ...]:
+    """Each of them alone."""
+    return tuple(_reduced(truth, run) for run in mixed)
+
+
+def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
     """Disc twice, plate once, runs of each in any order; the plate's mass is unknown and is found."""
-    found = identify(truth.model, mixed, CONDITIONING).estimate
+    found = identified.estimate
     assert found.gains == pytest.approx(GAINS, rel=0.01)
     values = dict(zip((column.name for column in found.unknowns), found.parameters, strict=True))
     assert len(values) == 61 + 9 + 9 + 10
@@ -68,55 +82,57 @@ def test_each_mounting_has_its_own_unknowns(truth: Truth, mixed: tuple[Run, ...]
     assert "m:a" not in values
 
 
-def test_one_unknown_vector_for_two_mountings_ruins_the_gains(truth: Truth, mixed: tuple[Run, ...]) -> None:
+def test_one_unknown_vector_for_two_mountings_ruins_the_gains(parts: tuple[Reduction, ...]) -> None:
     """Why a mounting has a name: the disc turned, and declared as if it had not been."""
-    runs = [run for run in mixed if run.payload is None or run.payload.name == "disc"]
-    confused = [run if run.payload is None else replace(run, payload=MOUNTED) for run in runs]
+    runs = [part for part in parts if not part.payloads or part.payloads[0].name == "disc"]
+    confused = [replace(part, payloads=(MOUNTED,)) if part.payloads else part for part in runs]
     right, wrong = (
-        np.max(np.abs(identify(truth.model, r, CONDITIONING).estimate.gains / GAINS - 1.0)) for r in (runs, confused)
+        np.max(np.abs(ml(r.system(r.base(), r.payload_columns())).gains / GAINS - 1.0))
+        for r in (joined(runs), joined(confused))
     )
     assert right < 0.01
     assert wrong > 5.0 * right
 
 
-@pytest.mark.parametrize("method", [Method.WLS, Method.TLS, Method.ML])
-def test_more_knowledge_is_used(truth: Truth, clean_runs: tuple[Run, ...], method: Method) -> None:
+@pytest.mark.parametrize("names", [("m",), ("m", "mx", "my", "mz"), LINK_PARAMETERS], ids=len)
+def test_more_knowledge_is_used(truth: Truth, clean_runs: tuple[Run, ...], names: tuple[str, ...]) -> None:
     """n_kL of eq. (5) from one to ten: what is known is not estimated, and all of it is consistent."""
-    for names in (("m",), ("m", "mx", "my", "mz"), LINK_PARAMETERS):
-        payload = Payload("disc", "a", {name: PAYLOAD_TRUTH[name] for name in names})
-        runs = (clean_runs[0], replace(clean_runs[1], payload=payload))
-        found = identify(truth.model, runs, CONDITIONING, method=method).estimate
+    payload = Payload("disc", "a", {name: PAYLOAD_TRUTH[name] for name in names})
+    runs = (clean_runs[0], replace(clean_runs[1], payload=payload))
+    system = identify(truth.model, runs, CONDITIONING).system
+    for method in (Method.WLS, Method.TLS, Method.ML):
+        found = estimate_with(method, system)
         assert found.gains == pytest.approx(GAINS, rel=2e-4)
         unknown = {column.name for column in found.unknowns if ":" in column.name}
         assert unknown == {f"{name}:a" for name in LINK_PARAMETERS if name not in names}
 
 
-def test_a_mass_is_found_with_its_uncertainty(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    bare = _reduced(truth, *(run for run in mixed if run.payload is None))
-    for run in mixed:
-        if run.payload is None:
+def test_a_mass_is_found_with_its_uncertainty(parts: tuple[Reduction, ...]) -> None:
+    bare = joined([part for part in parts if not part.payloads])
+    for part in parts:
+        if not part.payloads:
             continue
-        mass = 1.686 if run.payload.name == "plate" else 4.59
-        found = payload_beside_bare_runs(bare, _reduced(truth, run), GAINS)
+        mass = 1.686 if part.payloads[0].name == "plate" else 4.59
+        found = payload_beside_bare_runs(bare, part, GAINS)
         assert abs(found.mass_kg - mass) < 4.0 * found.mass_std_kg
         assert 0.0005 * mass < found.mass_std_kg < 0.01 * mass
         assert found.names == LINK_PARAMETERS
 
 
-def test_the_claimed_sigma_covers_the_scatter(truth: Truth) -> None:
+def test_the_claimed_sigma_covers_the_scatter(small_truth: Truth) -> None:
     """Over repetitions the mass scatters as much as each of them says; twelve show it within a factor of two."""
     rng = np.random.default_rng(7)
-    bare = _reduced(truth, record(truth, "bare", rng, noise_a=0.3))
-    runs = [record(truth, f"loaded{index}", rng, MOUNTED, noise_a=0.3) for index in range(12)]
-    found = [payload_beside_bare_runs(bare, _reduced(truth, run), GAINS) for run in runs]
+    runs = (record(small_truth, f"{index}", rng, MOUNTED if index else None, noise_a=0.3) for index in range(13))
+    bare, *loaded = (_reduced(small_truth, run) for run in runs)
+    found = [payload_beside_bare_runs(bare, one, small_truth.gains) for one in loaded]
     scatter = float(np.std([one.mass_kg for one in found], ddof=1))
     claimed = float(np.mean([one.mass_std_kg for one in found]))
     assert 0.5 < claimed / scatter < 2.5
     assert abs(float(np.mean([one.mass_kg for one in found])) - 4.59) < 3.0 * claimed
 
 
-def test_a_common_error_of_the_gains_is_the_masss_error(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    bare, loaded = _reduced(truth, mixed[0]), _reduced(truth, mixed[1])
+def test_a_common_error_of_the_gains_is_the_masss_error(parts: tuple[Reduction, ...]) -> None:
+    bare, loaded = parts[:2]
     right, wrong = (payload_beside_bare_runs(bare, loaded, scale * GAINS) for scale in (1.0, 1.05))
     assert wrong.mass_kg == pytest.approx(1.05 * right.mass_kg, rel=1e-9)
     assert right.per_gain @ GAINS == pytest.approx(right.values, rel=1e-6)
@@ -128,31 +144,33 @@ def test_a_common_error_of_the_gains_is_the_masss_error(truth: Truth, mixed: tup
     assert shifted.mass_kg - right.mass_kg == pytest.approx(0.01 * GAINS[2] * right.per_gain[-1, 2], rel=0.1, abs=1e-3)
 
 
-def test_on_a_known_robot_the_loaded_run_is_enough(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    found = payload_on_known_robot(truth.parameters, _reduced(truth, mixed[3]), GAINS)
+def test_on_a_known_robot_the_loaded_run_is_enough(truth: Truth, parts: tuple[Reduction, ...]) -> None:
+    found = payload_on_known_robot(truth.parameters, parts[3], GAINS)
     assert found.mass_kg == pytest.approx(1.686, rel=0.01)
     wrong = truth.parameters.copy()
     wrong[truth.model.flange.start + LINK_PARAMETERS.index("m")] += 0.5
-    lighter = payload_on_known_robot(wrong, _reduced(truth, mixed[3]), GAINS)
+    lighter = payload_on_known_robot(wrong, parts[3], GAINS)
     assert lighter.mass_kg == pytest.approx(found.mass_kg - 0.5, abs=1e-6)
 
 
-def test_reductions_are_joined_as_if_read_together(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    whole = _reduced(truth, *mixed)
-    parts = joined([_reduced(truth, run) for run in mixed])
-    assert parts.runs == whole.runs
-    assert parts.payloads == whole.payloads
-    one, other = (r.system(whole.base(), whole.payload_columns()) for r in (parts, whole))
+def test_reductions_are_joined_as_if_read_together(parts: tuple[Reduction, ...], identified: Identification) -> None:
+    whole, other = joined(parts), identified.system
+    one = whole.system(other.base, other.payload_columns)
+    assert one.runs == other.runs
+    assert one.payloads == other.payloads
+    assert (whole.base().independent, whole.payload_columns()) == (other.base.independent, other.payload_columns)
     assert wls(one).gains == pytest.approx(wls(other).gains, rel=1e-8)
     assert one.joints.rows.tolist() == other.joints.rows.tolist()
     assert len(one.moves) == len(other.moves)
-    other_weight = replace(mixed[1], payload=Payload("disc", "a", {"m": 5.0}))
+    other_weight = replace(parts[1], payloads=(Payload("disc", "a", {"m": 5.0}),))
     with pytest.raises(DataUnfit, match="in another run"):
-        joined([_reduced(truth, mixed[1]), _reduced(truth, other_weight)])
+        joined([parts[1], other_weight])
 
 
-def test_as_one_body_the_payload_is_part_of_the_last_link(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    one = as_one_body(_reduced(truth, mixed[1]))
+def test_as_one_body_the_payload_is_part_of_the_last_link(
+    truth: Truth, mixed: tuple[Run, ...], parts: tuple[Reduction, ...]
+) -> None:
+    one = as_one_body(parts[1])
     same = _reduced(truth, replace(mixed[1], payload=None))
     systems = [r.system(same.base(), ()) for r in (one, same)]
     first, second = (wls(system, GAINS) for system in systems)
@@ -160,14 +178,14 @@ def test_as_one_body_the_payload_is_part_of_the_last_link(truth: Truth, mixed: t
     assert first.condition == pytest.approx(second.condition, rel=1e-7)
 
 
-def test_what_cannot_be_weighed_is_refused(truth: Truth, mixed: tuple[Run, ...]) -> None:
-    loaded = _reduced(truth, mixed[1])
+def test_what_cannot_be_weighed_is_refused(truth: Truth, parts: tuple[Reduction, ...]) -> None:
+    bare, loaded, turned, *_ = parts
     with pytest.raises(RankDeficient, match="without load too"):
         payload_beside_bare_runs(loaded, loaded, GAINS)
     with pytest.raises(DataUnfit, match="one payload is weighed at a time"):
-        payload_beside_bare_runs(loaded, _reduced(truth, mixed[2]), GAINS)
+        payload_beside_bare_runs(loaded, turned, GAINS)
     with pytest.raises(DataUnfit, match="mountings none"):
-        payload_on_known_robot(truth.parameters, _reduced(truth, mixed[0]), GAINS)
+        payload_on_known_robot(truth.parameters, bare, GAINS)
     short = record(truth, "short", np.random.default_rng(1), MOUNTED, seconds=4.0, noise_a=0.1)
     with pytest.raises(TooFewMoves):
         payload_on_known_robot(truth.parameters, _reduced(truth, short), GAINS)

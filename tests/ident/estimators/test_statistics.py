@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ident.data.run import Run
+from ident.discovery.loop import Evidence
 from ident.equations.system import System, Triangles, triangle
 from ident.estimators.estimate import Estimate
 from ident.estimators.least_squares import Scaling, ls, tls, wls
 from ident.model.base import BaseParameters
 from ident.model.bodies import Payload
 from ident.model.model import Column, DriveTrain
-from tests.ident.recordings import Truth, gathered
 
 FloatArray = NDArray[np.float64]
 
@@ -110,9 +109,9 @@ def test_total_least_squares_scatters_as_equation_23_says(scaling: Scaling) -> N
     assert np.max(of_tls) < 0.1 * np.max(of_ls)
 
 
-def test_the_triangles_give_the_formulas_of_all_rows(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+def test_the_triangles_give_the_formulas_of_all_rows(noisy: Evidence) -> None:
     """Eqs. (16), (9), (10), (19), (22) and (23) written out on the whole W_tot."""
-    rows = gathered(truth, noisy_runs[:2]).training
+    rows = noisy.training.only(noisy.training.run < 2)
     matrix = np.concatenate(
         [
             np.concatenate(
