@@ -75,7 +75,7 @@ class Source:
 
     name: str  #: of the log
     sha256: str  #: its digest
-    role: str  #: in the fit
+    role: str  #: use of the log, `fit` or `holdout`; not whether a payload was mounted
     #: It is what was saved of a recording that was never finished, or one with losses; nothing of it may reach a
     #: controller.
     partial: bool = False

@@ -24,7 +24,7 @@ SEAL = "crc32"  #: Entry with the checksum of the others. Outside chunks, a log 
 
 
 class Role(Enum):
-    """Whether a payload was mounted."""
+    """Whether a payload was mounted; not the use of the log in a fit (`ident.calibration.Source.role`)."""
 
     UNLOADED = "unloaded"
     LOADED = "loaded"

@@ -20,7 +20,7 @@ from ident.arrays import FloatArray
 from ident.calibration import Calibration, Parameter
 from ident.discovery.loop import Evidence, without_effects
 from ident.effects.effect import PlacedEffect
-from ident.estimators.comparison import Comparison, Trial
+from ident.estimators.comparison import Comparison, EstimatorTrial
 from ident.estimators.estimate import RelativeError
 from ident.planning.excitation import GOOD_PERCENT, GainVerdict
 
@@ -217,7 +217,7 @@ def comparison_tables(comparison: Comparison, axes: tuple[str, ...]) -> tuple[Ta
     return gains, spreads
 
 
-def _trial(trial: Trial, axes: tuple[str, ...]) -> dict[str, Any]:
+def _trial(trial: EstimatorTrial, axes: tuple[str, ...]) -> dict[str, Any]:
     document = picked(trial, "estimator", "position_cutoff_hz", "decimation_cutoff_hz")
     if trial.gains is None or trial.std is None:
         return {**document, "gains": None, "reason": trial.reason}

@@ -14,7 +14,7 @@ from daq.report.text import plain_table, terminal_text
 from ident.calibration import Calibration, Gain
 
 if TYPE_CHECKING:  # `history` needs no effects
-    from ident.discovery.before_after import GainChange
+    from ident.discovery.before_after import GainShift
 
 _SIGMAS = 2.0
 _BESIDE = 0.12  #: Offset of the points before and after, in units of the distance between axes
@@ -90,7 +90,7 @@ def with_deviation(value: float, std: float) -> str:
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
 
 
-def plot_gain_changes(changes: tuple[GainChange, ...], axes: tuple[str, ...], *, title: str) -> bytes:
+def plot_gain_changes(changes: tuple[GainShift, ...], axes: tuple[str, ...], *, title: str) -> bytes:
     """Draw each gain before and after, in per cent of the one before, with the interval of either.
 
     Both estimates share their noise, so the σ of the change decides whether a change is more than noise, not the

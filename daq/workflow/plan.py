@@ -45,7 +45,7 @@ ROUND = 8  #: Proposals whose regressors are made at once
 THINNING = 2  #: Every second row is enough to compare proposals by
 SHARPNESS = 8.0
 """The search lowers this norm of all gains' deviations, nearly the largest: the second worst counts a little."""
-MIN_MOVES = 5
+MIN_PLANNED_MOVES = 5
 MAX_TRIES = 100  #: Random postures or ways that are tried from one place before it counts as shut in
 MAX_RETREATS = 30
 MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
@@ -106,7 +106,7 @@ class Search:
         most: list[PlannedMove] = []
         for _ in range(MAX_STARTS):
             moves, paths = self._filled()
-            if len(moves) >= MIN_MOVES:
+            if len(moves) >= MIN_PLANNED_MOVES:
                 return Draft(tuple(moves), tuple(paths), tuple(self._experiment.informations(paths, THINNING)))
             most = max(most, moves, key=len)
         found = f"room for {len(most)} moves"

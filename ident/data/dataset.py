@@ -97,8 +97,8 @@ def differentiate(run: Run, drive_train: DriveTrain, conditioning: Conditioning)
     motor_moving = np.abs(drive_train.direction @ velocity) >= speed_limit[list(drive_train.joints)]
     valid = np.ones_like(moving).T if usable is None else np.asfortranarray(usable[1:-1], dtype=np.bool_)
     # If the log has no moves, a new one begins after every standstill of all joints.
-    whole = np.any(moving, axis=0)
-    move = np.cumsum(np.diff(whole.astype(np.int64), prepend=1) > 0) if logged is None else logged[1:-1]
+    any_moving = np.any(moving, axis=0)
+    move = np.cumsum(np.diff(any_moving.astype(np.int64), prepend=1) > 0) if logged is None else logged[1:-1]
     # Long moves are split: σ and folds need many moves, and continuous motion would be a single one.
     starts = np.flatnonzero(np.diff(move, prepend=move[0] - 1))
     since = np.arange(len(move)) - np.repeat(starts, np.diff(starts, append=len(move)))

@@ -12,7 +12,7 @@ robot without coupled axes has the ε of Table 6. They are one set of gains for 
 in ε, as Table 6 would; its ε_i are not affected. The four ways differ in the data that the model has seen:
 
 - in-sample: all data; it cannot rise when an effect joins, so it proves nothing;
-- cross-validated: all moves but those predicted (`ident.equations.linearisation.cut`, one Gauss-Newton step around
+- cross-validated: all moves but those predicted (`cut_into_folds`, one Gauss-Newton step around
   the estimate, gains included); the choice of the effects has seen all moves, so the error is optimistic;
 - left-out runs: all runs but the one predicted, everything refitted, load and current of the effects' columns too; the
   choice and the settings of the effects have seen the run;
@@ -39,7 +39,7 @@ from ident.arrays import FloatArray, IntArray
 from ident.discovery.loop import Evidence, Step, with_effects
 from ident.discovery.noise_floor import NoiseFloor, noise_floors
 from ident.effects.effect import PlacedEffect
-from ident.equations.linearisation import Folds, cut, left_out_shifts, linearise
+from ident.equations.linearisation import Folds, cut_into_folds, left_out_shifts, linearise
 from ident.equations.rows import Observation
 from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, RelativeError, of_squares
@@ -116,15 +116,15 @@ def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> LeftOutRuns:
 def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
     """Error on one run of the fit, with the model refitted without it."""
     order = [index for index in range(len(evidence.trained)) if index != left_out] + [left_out]
-    whole = _in_order(evidence.bare, order)
-    last = whole.run == len(order) - 1
-    training, held = whole.only(~last), whole.only(last)
+    observation = _in_order(evidence.rows_without_effects, order)
+    last = observation.run == len(order) - 1
+    training, held = observation.only(~last), observation.only(last)
     fixed = evidence.estimate.gains if evidence.estimate.gains_fixed else None
     bare = replace(
         evidence,
         datasets=tuple(evidence.datasets[index] for index in order),
         held_out=1,
-        bare=whole,
+        rows_without_effects=observation,
         training=training,
         holdout=held,
         effects=(),
@@ -169,7 +169,7 @@ class Assessment:
 
 
 @dataclass(frozen=True, slots=True)
-class GainChange:
+class GainShift:
     """One gain without and with further effects [Nm at the joint per A]."""
 
     before: float  #: estimate without the effects
@@ -198,7 +198,7 @@ class BeforeAfter:
     removed: tuple[PlacedEffect, ...]  #: effects of the first model only
     before: Errors  #: errors of the first
     after: Errors  #: errors of the second
-    gains: tuple[GainChange, ...]  #: one a motor
+    gains: tuple[GainShift, ...]  #: one a motor
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,7 +262,7 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         TooFewMoves: there are too few moves to leave some out.
     """
     estimate = evidence.estimate
-    folds = cut(
+    folds = cut_into_folds(
         linearise(
             evidence.training,
             estimate.gains,
@@ -272,9 +272,9 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
         )
     )
     held, count = evidence.holdout, len(estimate.gains)
-    shifts = np.zeros((folds.problem.moves, count))
+    shifts = np.zeros((folds.problem.cluster_count, count))
     if not estimate.gains_fixed:
-        shifts = (left_out_shifts(folds.move_hessian, folds.move_score) * folds.problem.scale)[:, :count]
+        shifts = (left_out_shifts(folds.cluster_hessian, folds.cluster_score) * folds.problem.scale)[:, :count]
     return Assessment(
         effects=evidence.effects,
         errors=Errors(
@@ -291,9 +291,9 @@ def assess(evidence: Evidence, weights_nm_a: FloatArray, left_out: LeftOutRuns |
 
 def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     """Compare two models of the same rows."""
-    moves, count = before.shifts.shape
+    clusters, count = before.shifts.shape
     shifts = after.shifts - before.shifts
-    change_std = np.sqrt((moves - 1) / moves * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
+    change_std = np.sqrt((clusters - 1) / clusters * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
     limit = float(-scipy.special.ndtri(FALSE_ALARM / (2 * count)))
     return BeforeAfter(
         added=tuple(placed for placed in after.effects if placed not in before.effects),
@@ -301,7 +301,7 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
         before=before.errors,
         after=after.errors,
         gains=tuple(
-            GainChange(
+            GainShift(
                 before=float(before.gains[motor]),
                 before_std=float(before.gains_std[motor]),
                 after=float(after.gains[motor]),

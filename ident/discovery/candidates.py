@@ -18,7 +18,7 @@ from ident.data.dataset import Dataset
 from ident.discovery.noise_floor import noise_floors
 from ident.effects.effect import Effect, at_joints, effect_torque, is_placeable
 from ident.effects.signals import Abscissa, Signals, fitted_signals, session_began_s
-from ident.equations.linearisation import Folds, cut, linearise
+from ident.equations.linearisation import Folds, cut_into_folds, linearise
 from ident.equations.rows import Observation, decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
@@ -121,8 +121,8 @@ class Trial:
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
     held_out: FloatArray  #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, n)
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
-    scatter: FloatArray  #: Φ⊥ᵀe of each move with the candidate fitted, which is its noise alone, shape (moves, p)
-    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each move, shape (moves, p, p)
+    scatter: FloatArray  #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
 
 
 def prepare_search(
@@ -139,7 +139,7 @@ def prepare_search(
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    pieces, whole = _pieces(observation)
+    pieces, move_of = _pieces(observation)
     began_s = session_began_s(datasets)
     runs = tuple(fitted_signals(model, data, observation, estimate, began_s) for data in datasets)
     problem = linearise(
@@ -162,7 +162,7 @@ def prepare_search(
         observation=observation,
         runs=runs,
         rows=tuple(rows),
-        folds=cut(problem, whole=whole),
+        folds=cut_into_folds(problem, move_of=move_of),
         floors_a=tuple(None if floor is None else floor.noise_a for floor in floors),
         cache={} if cache is None else cache,
     )
@@ -204,12 +204,12 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     """
     made = _products(folds, columns)
     motor_jacobian, fold_jacobian = made.part_jacobian.sum(axis=0), made.part_jacobian.sum(axis=1)
-    motor_gram, gram_sum = made.part_gram.sum(axis=0), made.move_gram.sum(axis=0)
+    motor_gram, gram_sum = made.part_gram.sum(axis=0), made.cluster_gram.sum(axis=0)
     whole_jacobian = motor_jacobian.sum(axis=0)
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each move and of each motor.
-    along = linalg.cho_solve(folds.whole, whole_jacobian)
-    move_pushed, motor_pushed = folds.move_hessian @ along, folds.part_hessian.sum(axis=0) @ along
-    move_score = made.move_score - folds.move_score @ along
+    along = linalg.cho_solve(folds.full_factor, whole_jacobian)
+    all_pushed, motor_pushed = folds.cluster_hessian @ along, folds.part_hessian.sum(axis=0) @ along
+    cluster_score = made.cluster_score - folds.cluster_score @ along
     motor_score = made.part_score.sum(axis=0) - folds.motor_score @ along
     # The same with J and Φ of the other folds, for each fold k: Φ − J w_k.
     coupling = whole_jacobian - fold_jacobian
@@ -221,16 +221,16 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
     trials: list[Trial | None] = []
     for chosen in candidates:
         w, step = along[:, chosen], steps[:, :, chosen]
-        move_gram = _projected_gram(
-            made.move_gram[:, chosen, chosen], made.move_jacobian[:, :, chosen], w[None], move_pushed[:, :, chosen]
+        cluster_gram = _projected_gram(
+            made.cluster_gram[:, chosen, chosen], made.cluster_jacobian[:, :, chosen], w[None], all_pushed[:, :, chosen]
         )
-        gram = move_gram.sum(axis=0)
+        gram = cluster_gram.sum(axis=0)
         root = np.sqrt(np.maximum(np.diag(gram), 0.0))
         left = np.all(np.diag(gram) > REDUNDANT_SHARE * squares[chosen])
         if not left or np.linalg.cond(gram / np.outer(root, root)) > 1e10:
             trials.append(None)
             continue
-        score = move_score[:, chosen].sum(axis=0)
+        score = cluster_score[:, chosen].sum(axis=0)
         coefficients = np.linalg.solve(gram, score)
         own = motor_gram[:, chosen, chosen], motor_jacobian[:, :, chosen], w[None], motor_pushed[:, :, chosen]
         explained = np.einsum("p,npq,q->n", coefficients, _projected_gram(*own), coefficients)
@@ -252,8 +252,8 @@ def score_candidates(folds: Folds, columns: FloatArray, candidates: Sequence[sli
                 training_fall=np.sum(drive[:, chosen] * fitted, axis=1),
                 held_out=before - 2.0 * np.einsum("knp,kp->kn", shown[:, :, chosen], fitted) + rose,
                 score=score,
-                scatter=move_score[:, chosen] - move_gram @ coefficients,
-                gram=move_gram,
+                scatter=cluster_score[:, chosen] - cluster_gram @ coefficients,
+                gram=cluster_gram,
             )
         )
     return tuple(trials)
@@ -269,9 +269,9 @@ def _projected_gram(gram: FloatArray, jacobian: FloatArray, along: FloatArray, p
 class _Products:
     """Products of candidate columns Φ (many candidates side by side) with the problem, shape (…, q) for q columns."""
 
-    move_jacobian: FloatArray  #: JᵀΦ of each move
-    move_gram: FloatArray  #: ΦᵀΦ of each move
-    move_score: FloatArray  #: Φᵀe of each move
+    cluster_jacobian: FloatArray  #: JᵀΦ of each cluster
+    cluster_gram: FloatArray  #: ΦᵀΦ of each cluster
+    cluster_score: FloatArray  #: Φᵀe of each cluster
     part_jacobian: FloatArray  #: JᵀΦ of each fold and motor
     part_gram: FloatArray  #: ΦᵀΦ of each fold and motor
     part_score: FloatArray  #: Φᵀe of each fold and motor
@@ -281,8 +281,8 @@ class _Products:
 def _products(folds: Folds, columns: FloatArray) -> _Products:
     problem, n = folds.problem, len(folds.problem.gamma)
     f, q = problem.jacobian.shape[1], columns.shape[1]
-    moves, count = problem.moves, folds.count
-    shapes = [(*parts, *shape) for parts in ((moves,), (count, n)) for shape in ((f, q), (q, q), (q,))]
+    clusters, count = problem.cluster_count, folds.count
+    shapes = [(*parts, *shape) for parts in ((clusters,), (count, n)) for shape in ((f, q), (q, q), (q,))]
     made = _Products(*map(np.zeros, (*shapes, shapes[-1])))
     felt = [bool(np.any(columns[problem.motor == motor])) for motor in range(n)]
     for rows, k, m, i in folds.blocks:
@@ -290,9 +290,9 @@ def _products(folds: Folds, columns: FloatArray) -> _Products:
             continue
         inside = columns[rows]
         jacobian, gram, score = problem.jacobian[rows].T @ inside, inside.T @ inside, problem.residual[rows] @ inside
-        made.move_jacobian[m] += jacobian
-        made.move_gram[m] += gram
-        made.move_score[m] += score
+        made.cluster_jacobian[m] += jacobian
+        made.cluster_gram[m] += gram
+        made.cluster_score[m] += score
         made.part_jacobian[k, i] += jacobian
         made.part_gram[k, i] += gram
         made.part_score[k, i] += score

@@ -16,15 +16,15 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, prepare_search
 from ident.discovery.search import (
-    MIN_MOVES,
+    MIN_MOVES_FOR_STRUCTURE,
+    EffectKey,
     Finding,
     Gates,
-    Place,
     choose_effect,
     detection_limits_nm,
+    effect_key,
     find_structure,
     is_inadequate,
-    place_of,
     rank_effects,
     rank_families,
     refine_setting,
@@ -51,7 +51,7 @@ class Evidence:
         conditioning: the filters.
         datasets: all runs, held-out runs last.
         held_out: number of held-out runs.
-        bare: rows of all runs, without effects.
+        rows_without_effects: rows of all runs, without effects.
         training: rows of the fit, with the columns of the effects.
         holdout: rows of the held-out runs, None without any.
         effects: in the model, in the order of their columns.
@@ -62,7 +62,7 @@ class Evidence:
     conditioning: Conditioning
     datasets: tuple[Dataset, ...]
     held_out: int
-    bare: Observation
+    rows_without_effects: Observation
     training: Observation
     holdout: Observation | None
     effects: tuple[PlacedEffect, ...]
@@ -146,13 +146,13 @@ def find_effects(
     steps: list[Step] = []
     current = start
     cache: ColumnCache = {}
-    refused: dict[Place, str] = {}
+    refused: dict[EffectKey, str] = {}
     for _ in range(MAX_EFFECTS):
         known = len(current.effects)
         progress("searching for a missing effect" + (f" beside the {known} found" if known else ""))
         search_problem = prepare_search(current.model, start.trained, current.training, current.estimate, cache)
         findings = rank_effects(search_problem, rng, gates, families)
-        taken = frozenset((*refused, *(place_of(placed.effect, placed.axis) for placed in current.effects)))
+        taken = frozenset((*refused, *(effect_key(placed.effect, placed.axis) for placed in current.effects)))
         accepted = choose_effect(findings, taken)
         axes = range(search_problem.axes) if accepted is None else (accepted.axis,)
         if accepted is None:
@@ -164,19 +164,19 @@ def find_effects(
         limits_nm = detection_limits_nm(search_problem, gates)
         if accepted is None:
             moves, reasons = search_problem.folds.moves, [*refused.values()]
-            if moves < MIN_MOVES:
-                reasons.append(f"{moves} moves are too few (of {MIN_MOVES}) to test for structure without a name")
+            if moves < MIN_MOVES_FOR_STRUCTURE:
+                reasons.append(f"structure without a name needs {MIN_MOVES_FOR_STRUCTURE} moves, found {moves}")
             steps.append(Step(findings, structures, limits_nm, None, current, "; ".join(reasons)))
             break
-        place = place_of(accepted.effect, accepted.axis)
+        key = effect_key(accepted.effect, accepted.axis)
         accepted = replace(accepted, effect=refine_setting(search_problem, accepted.effect, accepted.axis, families))
         progress(f"adding {accepted.effect.name} on axis {accepted.axis + 1}")
         try:
             joined = with_effects(current, (*current.effects, PlacedEffect(accepted.effect, accepted.axis)))
         except UNFITTED as error:
             # The linearised problem distinguished the effect from the model, the whole one does not.
-            refused[place] = f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}"
-            progress(refused[place])
+            refused[key] = f"{accepted.effect.name} on axis {accepted.axis + 1} cannot be added: {error}"
+            progress(refused[key])
             continue
         current = _without_redundant(joined, rng, gates)
         steps.append(Step(findings, structures, limits_nm, accepted, current))
@@ -190,9 +190,9 @@ def gather(found: Identification, runs: Iterable[Run], holdout: Iterable[Run] = 
     model, conditioning = found.model, found.conditioning
     trained = tuple(differentiate(run, model.drive_train, conditioning) for run in runs)
     unseen = tuple(differentiate(run, model.drive_train, conditioning) for run in holdout)
-    bare = observe(model, (*trained, *unseen), conditioning, found.system)
-    training, rest = _split_holdout(bare, len(unseen))
-    return Evidence(model, conditioning, (*trained, *unseen), len(unseen), bare, training, rest, (), found.estimate)
+    rows = observe(model, (*trained, *unseen), conditioning, found.system)
+    training, rest = _split_holdout(rows, len(unseen))
+    return Evidence(model, conditioning, (*trained, *unseen), len(unseen), rows, training, rest, (), found.estimate)
 
 
 def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidence:
@@ -208,11 +208,11 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
         runs = [
             fitted_signals(before.model, data, current.training, current.estimate, began_s) for data in before.datasets
         ]
-        whole = before.bare
+        rows = before.rows_without_effects
         for placed in effects:
-            torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, whole.conditioning, before.model)
-            whole = whole.extended(placed.columns, torque)
-        training, rest = _split_holdout(whole, before.held_out)
+            torque = effect_torque(placed.effect, placed.axis, runs, before.datasets, rows.conditioning, before.model)
+            rows = rows.extended(placed.columns, torque)
+        training, rest = _split_holdout(rows, before.held_out)
         estimate = estimate_with(before.estimate.method, training.system(), fixed)
         current = replace(before, training=training, holdout=rest, effects=effects, estimate=estimate)
     return current
@@ -220,16 +220,16 @@ def with_effects(before: Evidence, effects: tuple[PlacedEffect, ...]) -> Evidenc
 
 def without_effects(evidence: Evidence, estimate: Estimate) -> Evidence:
     """Return the same data under the declared model alone, with its estimate by ``ml``."""
-    training, rest = _split_holdout(evidence.bare, evidence.held_out)
+    training, rest = _split_holdout(evidence.rows_without_effects, evidence.held_out)
     return replace(evidence, training=training, holdout=rest, effects=(), estimate=estimate)
 
 
-def _split_holdout(whole: Observation, held_out: int) -> tuple[Observation, Observation | None]:
+def _split_holdout(observation: Observation, held_out: int) -> tuple[Observation, Observation | None]:
     """Split rows of all runs into those of the fit and those of the last, held-out runs."""
     if not held_out:
-        return whole, None
-    rows = whole.run >= len(whole.runs) - held_out
-    return whole.only(~rows), whole.only(rows)
+        return observation, None
+    rows = observation.run >= len(observation.runs) - held_out
+    return observation.only(~rows), observation.only(rows)
 
 
 def _without_redundant(current: Evidence, rng: np.random.Generator, gates: Gates) -> Evidence:

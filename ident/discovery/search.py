@@ -31,7 +31,7 @@ from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import FOLDED, INTERVALS, Periodic, Smooth
 
-Place = tuple[str, int, tuple[int, ...]]
+EffectKey = tuple[str, int, tuple[int, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
 CLEARLY = 0.95
@@ -119,13 +119,13 @@ def rank_families(
     )
 
 
-def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozenset()) -> Finding | None:
+def choose_effect(findings: Sequence[Finding], taken: frozenset[EffectKey] = frozenset()) -> Finding | None:
     """Choose the best that passed; of those as good on the same axis, the one with the fewest parameters.
 
     So a hinge that starts outside the joint's range is reported as a spring. Places that are taken, in the model or
     refused, are not chosen again.
     """
-    passed = [finding for finding in findings if finding.passed and place_of(finding.effect, finding.axis) not in taken]
+    passed = [found for found in findings if found.passed and effect_key(found.effect, found.axis) not in taken]
     if not passed:
         return None
     best = passed[0]
@@ -137,7 +137,7 @@ def choose_effect(findings: Sequence[Finding], taken: frozenset[Place] = frozens
     return min(alike, key=lambda finding: len(finding.effect.coefficients) + len(finding.effect.settings))
 
 
-def place_of(effect: Effect, axis: int) -> Place:
+def effect_key(effect: Effect, axis: int) -> EffectKey:
     """Identify an effect on an axis by its family and integer settings: two orders of a ripple are two effects."""
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
@@ -230,8 +230,8 @@ def _judge(
 
 def _max_t(trials: tuple[Trial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
     """Probability of each candidate's Wald statistic under random signs of the moves, for the largest of all."""
-    moves = trials[0].scatter.shape[0]
-    signs = rng.choice((-1.0, 1.0), size=(draws, moves))
+    clusters = trials[0].scatter.shape[0]
+    signs = rng.choice((-1.0, 1.0), size=(draws, clusters))
     observed, largest = np.empty(len(trials)), dict[int, FloatArray]()
     for index, trial in enumerate(trials):
         # The candidate is in the fit here: else its own torque would count as noise, and the strongest would hide best.
@@ -313,7 +313,7 @@ VARIABLES = (
 )
 """Each variable, and whether its function is tried as it is (0) or turning with the direction of motion (1)."""
 MUCH_MORE = 0.15  #: Share by which a term must explain more than a named effect to call the name wrong
-MIN_MOVES = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
+MIN_MOVES_FOR_STRUCTURE = 5 * (INTERVALS + 1)  #: Five moves for each coefficient of a term
 TAIL = 0.005
 """Share of the samples cut off at either end of a variable's range, where a spline would rest on a handful of them."""
 
@@ -322,7 +322,7 @@ def find_structure(
     search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
     """Find variables that the residual of some axes depends on, the best on held-out moves first."""
-    if search_problem.folds.moves < MIN_MOVES:
+    if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
         return ()  # a term of many coefficients would fit the few moves
     tested = [
         found for axis in axes for found in search_problem.test(_families(search_problem, axis), axis, at_rows=True)

@@ -3,7 +3,7 @@
 The residual of motor i is e_i = (v_i − γ_i (T τ)_i)/σ_i with the unknowns (g_1 … g_n, χ, χ_uL); see
 estimators/maximum_likelihood.py. Its derivative to a gain is built from the *predicted* torque, not from the measured
 current, so that the noise does not enter it. `motor_jacobian` is that derivative. Error bars leave out one move at a
-time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut`).
+time (`left_out_shifts`); the search for effects leaves out folds of moves (`cut_into_folds`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ident.equations.rows import Observation
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
-MIN_MOVES = 8  #: With fewer, leaving one out in turn shows little of the scatter, and folds of moves hold one each
+MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter, and each fold holds one
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Linearisation:
     residual: FloatArray  #: whitened, shape (rows,)
     current: FloatArray  #: measured, whitened: what the residual is relative to, shape (rows,)
     motor: IntArray  #: of each row, shape (rows,)
-    cluster: IntArray  #: move of each row, numbered 0 … without gaps, shape (rows,)
+    cluster: IntArray  #: number of each row's cluster, 0 … without gaps, shape (rows,)
     source: IntArray  #: index of each row among the observation's decimated rows, shape (rows,)
     gamma: FloatArray  #: 1/g, shape (n,)
     noise: FloatArray  #: σ_i [A], shape (n,)
@@ -39,7 +39,7 @@ class Linearisation:
     scale: FloatArray
 
     @property
-    def moves(self) -> int:
+    def cluster_count(self) -> int:
         """Number of clusters."""
         return int(self.cluster.max()) + 1
 
@@ -151,22 +151,22 @@ def jackknife_covariance(
         shape (n + p, n + p).
 
     Raises:
-        TooFewMoves: fewer than MIN_MOVES.
+        TooFewMoves: fewer than MIN_MOVES_TO_LEAVE_OUT.
     """
-    moves, count, size = len(system.moves), len(gains), len(gains) + len(parameters)
-    if moves < MIN_MOVES:
-        raise TooFewMoves(moves, MIN_MOVES)
+    clusters, count, size = len(system.clusters), len(gains), len(gains) + len(parameters)
+    if clusters < MIN_MOVES_TO_LEAVE_OUT:
+        raise TooFewMoves(clusters, MIN_MOVES_TO_LEAVE_OUT)
     free = slice(count if gains_fixed else 0, size)
-    grams, scores = np.zeros((moves, size, size)), np.zeros((moves, size))
-    for index, move in enumerate(system.moves):
-        for motor, rows in enumerate(move):
+    grams, scores = np.zeros((clusters, size, size)), np.zeros((clusters, size))
+    for index, cluster in enumerate(system.clusters):
+        for motor, rows in enumerate(cluster):
             jacobian, residual = motor_jacobian(rows, motor, gains, parameters, noise)
             grams[index] += jacobian.T @ jacobian
             scores[index] += jacobian.T @ residual
     shifts = left_out_shifts(grams[:, free, free], scores[:, free])
     centred = shifts - shifts.mean(axis=0)
     covariance = np.zeros((size, size))
-    covariance[free, free] = (moves - 1) / moves * (centred.T @ centred)
+    covariance[free, free] = (clusters - 1) / clusters * (centred.T @ centred)
     return covariance
 
 
@@ -174,17 +174,17 @@ def jackknife_covariance(
 class Folds:
     """A linearised problem cut into folds of whole moves, with everything that cross-validation reuses.
 
-    A block holds the rows of one motor in one move; what is wanted of a fold, a move or a motor is a sum over blocks.
+    A block holds the rows of one motor in one cluster; folds, clusters and motors are sums over blocks.
     """
 
-    problem: Linearisation  #: the linearisation, its rows sorted by fold, move and motor
+    problem: Linearisation  #: the linearisation, its rows sorted by fold, cluster and motor
     moves: int  #: number of whole moves distributed over the folds; a cluster may be only a piece of one
-    blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, move and motor of each block
-    whole: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
+    blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
+    full_factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
     factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
-    move_hessian: FloatArray  #: JᵀJ of each move, shape (moves, f, f)
-    move_score: FloatArray  #: Jᵀe of each move, shape (moves, f)
+    cluster_hessian: FloatArray  #: JᵀJ of each cluster, shape (clusters, f, f)
+    cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
     part_hessian: FloatArray  #: JᵀJ of each fold and motor, shape (folds, n, f, f)
     part_score: FloatArray  #: Jᵀr of each fold and motor, shape (folds, n, f)
     motor_score: FloatArray  #: Jᵀe of each motor, shape (n, f)
@@ -203,23 +203,23 @@ class Folds:
         return total
 
 
-def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -> Folds:
+def cut_into_folds(problem: Linearisation, count: int = 8, move_of: IntArray | None = None) -> Folds:
     """Deal the moves out to folds in turn, so that every fold sees every run; a move is never parted.
 
     Args:
         problem: around an estimate.
         count: of folds; fewer where there are fewer moves.
-        whole: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
+        move_of: the move that each cluster is a piece of, shape (clusters,); the clusters themselves when None.
 
     Raises:
         TooFewMoves: to leave some out.
     """
-    whole = np.arange(problem.moves) if whole is None else np.unique(whole, return_inverse=True)[1]
-    moves = int(whole.max()) + 1
-    if moves < MIN_MOVES:
-        raise TooFewMoves(moves, MIN_MOVES)
+    move_of = np.arange(problem.cluster_count) if move_of is None else np.unique(move_of, return_inverse=True)[1]
+    moves = int(move_of.max()) + 1
+    if moves < MIN_MOVES_TO_LEAVE_OUT:
+        raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
     count = min(count, moves)
-    fold_of = whole % count
+    fold_of = move_of % count
     motors, width = len(problem.gamma), problem.jacobian.shape[1]
     order = np.lexsort((problem.motor, problem.cluster, fold_of[problem.cluster]))
     of_rows = ("jacobian", "residual", "current", "motor", "cluster", "source")
@@ -227,16 +227,16 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
     change = (np.diff(problem.cluster, prepend=-1) != 0) | (np.diff(problem.motor, prepend=-1) != 0)
     starts = np.flatnonzero(change)
     rows_of = (slice(int(a), int(b)) for a, b in pairwise((*starts, len(problem.motor))))
-    move, motor = problem.cluster[starts], problem.motor[starts]
-    blocks = tuple(zip(rows_of, fold_of[move].tolist(), move.tolist(), motor.tolist(), strict=True))
-    move_hessian, move_score = np.zeros((problem.moves, width, width)), np.zeros((problem.moves, width))
-    part_hessian = np.zeros((count, motors, width, width))
-    motor_score = np.zeros((motors, width))
+    cluster, motor = problem.cluster[starts], problem.motor[starts]
+    blocks = tuple(zip(rows_of, fold_of[cluster].tolist(), cluster.tolist(), motor.tolist(), strict=True))
+    cluster_hessian = np.zeros((problem.cluster_count, width, width))
+    cluster_score = np.zeros((problem.cluster_count, width))
+    part_hessian, motor_score = np.zeros((count, motors, width, width)), np.zeros((motors, width))
     for rows, k, m, i in blocks:
         inside = problem.jacobian[rows]
         gram, score = inside.T @ inside, inside.T @ problem.residual[rows]
-        move_hessian[m] += gram
-        move_score[m] += score
+        cluster_hessian[m] += gram
+        cluster_score[m] += score
         part_hessian[k, i] += gram
         motor_score[i] += score
     by_fold = part_hessian.sum(axis=1)
@@ -249,7 +249,7 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
         # A direction that only this fold sees must not explode: it stays where the whole data put it.
         rest[np.diag_indices_from(rest)] += 1e-10 * np.diag(hessian)
         factors.append(linalg.cho_factor(rest, lower=True))
-        scores.append(score - move_score[fold_of == k].sum(axis=0))
+        scores.append(score - cluster_score[fold_of == k].sum(axis=0))
     steps = [linalg.cho_solve(factor, part) for factor, part in zip(factors, scores, strict=True)]
     residual = np.empty_like(problem.residual)
     part_score = np.zeros((count, motors, width))
@@ -261,11 +261,11 @@ def cut(problem: Linearisation, count: int = 8, whole: IntArray | None = None) -
         problem=problem,
         moves=moves,
         blocks=blocks,
-        whole=linalg.cho_factor(hessian, lower=True),
+        full_factor=linalg.cho_factor(hessian, lower=True),
         factors=tuple(factors),
         scores=np.stack(scores),
-        move_hessian=move_hessian,
-        move_score=move_score,
+        cluster_hessian=cluster_hessian,
+        cluster_score=cluster_score,
         part_hessian=part_hessian,
         part_score=part_score,
         motor_score=motor_score,

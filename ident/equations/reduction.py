@@ -114,14 +114,14 @@ class Reduction:
                 spread = _widened(factors[joint], plan.joint[joint], count + standard)
                 parts.append(np.concatenate((spread[:, :count], -chosen(spread[:, count:], index - 1)), axis=1))
             joints.append(triangle(parts, count + width))
-        moves = tuple(
+        clusters = tuple(
             tuple(
                 np.concatenate((factor[:, :1], chosen(_widened(factor[:, 1:], held, standard), c.mounting)), 1)
                 for factor, held in zip(c.factors, plan.motor, strict=True)
             )
             for c in self.clusters
         )
-        motors = tuple(triangle((move[motor] for move in moves), 1 + width) for motor in range(count))
+        motors = tuple(triangle((cluster[motor] for cluster in clusters), 1 + width) for motor in range(count))
         named = zip(base.names, base.independent, strict=True)
         return System(
             drive_train=self.model.drive_train,
@@ -132,7 +132,7 @@ class Reduction:
             runs=self.runs,
             joints=Triangles(tuple(joints), self.joint_rows),
             motors=Triangles(motors, self.motor_rows),
-            moves=moves,
+            clusters=clusters,
         )
 
 
@@ -169,14 +169,14 @@ def reduce_runs(
     """
     count, plan = model.robot.joint_count, layout(model)
     width = tuple(len(columns) for columns in plan.joint)
-    met = list(payloads)
-    joints = [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1)]
+    seen_payloads = list(payloads)
+    joints = [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1)]
     joint_rows, motor_rows = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     names: list[str] = []
     clusters: list[Cluster] = []
     for run in runs:
-        mounting = place_of(run.payload, met, run.name)
-        joints += [[np.zeros((c, c)) for c in width] for _ in range(len(met) + 1 - len(joints))]
+        mounting = mounting_index(run.payload, seen_payloads, run.name)
+        joints += [[np.zeros((c, c)) for c in width] for _ in range(len(seen_payloads) + 1 - len(joints))]
         data = differentiate(run, model.drive_train, conditioning)
         moves: dict[int, list[list[FloatArray]]] = {}
         for rows in rows_of(model, data, conditioning, chunk_rows):
@@ -200,7 +200,7 @@ def reduce_runs(
     return Reduction(
         model=model,
         conditioning=conditioning,
-        payloads=tuple(met),
+        payloads=tuple(seen_payloads),
         runs=tuple(names),
         joints=tuple(tuple(factors) for factors in joints),
         joint_rows=joint_rows,
@@ -209,7 +209,7 @@ def reduce_runs(
     )
 
 
-def place_of(payload: Payload | None, payloads: list[Payload], run: str) -> int:
+def mounting_index(payload: Payload | None, payloads: list[Payload], run: str) -> int:
     """Index of a payload among those met so far, to which a new one is added; −1 without load.
 
     Raises:
@@ -233,16 +233,16 @@ def place_of(payload: Payload | None, payloads: list[Payload], run: str) -> int:
 def _motor_rows(model: Model, rows: Rows, plan: Layout) -> dict[int, list[FloatArray]]:
     """Rows [v_i | (T W_st)_i] of each motor, parted by move."""
     to_motor = model.drive_train.to_motor
-    whole = []
+    by_motor = []
     for motor, held in enumerate(plan.motor):
         joints = np.flatnonzero(to_motor[motor])
         mixed = sum(to_motor[motor, joint] * rows.standard[joint][held] for joint in joints)
-        whole.append(np.concatenate((rows.current[motor][None], np.asarray(mixed))))
+        by_motor.append(np.concatenate((rows.current[motor][None], np.asarray(mixed))))
     parts: dict[int, list[FloatArray]] = {}
     for move in np.unique(rows.move):
         here = rows.motor_use & (rows.move == move)
         if here.any():
-            parts[int(move)] = [columns[:, used].T for columns, used in zip(whole, here, strict=True)]
+            parts[int(move)] = [columns[:, used].T for columns, used in zip(by_motor, here, strict=True)]
     return parts
 
 

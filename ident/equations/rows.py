@@ -102,9 +102,9 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
     time_s, move = data.time_s[centres] - data.time_s[0], data.move[centres]
     first, support = 0, model.support
     for part in chunks(filter_, len(data.time_s), chunk_rows):
-        whole = model.regressor(data.motion(part))
-        standard = np.zeros((*support.shape, filter_.rows(whole.shape[2])))
-        standard[support] = filter_(whole[support])
+        regressor = model.regressor(data.motion(part))
+        standard = np.zeros((*support.shape, filter_.rows(regressor.shape[2])))
+        standard[support] = filter_(regressor[support])
         piece = slice(first, first + standard.shape[2])
         first = piece.stop
         yield Rows(
@@ -117,7 +117,7 @@ def rows_of(model: Model, data: Dataset, conditioning: Conditioning, chunk_rows:
         )
 
 
-OF_ROWS = ("current", "robot", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
+OF_ROWS = ("current", "regressor", "flange", "use", "motor_use", "time_s", "run", "move", "mounting")
 """Fields of an observation that have a row last."""
 
 
@@ -126,7 +126,7 @@ class Observation(Equations):
     """Rows of several runs, before any scaling; arrays are joint-first and time-last."""
 
     current: FloatArray  #: decimated current references of the motors [A], shape (n, r)
-    robot: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
+    regressor: FloatArray  #: W, torque at each joint per unit of each column, shape (n, b, r)
     flange: FloatArray  #: the last link's ten columns; a payload's are these where it was mounted, shape (n, 10, r)
     use: BoolArray  #: rows of each joint that count: moving and valid, shape (n, r)
     motor_use: BoolArray  #: rows of each motor that count: all joints it turns with, and itself, moving, shape (n, r)
@@ -138,7 +138,7 @@ class Observation(Equations):
 
     def linear(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
         """[W | W_uL] of some rows, shape (n, p, rows)."""
-        parts = [self.robot[:, :, rows]]
+        parts = [self.regressor[:, :, rows]]
         for index, indices in enumerate(self.payload_columns):
             parts.append(self.flange[:, list(indices)][:, :, rows] * (self.mounting[rows] == index))
         return np.concatenate(parts, axis=1)
@@ -170,7 +170,7 @@ class Observation(Equations):
 
     def extended(self, columns: tuple[Column, ...], torque: FloatArray) -> Observation:
         """Add columns to W, torque of shape (n, extra, r) [Nm per unit]."""
-        return replace(self, columns=self.columns + columns, robot=np.concatenate((self.robot, torque), axis=1))
+        return replace(self, columns=self.columns + columns, regressor=np.concatenate((self.regressor, torque), axis=1))
 
     def system(self) -> System:
         """Reduce the rows to triangles."""
@@ -181,14 +181,14 @@ class Observation(Equations):
             current = direction[:, joint, None] * self.current[:, used]
             rows = np.concatenate((current, -linear[joint][:, used], -known[joint, used][None]))
             joints.append(triangle((rows.T,), len(rows)))
-        motors, moves = [], []
-        whole = self.motor_columns()
-        for columns, used in zip(whole, self.motor_use, strict=True):
+        motors, clusters = [], []
+        motor_columns = self.motor_columns()
+        for columns, used in zip(motor_columns, self.motor_use, strict=True):
             motors.append(triangle((columns[:, used].T,), width + 2))
         for move in np.unique(self.move):
             here = self.motor_use & (self.move == move)
             if here.any():
-                moves.append(tuple(columns[:, used].T for columns, used in zip(whole, here, strict=True)))
+                clusters.append(tuple(columns[:, used].T for columns, used in zip(motor_columns, here, strict=True)))
         return System(
             drive_train=self.drive_train,
             base=self.base,
@@ -198,7 +198,7 @@ class Observation(Equations):
             runs=self.runs,
             joints=Triangles(tuple(joints), self.use.sum(axis=1)),
             motors=Triangles(tuple(motors), self.motor_use.sum(axis=1)),
-            moves=tuple(moves),
+            clusters=tuple(clusters),
         )
 
 
@@ -232,7 +232,7 @@ def observe(model: Model, datasets: Sequence[Dataset], conditioning: Conditionin
         drive_train=model.drive_train,
         columns=like.columns[: len(base)],
         base=like.base,
-        robot=np.concatenate([robot for _, robot, _ in parts], axis=2),
+        regressor=np.concatenate([regressor for _, regressor, _ in parts], axis=2),
         flange=np.concatenate([flange for _, _, flange in parts], axis=2),
         run=np.concatenate(run),
         move=np.concatenate(move),

@@ -149,8 +149,8 @@ class System(Equations):
     #: Triangle of each motor's rows [v_i | (T [W | W_uL])_i | (T W_kL χ_kL)_i], p + 2 columns: the equation g_i v_i =
     #: (T W χ + T W_kL χ_kL)_i holds one current alone.
     motors: Triangles
-    #: For each move (or neighbouring moves together), the rows or the triangle of each motor's rows.
-    moves: tuple[tuple[FloatArray, ...], ...]
+    #: For each cluster the rows or the triangle of each motor's rows.
+    clusters: tuple[tuple[FloatArray, ...], ...]
 
     @property
     def knows_payload(self) -> bool:
@@ -180,7 +180,7 @@ class System(Equations):
             columns=tuple(column for index, column in enumerate(self.columns) if index not in values),
             joints=folded(self.joints, self.joint_count),
             motors=folded(self.motors, 1),
-            moves=tuple(tuple(held(rows, 1) for rows in move) for move in self.moves),
+            clusters=tuple(tuple(held(rows, 1) for rows in cluster) for cluster in self.clusters),
         )
 
 

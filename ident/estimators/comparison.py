@@ -37,7 +37,7 @@ ESTIMATORS: dict[str, Callable[[System], Estimate]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class EstimatorTrial:
     """One estimator under one filter."""
 
     estimator: str  #: its name
@@ -53,10 +53,10 @@ class Trial:
 class Comparison:
     """All trials, those of the declared filters first."""
 
-    trials: tuple[Trial, ...]
+    trials: tuple[EstimatorTrial, ...]
 
     @property
-    def declared(self) -> tuple[Trial, ...]:
+    def declared(self) -> tuple[EstimatorTrial, ...]:
         """Under the declared filters."""
         return self.trials[: len(ESTIMATORS)]
 
@@ -86,7 +86,7 @@ def compare(
     Raises:
         DataUnfit: the runs cannot be used under the declared filters.
     """
-    trials: list[Trial] = []
+    trials: list[EstimatorTrial] = []
     for factor in sorted(CUTOFF_FACTORS, key=lambda factor: factor != 1.0):
         filters = replace(
             conditioning,
@@ -109,7 +109,7 @@ def compare(
                 trials.append(_failed(name, filters, error))
                 continue
             trials.append(
-                Trial(
+                EstimatorTrial(
                     estimator=name,
                     position_cutoff_hz=filters.position_cutoff_hz,
                     decimation_cutoff_hz=filters.decimation_cutoff_hz,
@@ -121,8 +121,8 @@ def compare(
     return Comparison(tuple(trials))
 
 
-def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> Trial:
-    return Trial(
+def _failed(estimator: str, filters: Conditioning, error: IdentificationError) -> EstimatorTrial:
+    return EstimatorTrial(
         estimator, filters.position_cutoff_hz, filters.decimation_cutoff_hz, None, None, None, reason=str(error)
     )
 

@@ -97,14 +97,14 @@ def identify(
     system = reduction.system(reduction.base(), reduction.payload_columns())
     require_distinct(system, gains=fixed_gains is None)
     estimate = estimate_with(method, system, fixed_gains)
-    judged = estimate
+    jackknifed = estimate
     if fixed_gains is None:
         # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and do not see that moves
         # contradict each other; ml's do, where it has an estimate.
         with suppress(IdentificationError):
-            judged = estimate if method is Method.ML else ml(system)
-        require_seen_payload(judged, system)
-    require_plausible(judged, estimate.relative_error(system), [joint.name for joint in model.robot.joints])
+            jackknifed = estimate if method is Method.ML else ml(system)
+        require_seen_payload(jackknifed, system)
+    require_plausible(jackknifed, estimate.relative_error(system), [joint.name for joint in model.robot.joints])
     rest = reduce_runs(model, each_run(holdout, system.payloads), conditioning, payloads=system.payloads)
     unseen = rest.system(system.base, system.payload_columns) if rest.runs else None
     return Identification(model, conditioning, system, unseen, estimate)

@@ -121,9 +121,9 @@ def _gauss_newton(system: System) -> tuple[FloatArray, int]:
         vector = np.concatenate(([0.0], parameters, [1.0]))
         # Relative steps of γ, so that motors of different units are alike.
         steps = zip(triangles.factors, gamma / noise, strict=True)
-        towards = linalg.block_diag(*((factor @ vector * step)[:, None] for factor, step in steps))
+        gain_columns = linalg.block_diag(*((factor @ vector * step)[:, None] for factor, step in steps))
         q, _ = np.linalg.qr(linear / np.linalg.norm(linear, axis=0))
-        projected = towards - q @ (q.T @ towards)
+        projected = gain_columns - q @ (q.T @ gain_columns)
         gram, gradient = projected.T @ projected, projected.T @ residual
         # Judged before damping: a step made small by damping alone is a failure, not an optimum.
         step = float(np.max(np.abs(np.linalg.lstsq(gram, gradient, rcond=None)[0])))

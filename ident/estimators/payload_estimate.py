@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.equations.linearisation import jackknife_covariance
-from ident.equations.reduction import Cluster, Reduction, place_of
+from ident.equations.reduction import Cluster, Reduction, mounting_index
 from ident.equations.system import System, require_distinct, solve, triangle
 from ident.errors import DataUnfit, RankDeficient
 from ident.estimators.least_squares import ls, wls
@@ -107,7 +107,7 @@ def joined(parts: Sequence[Reduction]) -> Reduction:
     joints = [list(parts[0].joints[0])]
     clusters: list[Cluster] = []
     for number, part in enumerate(parts):
-        places = [0, *(1 + place_of(payload, payloads, ", ".join(part.runs)) for payload in part.payloads)]
+        places = [0, *(1 + mounting_index(payload, payloads, ", ".join(part.runs)) for payload in part.payloads)]
         joints += [
             [np.empty((0, factor.shape[1])) for factor in joints[0]] for _ in range(1 + len(payloads) - len(joints))
         ]

@@ -314,7 +314,7 @@ UNSEEN_PERCENT = 10.0  #: Standard deviation above which the nameplate is the be
 SHARE_OF_BEST = 3.0  #: A source counts when it alone gives at most so many times the deviation of the best one
 
 
-class Source(Enum):
+class GainSource(Enum):
     """Source of information about a gain."""
 
     GRAVITY = "gravity"
@@ -354,13 +354,13 @@ class GainVerdict:
 
     axis: int  #: index from 0
     std_percent: float  #: predicted standard deviation [% of the gain]; inf where it is not identifiable
-    alone_percent: dict[Source, float]  #: standard deviation that each source would give alone [%]
+    alone_percent: dict[GainSource, float]  #: standard deviation that each source would give alone [%]
     gravity_acts: bool  #: whether gravity of any body on the last link acts on this axis
     verdict: Verdict  #: good, weak or unseen
     advice: Advice | None  #: for a gain that is not good; None where no extra moves were offered or none helps
 
     @property
-    def sources(self) -> tuple[Source, ...]:
+    def sources(self) -> tuple[GainSource, ...]:
         """Sources of information, the best first; empty for a gain that is not identifiable."""
         best = min(self.alone_percent.values())
         order = sorted(self.alone_percent.items(), key=lambda item: item[1])
@@ -370,7 +370,7 @@ class GainVerdict:
         """Describe it for a report: ``J1 is identifiable only through inertia: σ 3.1 %; add 5 s of … (σ 1.9 %)``."""
         through = " and ".join(source.value for source in self.sources)
         if not self.gravity_acts:
-            shared = Source.COUPLING in self.sources
+            shared = GainSource.COUPLING in self.sources
             through = "inertia" + (", partly through parameters shared with other axes" if shared else "")
         only = "only " if len(self.sources) == 1 or not self.gravity_acts else ""
         text = f"{axis_name} is not identifiable"
@@ -409,9 +409,9 @@ def verdicts(design: Design, runs: Runs, extras: Sequence[ExtraMoves] = ()) -> t
         blind = np.sum([design.information_of(w, payloads, axis) for w, payloads in whitened], axis=0)
         gravity, inertia, acts = own[axis]
         alone = {
-            Source.GRAVITY: gravity,
-            Source.INERTIA: inertia,
-            Source.COUPLING: float(design.std_percent(blind)[axis]),
+            GainSource.GRAVITY: gravity,
+            GainSource.INERTIA: inertia,
+            GainSource.COUPLING: float(design.std_percent(blind)[axis]),
         }
         weak = Verdict.WEAK if std <= UNSEEN_PERCENT else Verdict.UNSEEN
         verdict = Verdict.GOOD if std <= GOOD_PERCENT else weak

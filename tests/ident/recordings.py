@@ -155,8 +155,8 @@ def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArra
 
 def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
     """The same with more current on the decimated rows, shape (n, r), fitted again."""
-    training = replace(clean.bare, current=clean.bare.current + added_a)
-    return replace(clean, bare=training, training=training, estimate=ml(training.system()))
+    training = replace(clean.rows_without_effects, current=clean.rows_without_effects.current + added_a)
+    return replace(clean, rows_without_effects=training, training=training, estimate=ml(training.system()))
 
 
 def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:

@@ -142,7 +142,7 @@ def test_leading_columns_alone_move_as_all_standard_parameters_do(
     rng = np.random.default_rng(seed)
     motion = _random_motion(identified.datasets[0], rng)
     standard = rng.normal(size=len(truth.model.columns))
-    base = identified.bare.base
+    base = identified.rows_without_effects.base
     named = tuple(
         Parameter(name, float(value), 0.0, "") for name, value in zip(base.names, base.grouping @ standard, strict=True)
     )
@@ -167,7 +167,7 @@ def _random_motion(like: Dataset, rng: np.random.Generator) -> Dataset:
 def test_the_true_parameters_predict_the_recorded_current(
     identified: Evidence, truth: Truth, clean_runs: tuple[Run, ...]
 ) -> None:
-    base = identified.bare.base
+    base = identified.rows_without_effects.base
     values = (*base.grouping @ truth.parameters, *(value for name, value in PAYLOAD_TRUTH.items() if name != "m"))
     names = (*base.names, *(f"{name}:{MOUNTED.mounting}" for name in PAYLOAD_TRUTH if name != "m"))
     parameters = tuple(Parameter(name, float(value), 0.0, "") for name, value in zip(names, values, strict=True))

@@ -25,7 +25,7 @@ from ident.discovery.noise_floor import NoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import Saturation
 from ident.effects.position import Spring
-from ident.equations.linearisation import cut, linearise
+from ident.equations.linearisation import cut_into_folds, linearise
 from ident.estimators.identify import identify
 from tests.ident.recordings import CONDITIONING, GAINS, Truth, gathered
 
@@ -104,7 +104,7 @@ def test_parts_of_the_data_add_up(start: Evidence) -> None:
 def test_left_out_moves_are_predicted_worse_than_seen_ones(start: Evidence) -> None:
     estimate = start.estimate
     problem = linearise(start.training, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False)
-    folds = cut(problem)
+    folds = cut_into_folds(problem)
     seen = replace(folds, residual=folds.problem.residual)
     assert error_left_out(seen).left == pytest.approx(error_on(start.training, estimate).left)
     assert np.all(error_left_out(folds).left > error_left_out(seen).left)
@@ -141,7 +141,7 @@ def test_what_is_taken_out_again_is_reported(start: Evidence, after: Evidence) -
 
 def test_the_declared_model_is_found_again_behind_its_effects(start: Evidence, after: Evidence) -> None:
     again = without_effects(after, start.estimate)
-    assert np.array_equal(again.training.robot, start.training.robot)
+    assert np.array_equal(again.training.regressor, start.training.regressor)
     assert again.holdout is not None
     assert start.holdout is not None
     assert np.array_equal(again.holdout.current, start.holdout.current)

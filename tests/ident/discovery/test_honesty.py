@@ -17,7 +17,7 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect
 from ident.effects.electrical import Cogging
 from ident.effects.friction import Stribeck
-from ident.equations.linearisation import Folds, Linearisation, cut, linearise
+from ident.equations.linearisation import Folds, Linearisation, cut_into_folds, linearise
 from tests.ident.recordings import search_problem_of, with_current
 
 FloatArray = NDArray[np.float64]
@@ -54,12 +54,12 @@ def _changed(problem: Linearisation, folds: Folds) -> Linearisation:
 
 
 def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearisation) -> None:
-    folds = cut(problem)
+    folds = cut_into_folds(problem)
     fold = _fold_of_rows(folds)
     parts = [set(folds.problem.cluster[fold == number]) for number in range(folds.count)]
-    assert sum(map(len, parts)) == problem.moves
+    assert sum(map(len, parts)) == problem.cluster_count
     assert not any(one & other for one, other in combinations(parts, 2))
-    changed = cut(_changed(problem, folds))
+    changed = cut_into_folds(_changed(problem, folds))
     change = changed.residual - folds.residual
     assert change[fold == 0] == pytest.approx(3.0)
     assert np.max(np.abs(change[fold != 0])) > 1e-3
@@ -67,12 +67,12 @@ def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearis
 
 def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same figure of merit on a residual of the fit of all rows, and on folds that part the moves."""
-    folds = cut(problem)
-    changed = cut(_changed(problem, folds))
+    folds = cut_into_folds(problem)
+    changed = cut_into_folds(_changed(problem, folds))
     assert _shows_its_own(folds, changed) == pytest.approx(3.0)
 
     def of_all_rows(fold: Folds) -> FloatArray:
-        step = linalg.cho_solve(fold.whole, fold.problem.jacobian.T @ fold.problem.residual)
+        step = linalg.cho_solve(fold.full_factor, fold.problem.jacobian.T @ fold.problem.residual)
         return np.asarray(fold.problem.residual - fold.problem.jacobian @ step)
 
     leaking = [replace(one, residual=of_all_rows(one)) for one in (folds, changed)]
@@ -81,7 +81,7 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
     # Pieces of one move dealt to different folds: they share its noise. The move's number is what forbids it.
     pieces = 4 * problem.cluster + np.arange(len(problem.cluster)) % 4
     parted = replace(problem, cluster=pieces)
-    kept, leaked = cut(parted, whole=np.arange(4 * problem.moves) // 4), cut(parted)
+    kept, leaked = cut_into_folds(parted, move_of=np.arange(4 * problem.cluster_count) // 4), cut_into_folds(parted)
     assert max(_folds_a_move(kept)) == 1
     assert min(_folds_a_move(leaked)) == 4
 
@@ -96,7 +96,7 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
     short = replace(small, training=small.training.only(rows), datasets=small.datasets[:2])
     search_problem = search_problem_of(short)
     folds = search_problem.folds
-    assert folds.moves < folds.problem.moves  # cut into pieces, as there are few
+    assert folds.moves < folds.problem.cluster_count  # cut into pieces, as there are few
     fold = _fold_of_rows(folds)
     move = short.training.move[folds.problem.source]
     assert all(len(np.unique(fold[move == number])) == 1 for number in np.unique(move))
@@ -127,10 +127,10 @@ def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(search_proble
 def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -> None:
     """Whatever fold 0 measures, the fall on the others, which chooses, is the same."""
     rng = np.random.default_rng(7)
-    folds = cut(problem)
+    folds = cut_into_folds(problem)
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
-    changed = cut(replace(folds.problem, residual=folds.problem.residual + 5.0 * own * columns[:, 0]))
+    changed = cut_into_folds(replace(folds.problem, residual=folds.problem.residual + 5.0 * own * columns[:, 0]))
     before, after = (score_candidates(one, columns, [slice(i, i + 1) for i in range(3)]) for one in (folds, changed))
     for one, other in zip(before, after, strict=True):
         assert one is not None

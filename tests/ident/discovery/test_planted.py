@@ -273,7 +273,7 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     own = next(f for f in findings if (f.effect.name, f.axis) == (planted.family, planted.axis))
     after = with_effects(start, (PlacedEffect(own.effect, own.axis),))
     count = len(planted.expected)
-    found = after.estimate.parameters[len(after.bare.columns) :][:count]
+    found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
     assert found == pytest.approx(np.array(planted.expected), rel=0.2, abs=0.1 * max(np.abs(planted.expected)))
     assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
 
@@ -311,7 +311,7 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
 ) -> None:
     never_still = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
     whole = identify(truth.model, noisy_runs, never_still)
-    assert len(whole.system.moves) >= 4 * 11
+    assert len(whole.system.clusters) >= 4 * 11
     assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
     short = tuple(
         replace(run, time_s=run.time_s[:5000], position_rad=run.position_rad[:5000], current_a=run.current_a[:5000])
@@ -325,7 +325,7 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     """Lag-one correlation 0.67 in every current: the spread over 24 draws against the σ that each of them claims."""
     rng = np.random.default_rng(5)
     clean = small_arm.clean
-    bare, estimate = clean.bare, clean.estimate
+    bare, estimate = clean.rows_without_effects, clean.estimate
     exact = small_arm.truth.model.drive_train.to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
     gains, claimed = [], []
     for _ in range(24):

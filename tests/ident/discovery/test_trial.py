@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.discovery.candidates import Trial, score_candidates
-from ident.equations.linearisation import Linearisation, cut
+from ident.equations.linearisation import Linearisation, cut_into_folds
 
 FloatArray = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def _agree(found: Trial | None, expected: Trial) -> None:
 def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
     """Candidates of one and of several columns side by side, on all motors or on one alone."""
     rng = np.random.default_rng(seed)
-    folds = cut(_problem(rng))
+    folds = cut_into_folds(_problem(rng))
     problem = folds.problem
     columns = rng.normal(size=(len(problem.motor), sum(widths)))
     columns[:, 0] *= problem.motor == 1
@@ -99,7 +99,7 @@ def test_blocks_say_what_whole_rows_say(seed: int, widths: list[int]) -> None:
 
 def test_what_the_model_says_already_is_no_candidate() -> None:
     rng = np.random.default_rng(1)
-    folds = cut(_problem(rng))
+    folds = cut_into_folds(_problem(rng))
     j = folds.problem.jacobian
     own = rng.normal(size=len(j))
     said = j @ rng.normal(size=WIDTH)
@@ -115,7 +115,7 @@ def test_what_the_model_says_already_is_no_candidate() -> None:
 
 def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     rng = np.random.default_rng(2)
-    folds = cut(_problem(rng))
+    folds = cut_into_folds(_problem(rng))
     problem = folds.problem
     seen = rng.normal(size=(len(problem.motor), 1)) * (problem.cluster % 8 == 3)[:, None]
     (trial,) = score_candidates(folds, seen, [slice(0, 1)])
@@ -128,7 +128,7 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
 
 def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> None:
     rng = np.random.default_rng(3)
-    folds = cut(_problem(rng))
+    folds = cut_into_folds(_problem(rng))
     problem = folds.problem
     whole = rng.normal(size=len(problem.motor)) + 0.5 * problem.residual
     seen = rng.normal(size=len(problem.motor)) * (problem.cluster % 8 == 3)
@@ -140,7 +140,7 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
 
 def test_the_unit_of_a_candidate_does_not_matter() -> None:
     rng = np.random.default_rng(4)
-    folds = cut(_problem(rng))
+    folds = cut_into_folds(_problem(rng))
     columns = rng.normal(size=(len(folds.problem.motor), 2))
     (one,) = score_candidates(folds, columns, [slice(0, 2)])
     (other,) = score_candidates(folds, columns * np.array([1e5, 1e-4]), [slice(0, 2)])

@@ -41,7 +41,7 @@ def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> 
         assert one.rows.tolist() == other.rows.tolist()
         for a, b in zip(one.factors, other.factors, strict=True):
             assert_allclose(a.T @ a, b.T @ b, rtol=1e-9, atol=1e-9 * np.max(np.abs(b)) ** 2)
-    assert len(whole.moves) == len(rows.moves)
+    assert len(whole.clusters) == len(rows.clusters)
     assert ml(whole).gains_std == pytest.approx(ml(rows).gains_std, rel=1e-6)
 
 
@@ -66,7 +66,7 @@ def test_many_moves_are_joined_and_say_the_same(
 ) -> None:
     monkeypatch.setattr(reduction_module, "MAX_CLUSTERS", 20)
     joined = _system(reduce_runs(truth.model, noisy_runs, CONDITIONING))
-    assert len(joined.moves) < len(whole.moves)
+    assert len(joined.clusters) < len(whole.clusters)
     assert ml(joined).gains == pytest.approx(ml(whole).gains, rel=1e-9)
     assert ml(joined).gains_std == pytest.approx(ml(whole).gains_std, rel=0.5)
 

@@ -93,7 +93,7 @@ def test_parameters_held_where_they_were_found_change_nothing(system: System, he
     assert rest.joints.square_sum(np.concatenate((gains, left, [1.0]))) == pytest.approx(one, rel=1e-8)
     one = system.motors.square_sum(np.concatenate(([1.0], values, [1.0])))
     assert rest.motors.square_sum(np.concatenate(([1.0], left, [1.0]))) == pytest.approx(one, rel=1e-8)
-    for before, after in zip(system.moves[:3], rest.moves[:3], strict=True):
+    for before, after in zip(system.clusters[:3], rest.clusters[:3], strict=True):
         for rows, others in zip(before, after, strict=True):
             assert others @ np.concatenate(([1.0], left, [1.0])) == pytest.approx(
                 rows @ np.concatenate(([1.0], values, [1.0])), rel=1e-8, abs=1e-8

@@ -161,7 +161,7 @@ def test_reductions_are_joined_as_if_read_together(parts: tuple[Reduction, ...],
     assert (whole.base().independent, whole.payload_columns()) == (other.base.independent, other.payload_columns)
     assert wls(one).gains == pytest.approx(wls(other).gains, rel=1e-8)
     assert one.joints.rows.tolist() == other.joints.rows.tolist()
-    assert len(one.moves) == len(other.moves)
+    assert len(one.clusters) == len(other.clusters)
     other_weight = replace(parts[1], payloads=(Payload("disc", "a", {"m": 5.0}),))
     with pytest.raises(DataUnfit, match="in another run"):
         joined([parts[1], other_weight])

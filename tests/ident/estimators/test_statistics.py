@@ -35,7 +35,7 @@ def _system(matrix: FloatArray) -> System:
         runs=("run",),
         joints=Triangles(tuple(triangle((half,), 7) for half in halves), np.array([ROWS // 2] * 2)),
         motors=Triangles((), np.zeros(0, dtype=np.int64)),
-        moves=(),
+        clusters=(),
     )
 
 

@@ -19,7 +19,7 @@ def test_the_tx40_has_61(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
     observation = observe(truth.model, [data], CONDITIONING, reduction.system(reduction.base(), ()))
     assert len(observation.columns) == 61
     assert observation.columns[0].name.startswith("Izz1 + 1.0*Ia1 + 1.0*Iyy2")
-    torque = np.einsum("jcr,c->jr", observation.robot, observation.base.grouping @ truth.parameters)
+    torque = np.einsum("jcr,c->jr", observation.regressor, observation.base.grouping @ truth.parameters)
     # The currents of this run were made from the standard parameters, without noise.
     measured = observation.torque(truth.gains)
     size = np.max(np.abs(measured[:, observation.use.any(axis=0)]))

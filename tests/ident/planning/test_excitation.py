@@ -23,7 +23,7 @@ from ident.planning.excitation import (
     Expectation,
     ExpectedPayload,
     ExtraMoves,
-    Source,
+    GainSource,
     Verdict,
     effective_noise,
     recorded,
@@ -177,11 +177,11 @@ def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_throu
     excitation = _excitation(np.random.default_rng(1))
     upright = verdicts(_design(truth), [(excitation, (None, 0))])[0]
     assert not upright.gravity_acts
-    assert np.isinf(upright.alone_percent[Source.GRAVITY])
+    assert np.isinf(upright.alone_percent[GainSource.GRAVITY])
     assert "identifiable only through inertia" in upright.words("J1")
     wall = verdicts(_design(truth, gravity=(9.81, 0.0, 0.0)), [(excitation, (None, 0))])[0]
     assert wall.gravity_acts
-    assert np.isfinite(wall.alone_percent[Source.GRAVITY])
+    assert np.isfinite(wall.alone_percent[GainSource.GRAVITY])
     assert "only through inertia" not in wall.words("J1")
 
 
