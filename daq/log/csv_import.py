@@ -22,6 +22,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import ImportDescription, PositionUnit, Side, Table, load_import
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
+from daq.files import open_regular
 from daq.log.conversion import check_limits, scaling
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics
 from daq.log.writer import LogContent, LogWriter
@@ -313,7 +314,8 @@ def read_table(path: Path, table: Table) -> TableFile:
         TableUnfit: the file cannot be read, has no rows, ends early, or a line has another number of fields.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with open_regular(path) as stream:
+            text = stream.read().decode("utf-8-sig")
     except OSError as error:
         raise TableUnfit(
             str(path),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete, LogUnreadable, UsageError
+from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
@@ -130,7 +131,7 @@ def _copy(
 
 
 def _refuse_running(damaged: Path) -> None:
-    with suppress(FileNotFoundError, IsADirectoryError, PermissionError), damaged.open("rb") as stream:
+    with suppress(OSError), open_regular(damaged) as stream:  # also of a file system without locks
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -140,5 +141,3 @@ def _refuse_running(damaged: Path) -> None:
                 expected="one whose recorder has ended",
                 remedy="wait for its end, or interrupt it with Ctrl-C, which stops the axes",
             ) from error
-        except OSError:
-            return  # a file system without locks
