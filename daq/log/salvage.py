@@ -16,7 +16,7 @@ from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
 from daq.log.reader import LogReader, SampleBlock
-from daq.log.writer import LogContent, LogWriter
+from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import EventKind, Sample
 
 _HARMLESS = (
@@ -84,7 +84,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent(run, head.files, head.readback, cell.axis_names)
     # A crash loses only this new file, so no clock is needed to flush in time.
-    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0)
+    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
     with log:
         try:
             _copy(reader, chain((first,), blocks), log, len(cell.axes), progress)

@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
+from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
 
@@ -399,3 +399,19 @@ def test_a_recording_that_is_no_regular_file_is_refused(bench: Bench, what: str)
     with pytest.raises(TableUnfit, match="no regular file"):
         import_csv(bench.description, bench.data, bench.out, software="test")
     assert not bench.out.exists()
+
+
+def test_a_payload_that_is_not_the_cells_is_named_as_it_was_given(bench: Bench) -> None:
+    bench.describe(payload="brick")
+    with pytest.raises(ConfigurationInconsistent, match="'brick'") as caught:
+        import_csv(bench.description, bench.data, bench.out, software="test")
+    assert "None" not in str(caught.value)
+    assert "payload: NAME" in str(caught.value)
+
+
+def test_a_full_disk_is_not_reported_as_a_recording(bench: Bench) -> None:
+    bench.out.parent.rmdir()
+    with pytest.raises(OutputFailed) as caught:
+        import_csv(bench.description, bench.data, bench.out, software="test")
+    assert "nothing was written" in str(caught.value)
+    assert "record" not in str(caught.value)

@@ -19,7 +19,16 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogMissing, LogTruncated, LogUnreadable, UsageError
+from daq.errors import (
+    ExitCode,
+    LogCorrupt,
+    LogIncomplete,
+    LogMissing,
+    LogTruncated,
+    LogUnreadable,
+    OutputFailed,
+    UsageError,
+)
 from daq.log.conversion import load_run
 from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
@@ -299,3 +308,9 @@ def test_a_log_that_is_no_regular_file_is_refused(what: str, tmp_path: Path) -> 
         read_log(log)
     with pytest.raises(LogMissing, match="no regular file"):
         salvage(log, tmp_path / "saved.mcap")
+
+
+def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(part: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputFailed, match="nothing was written") as caught:
+        salvage(part, tmp_path / "none" / "saved.mcap")
+    assert "record again" not in str(caught.value)
