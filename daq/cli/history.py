@@ -88,7 +88,7 @@ def history_verb(
     with Ledger(declared, place, who) as ledger:
         if add is not None:
             _add(ledger, add, now)
-        lost = not verify and ledger.is_lost() and _say_lost()
+        lost = not verify and ledger.is_lost()
         all_series = watch(ledger.entries(), ledger.acknowledgements())
         if acknowledge is not None:
             _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)
@@ -116,11 +116,6 @@ def history_verb(
             say_written(console, plot, csv)
         if checked is not None:
             _require(checked)
-
-
-def _say_lost() -> bool:
-    typer.echo("The history lacks what the audit has; to make it anew: drivegain history CELL --rebuild", err=True)
-    return True
 
 
 def _verified(ledger: Ledger) -> Verification:

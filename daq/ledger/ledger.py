@@ -131,10 +131,12 @@ class Ledger(HistoryStore):
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
     def is_lost(self) -> bool:
-        """Whether the index is empty, though the audit log has calibrations or writes of this cell."""
+        """Whether the index is empty, though the audit log has calibrations or writes of this cell; with a warning."""
         audited = () if self.entries() else read(self.place.audit)
         entered = any(entered_calibration(one, self.cell.name) for one in audited)
-        return entered or bool(writes_to(self.cell, audited, everywhere=True))
+        if lost := entered or bool(writes_to(self.cell, audited, everywhere=True)):
+            _LOG.warning("the history lacks what the audit has; to make it anew: drivegain history CELL --rebuild")
+        return lost
 
     def enter_in_audit(self, at: datetime) -> None:
         """Enter in the audit log what only the history has: calibrations and found writes of an earlier version."""

@@ -169,8 +169,8 @@ def _translate_sqlite_errors(path: Path, *, write: bool = False) -> Iterator[Non
                 expected="a file in a folder that can be written, with room",
                 remedy="nothing was entered; free space or rights",
             ) from error
-        said = str(error).partition(" with text ")[0]  # without the bytes of a damaged row
-        raise _broken(path, f"{said} ({name})") from error
+        # Without the bytes of a damaged row.
+        raise _broken(path, f"{str(error).partition(' with text ')[0]} ({name})") from error
 
 
 def _broken(path: Path, found: str) -> HistoryUnreadable:
