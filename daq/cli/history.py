@@ -14,7 +14,7 @@ from rich.console import Console
 from daq.cli.apply import applier
 from daq.cli.terminal import check_replaceable, say_written
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.errors import ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError, writing
+from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError, writing
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -88,6 +88,7 @@ def history_verb(
     with Ledger(declared, place, who) as ledger:
         if add is not None:
             _add(ledger, add, now)
+        lost = not verify and ledger.is_lost()
         all_series = watch(ledger.entries(), ledger.acknowledgements())
         if acknowledge is not None:
             _acknowledge(ledger, _named(all_series, acknowledge, declared), why, since, now)
@@ -100,7 +101,7 @@ def history_verb(
         if verify and declared.controller_path is not None:
             # Where its links lead decides which writes are this cell's: another user's link could hide some.
             resolve_links(declared.controller_path)
-        checked = ledger.verify(_session_heads(declared)) if verify else None
+        checked = _verified(ledger) if verify else None
         console = Console(soft_wrap=True, highlight=False, markup=False)
         if json:
             document = describe(declared.name, entries, chosen, all_series, current)
@@ -110,11 +111,20 @@ def history_verb(
                 say_verification(checked, console)
             elif axis is not None:
                 show_axis(chosen[0], all_series, actions, console)
-            else:
+            elif not lost:
                 show(entries, all_series, actions, console)
             say_written(console, plot, csv)
         if checked is not None:
             _require(checked)
+
+
+def _verified(ledger: Ledger) -> Verification:
+    """Check audit and history; an audit that is no regular file is as broken as one that was edited."""
+    try:
+        return ledger.verify(_session_heads(ledger.cell))
+    except AuditUnusable as error:
+        remedy = "correct `history.audit` of the cell file"
+        raise DataError(error.subject, found=error.found, expected=error.expected, remedy=remedy) from error
 
 
 def _session_heads(cell: Cell) -> list[str]:

@@ -70,6 +70,7 @@ def cell_from_bundle(
         for member in (f"{DRIVES}{drive}.yaml",)
     }
     check(document, model, urdf, profiles)
+    controller = None if model.controller is None else model.controller.file
     used = (CELL, URDF, *(f"{DRIVES}{drive}.yaml" for drive in model.drives))
     return Cell(
         name=model.name,
@@ -88,7 +89,7 @@ def cell_from_bundle(
         recording_digest=digest({name: _canonical(name, files[name], names.get(name, name)) for name in used}),
         motion=model.policy.motion,
         apply=model.policy.apply,
-        history=None if file is None else model.history.place(file),
+        history=None if file is None else model.history.place(file, controller),
         recalibration=None if file is None or model.recalibration is None else model.recalibration.recalibration(file),
     )
 

@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from daq.config.yaml_file import Fault
+from daq.errors import ConfigurationInconsistent
 
 _Percent = Annotated[float, Field(ge=0)]
 
@@ -81,13 +82,16 @@ class HistorySection:
     store: str | None = None
     audit: str | None = None
 
-    def place(self, cell_file: Path) -> HistoryPlace:
-        """Resolve the file names."""
+    def place(self, cell_file: Path, controller: str | None) -> HistoryPlace:
+        """Resolve the file names; refuse a history that would replace the cell file or the controller file."""
         folder, stem = cell_file.parent, cell_file.stem
-        return HistoryPlace(
-            (folder / (self.store or f"{stem}.history.sqlite")).resolve(),
-            (folder / (self.audit or f"{stem}.audit.jsonl")).resolve(),
-        )
+        store = (folder / (self.store or f"{stem}.history.sqlite")).resolve()
+        for other in (cell_file, folder / (controller or cell_file.name)):
+            if store == other.resolve() or (store.exists() and other.exists() and store.samefile(other)):
+                where, found = f"{cell_file}: history.store", f"the same file as {other}"
+                expected, remedy = "a file of the history's own", "give it another name"
+                raise ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
+        return HistoryPlace(store, (folder / (self.audit or f"{stem}.audit.jsonl")).resolve())
 
 
 @dataclass(frozen=True, slots=True)

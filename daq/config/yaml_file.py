@@ -11,9 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import os
 import re
-import stat
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +21,7 @@ import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
 from daq.errors import ConfigurationMissing, SchemaMismatch, YamlInvalid
+from daq.files import read_regular
 
 Location = tuple[str | int, ...]
 MAX_BYTES = 4 * 2**20  #: Largest configuration [bytes]
@@ -217,25 +216,14 @@ def read_bytes(path: Path) -> bytes:
         ConfigurationMissing: the file does not exist, is not a regular file, is too large, or cannot be read.
     """
     try:
-        # Without blocking: opening a pipe waits for its writer, and a device may never end.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as stream:
-            regular = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
-            content = stream.read(MAX_BYTES + 1) if regular else b""
+        return read_regular(path, MAX_BYTES)
     except OSError as error:
         raise ConfigurationMissing(
             str(path),
             found=(error.strerror or type(error).__name__).lower(),
-            expected="a readable file",
-            remedy="check the name; it is relative to the file that names it",
+            expected=f"a readable, regular file of at most {MAX_BYTES} bytes",
+            remedy="check the name; it is relative to the file that names it, on a command line to the current folder",
         ) from error
-    if not regular or len(content) > MAX_BYTES:
-        raise ConfigurationMissing(
-            str(path),
-            found=f"more than {MAX_BYTES} bytes" if regular else "a pipe, a device or a socket",
-            expected=f"a regular file of at most {MAX_BYTES} bytes",
-            remedy="is this the right file?",
-        )
-    return content
 
 
 def read_model(document: Document, model: type[Model], folder: Path | None = None) -> Model:

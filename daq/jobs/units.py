@@ -15,6 +15,7 @@ from daq.errors import ExitCode, UsageError
 
 MARK = "# Made by `drivegain install-units`, which may replace this file."
 """First line of what is ours; a file of that name without it is not ours."""
+_SEARCHED = (("systemd", "system"), ("systemd", "user"))  #: Ends of the folders in which systemd finds units
 STOP_S = 30  #: Time for the axes to stop and the session to be saved, after SIGTERM [s]
 CRON = {"hourly": "0 * * * *", "daily": "0 3 * * *", "weekly": "0 3 * * 0", "monthly": "0 3 1 * *"}
 _NEEDS_LITTLE = """\
@@ -102,8 +103,11 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
     systemctl = "systemctl --user" if wanted.user else "systemctl"
     journal = "journalctl --user" if wanted.user else "journalctl"
     service = timer.name.removesuffix(".timer") + ".service"
+    files = shlex.join(str(folder.absolute() / name) for name in (service, timer.name))
+    link = () if folder.parts[-2:] in _SEARCHED else (f"{systemctl} link {files}",)
     return (
         f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
+        *link,
         f"{systemctl} daemon-reload",
         f"{systemctl} start {service}    # once, with an operator at the cell",
         f"{systemctl} enable --now {timer.name}",

@@ -262,7 +262,7 @@ def _no_file(path: Path, found: str) -> AuditUnusable:
         str(path),
         found=found,
         expected="the cell's audit, a regular file",
-        remedy="correct `history.audit` of the cell file, or give --audit FILE; nothing was written",
+        remedy="correct `history.audit` of the cell file, or --audit where you gave it; nothing was written",
     )
 
 

@@ -130,6 +130,14 @@ class Ledger(HistoryStore):
         unknown, new = unknown_writes(writes_to(self.cell, verdict.entries), self.audited())
         return Verification(self.place, verdict, broken, tuple(unknown), new != unknown)
 
+    def is_lost(self) -> bool:
+        """Whether the index is empty, though the audit log has calibrations or writes of this cell; with a warning."""
+        audited = () if self.entries() else read(self.place.audit)
+        entered = any(entered_calibration(one, self.cell.name) for one in audited)
+        if lost := entered or bool(writes_to(self.cell, audited, everywhere=True)):
+            _LOG.warning("the history lacks what the audit has; to make it anew: drivegain history CELL --rebuild")
+        return lost
+
     def enter_in_audit(self, at: datetime) -> None:
         """Enter in the audit log what only the history has: calibrations and found writes of an earlier version."""
         for one in self.entries():
@@ -251,6 +259,13 @@ def rebuild(cell: Cell, place: HistoryPlace, *, who: str, at: datetime, heads: C
 def audit_error(place: HistoryPlace, verdict: AuditVerdict) -> DataError:
     """Return the error for an audit log that is not what was written."""
     first = verdict.flaws[0]
+    if not place.audit.exists():
+        return DataError(
+            str(place.audit),
+            found=f"no file; {first.says}",
+            expected="the audit log with these entries",
+            remedy="restore it from a backup; without one begin both anew (`history.audit`, `history.store`)",
+        )
     more = "".join(f"\n  line {flaw.line}: {flaw.flaw.value}: {flaw.says}" for flaw in verdict.flaws)
     return DataError(
         f"{place.audit}, line {first.line}",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sqlite3
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
@@ -16,7 +17,7 @@ from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 from urllib.parse import quote
 
 from daq.errors import DaqError, DataError, HistoryUnreadable, OutputFailed
@@ -168,7 +169,8 @@ def _translate_sqlite_errors(path: Path, *, write: bool = False) -> Iterator[Non
                 expected="a file in a folder that can be written, with room",
                 remedy="nothing was entered; free space or rights",
             ) from error
-        raise _broken(path, f"{error} ({name})") from error
+        # Without the bytes of a damaged row.
+        raise _broken(path, f"{str(error).partition(' with text ')[0]} ({name})") from error
 
 
 def _broken(path: Path, found: str) -> HistoryUnreadable:
@@ -176,8 +178,8 @@ def _broken(path: Path, found: str) -> HistoryUnreadable:
         str(path),
         found=found,
         expected="the history that drivegain keeps of a cell",
-        remedy="check its rights; if it is broken keep a copy, restore the last good one from a backup, or enter "
-        "the calibrations anew in another file (`drivegain history CELL --add CALIBRATION`)",
+        remedy="check its rights; if it is broken make it anew from the audit (`drivegain history CELL --rebuild`, "
+        "which keeps a copy), or restore the last good one from a backup",
     )
 
 
@@ -290,13 +292,13 @@ class HistoryStore:
         """Return all writes to controllers, oldest first."""
         rows = self._rows("SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number")
         with _translate_sqlite_errors(self.path):
-            return tuple(Event(row[0], WriteAction(row[1]), zoned(row[2]), *row[3:]) for row in rows)
+            return tuple(Event(row[0], WriteAction(row[1]), zoned(row[2]), *map(_raw, row[3:])) for row in rows)
 
     def acknowledgements(self) -> tuple[Acknowledgement, ...]:
         """Return all acknowledgements, oldest first."""
         rows = self._rows("SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number")
         with _translate_sqlite_errors(self.path):
-            return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *row[3:]) for row in rows)
+            return tuple(Acknowledgement(row[0], zoned(row[1]), zoned(row[2]), *map(_raw, row[3:])) for row in rows)
 
     def audited(self) -> frozenset[str]:
         """Return the SHA-256 of all entries that the audit log must have."""
@@ -428,4 +430,11 @@ class HistoryStore:
 
 def _insert(connection: sqlite3.Connection, table: str, row: Mapping[str, object]) -> None:
     places = ", ".join("?" * len(row))
-    connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({places})", tuple(row.values()))
+    # SQLite refuses bytes of a file's name that are not UTF-8: they are spelled as in the audit log, \udcff.
+    values = [v.encode(errors="backslashreplace").decode() if isinstance(v, str) else v for v in row.values()]
+    connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({places})", values)
+
+
+def _raw(text: Any) -> Any:
+    """Turn bytes that `_insert` has spelled into what they were, so that paths are equal to those of the audit log."""
+    return text and re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)

@@ -25,6 +25,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, Header, Mc
 from numpy.typing import NDArray
 
 from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated
+from daq.files import open_regular
 from daq.log.message import (
     EVENTS_SCHEMA,
     EVENTS_TOPIC,
@@ -87,7 +88,7 @@ class RecordFile:
         self, records: Callable[[BinaryIO, int], Iterator[tuple[int, McapRecord]]]
     ) -> Iterator[tuple[int, McapRecord]]:
         try:
-            with self.path.open("rb") as stream:
+            with open_regular(self.path) as stream:
                 size = os.fstat(stream.fileno()).st_size
                 self._allowance = LARGEST_CHUNK + LARGEST_RATIO * size
                 yield from records(stream, size)

@@ -22,9 +22,10 @@ from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
 from daq.config.import_description import ImportDescription, PositionUnit, Side, Table, load_import
 from daq.errors import ConfigurationInconsistent, PositionImplausible, TableUnfit
+from daq.files import open_regular
 from daq.log.conversion import check_limits, scaling
 from daq.log.metadata import AxisReadback, Readback, RunInfo, RunStatistics
-from daq.log.writer import LogContent, LogWriter
+from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import Sample
 from ident.arrays import FloatArray, IntArray
 from ident.model.bodies import Payload
@@ -106,7 +107,7 @@ def import_csv(
     opened = False
     try:
         # A crash of an import loses no sample, so no clock is needed to flush in time.
-        with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0) as log:
+        with LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT) as log:
             opened = True
             time_ns = np.rint(np.arange(len(counts)) * (1e9 / rate_hz)).astype(np.int64).tolist()
             silent = (0,) * len(cell.axes)
@@ -196,9 +197,9 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
     known = ", ".join(f"{p.name} at {p.mounting}" for p in cell.payloads) or "none"
     raise ConfigurationInconsistent(
         f"import description {wanted.name!r}",
-        found=f"payload {wanted.payload!r}, mounting {wanted.mounting!r}",
+        found=f"payload {wanted.payload!r}" + (f", mounting {wanted.mounting!r}" if wanted.mounting else ""),
         expected=f"one of the cell's ({known})",
-        remedy="name payload and mounting as in the cell file",
+        remedy="`payload: NAME` and, if needed, `mounting: NAME`, as in the cell file",
     )
 
 
@@ -313,7 +314,8 @@ def read_table(path: Path, table: Table) -> TableFile:
         TableUnfit: the file cannot be read, has no rows, ends early, or a line has another number of fields.
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        with open_regular(path) as stream:
+            text = stream.read().decode("utf-8-sig")
     except OSError as error:
         raise TableUnfit(
             str(path),

@@ -11,11 +11,12 @@ from pathlib import Path
 
 from daq.config.cell_file import cell_from_bundle
 from daq.errors import LogIncomplete, LogUnreadable, UsageError
+from daq.files import open_regular
 from daq.log.container import UNFINISHED
 from daq.log.conversion import scaling
 from daq.log.metadata import RunStatistics
 from daq.log.reader import LogReader, SampleBlock
-from daq.log.writer import LogContent, LogWriter
+from daq.log.writer import NOTHING_KEPT, LogContent, LogWriter
 from drivers.stream.sample import EventKind, Sample
 
 _HARMLESS = (
@@ -83,7 +84,7 @@ def salvage(damaged: Path, out: Path, progress: Callable[[int], None] = lambda _
     run = replace(head.run, origin=f"{head.run.origin}; salvaged from {damaged.name}")
     content = LogContent(run, head.files, head.readback, cell.axis_names)
     # A crash loses only this new file, so no clock is needed to flush in time.
-    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0)
+    log = LogWriter(out, content, scale.joint_position_of, clock_ns=lambda: 0, remedy=NOTHING_KEPT)
     with log:
         try:
             _copy(reader, chain((first,), blocks), log, len(cell.axes), progress)
@@ -130,7 +131,7 @@ def _copy(
 
 
 def _refuse_running(damaged: Path) -> None:
-    with suppress(FileNotFoundError, IsADirectoryError, PermissionError), damaged.open("rb") as stream:
+    with suppress(OSError), open_regular(damaged) as stream:  # also of a file system without locks
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -140,5 +141,3 @@ def _refuse_running(damaged: Path) -> None:
                 expected="one whose recorder has ended",
                 remedy="wait for its end, or interrupt it with Ctrl-C, which stops the axes",
             ) from error
-        except OSError:
-            return  # a file system without locks

@@ -50,6 +50,7 @@ FLUSH_NS = 150_000_000
 for the cycle on the bus and the chunk that is being packed."""
 JOINT_STATE_NS = 20_000_000
 CHUNK_BYTES = 4 * 2**20  #: Never reached between two flushes; a chunk ends with one
+NOTHING_KEPT = "nothing was written; free space or rights, or choose another folder"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,7 @@ class LogWriter:
         content: LogContent,
         joint_position: Callable[[tuple[int, ...]], Sequence[float]],
         clock_ns: Callable[[], int],
+        remedy: str = "",
     ) -> None:
         """Store the arguments.
 
@@ -88,12 +90,14 @@ class LogWriter:
             content: start of the log.
             joint_position: converts motor counts to joint positions [rad], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
+            remedy: advice if the file system refuses, instead of that of a recording.
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
         self._content = content
         self._joint_position = joint_position
         self._clock_ns = clock_ns
+        self._remedy = remedy
         self._axes = len(content.readback.axes)
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
@@ -282,6 +286,7 @@ class LogWriter:
             str(self.part),
             found=(error.strerror or type(error).__name__).lower(),
             expected="a folder that can be written, with room",
-            remedy="what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
+            remedy=self._remedy
+            or "what was recorded until then stays in that file, which no fit reads (`drivegain salvage` saves "
             "it); free space and record again",
         )

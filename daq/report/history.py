@@ -102,7 +102,7 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
 def gain_table(all_series: Sequence[Series]) -> Table:
     """Each gain as it was found last, beside its baseline."""
     headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
-    table = plain_table(headings, left=(0, 5, 6))
+    table = plain_table(headings, left=(0, 5, 6), wrap=(3,))
     for series in all_series:
         if not series.points:
             table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
@@ -217,7 +217,7 @@ def _described(entry: AuditEntry) -> dict[str, Any]:
     return {"number": entry.number, "at": entry.at, "who": entry.who, "file": entry.subject}
 
 
-_WORDS = {WriteAction.APPLIED: "applied", WriteAction.ROLLED_BACK: "restored"}
+_WORDS = {WriteAction.APPLIED: "applied by", WriteAction.ROLLED_BACK: "gains restored by the rollback of"}
 """Words for an event after which a controller had the gains of a calibration."""
 
 
@@ -254,7 +254,7 @@ def describe_actions(entries: Sequence[Entry], events: Sequence[Event], digest_i
         mine = [place for place, event in enumerate(events) if event.digest == entry.digest]
         if mine:
             last = events[mine[-1]]
-            parts.append(f"{_WORDS[last.action]} by {last.who}")
+            parts.append(f"{_WORDS[last.action]} {last.who}")
             then = next((event for event in events[mine[-1] + 1 :] if event.target == last.target), None)
             if then is not None and then.action is WriteAction.ROLLED_BACK:
                 parts.append(f"rolled back by {then.who}")

@@ -177,9 +177,10 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     if not found:
         raise ConfigurationInconsistent(
             f"payloads of cell {cell.name!r}",
-            found=", ".join(declared.name for declared in cell.payloads) or "none",
-            expected="a weighed payload" if payload is None else repr(payload),
-            remedy="gains show only beside a known mass: weigh a body and declare it under `payloads`",
+            found="none" if payload is None else f"no payload {payload!r}",
+            expected=", ".join(declared.name for declared in cell.payloads) or "a weighed payload",
+            remedy="gains show only beside a known mass: give a declared name, or weigh a body and declare it under "
+            "`payloads`",
         )
     mounted = found[0]
     model = model_of(cell)

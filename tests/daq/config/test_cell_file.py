@@ -272,3 +272,13 @@ def test_a_misspelt_single_bus_is_refused_with_its_place(
 ) -> None:
     with pytest.raises(SchemaMismatch, match=message):
         load_cell(_spoil(configurations / "cells/demo.yaml", old, new))
+
+
+@pytest.mark.parametrize("store", ["demo.yaml", "../controllers/demo.yaml", "../cells/other.yaml"])
+def test_a_history_that_would_replace_another_file_is_refused(configurations: Path, store: str) -> None:
+    cell = configurations / "cells" / "demo.yaml"
+    (configurations / "cells" / "other.yaml").hardlink_to(cell)
+    with cell.open("a", encoding="utf-8") as stream:
+        stream.write(f"\nhistory: {{store: {store}}}\n")
+    with pytest.raises(ConfigurationInconsistent, match="a file of the history's own"):
+        load_cell(cell)

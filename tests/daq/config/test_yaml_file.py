@@ -130,7 +130,7 @@ def test_a_pipe_or_a_device_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     # Opened for reading as usual, the one would be waited for, and the other never end.
     for path in (tmp_path / "pipe", Path("/dev/zero")):
-        with pytest.raises(ConfigurationMissing, match="a pipe, a device or a socket"):
+        with pytest.raises(ConfigurationMissing, match="no regular file"):
             read_bytes(path)
 
 
@@ -148,6 +148,11 @@ def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationMissing, match="directory"):
         read_bytes(tmp_path)
+
+
+def test_a_missing_file_of_the_command_line_is_sought_in_the_current_folder(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationMissing, match="on a command line to the current folder"):
+        read_bytes(tmp_path / "none.yaml")
 
 
 @pytest.mark.parametrize("text", ["0x" + "f" * 9999, "0x1" + "0" * 16, "9" * 4000, "-" + "9" * 4000, "9" * 9999])

@@ -102,6 +102,9 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert main([*command, "--yes"]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert f"systemctl enable --now {NAME}.timer" in shown
+    assert f"systemctl link '{folder}/{NAME}.service' '{folder}/{NAME}.timer'".replace("'", "") in shown.replace(
+        "'", ""
+    )
     assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.service", f"{NAME}.timer"]
     assert main([*command, "--yes", "--schedule", "daily"]) == ExitCode.OK
     assert "OnCalendar=daily" in (folder / f"{NAME}.timer").read_text()

@@ -817,7 +817,7 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
     }
     done += [event("a", WriteAction.ROLLED_BACK, "dora")]
     assert describe_actions(entries, done, "a") == {
-        "a": "restored by dora, in force",
+        "a": "gains restored by the rollback of dora, in force",
         "b": "applied by ben, rolled back by dora",
         "c": "applied by cem",
     }
@@ -830,3 +830,68 @@ def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> Non
     os.mkfifo(cell.parent / "pipe")
     for path in (cell.parent / "pipe", Path("/dev/zero"), cell.parent):
         assert main(["history", str(cell), "--add", str(path)]) == 4
+
+
+@pytest.mark.parametrize("lost", ["removed", "truncated"])
+def test_a_lost_history_is_not_called_empty(
+    cell: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture, lost: str
+) -> None:
+    calibration, file = calibration_of(0), cell.parent / "calibration.yaml"
+    save_calibration(calibration, file)
+    assert main(["history", str(cell), "--add", str(file)]) == 0
+    _enter_write(cell, digest_of(calibration), _write_down(cell, digest_of(calibration)))
+    _place(cell).store.unlink()
+    if lost == "truncated":
+        _place(cell).store.touch()
+    capsys.readouterr()
+    assert main(["history", str(cell)]) == 0
+    assert "--rebuild" in caplog.text
+    assert "no calibration" not in capsys.readouterr().out
+    caplog.clear()
+    assert main(["history", str(cell), "--rebuild"]) == 0
+    assert "--rebuild" not in caplog.text
+    with HistoryStore(_place(cell).store) as store:
+        assert [event.who for event in store.events()] == ["anna"]
+
+
+def test_nothing_is_cut_off_in_80_columns(
+    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _filled(cell, 3, lambda _: FLAT)
+    assert main(["history", str(cell)]) == 0
+    shown = capsys.readouterr().out
+    assert "nameplate" in shown
+    assert "…" not in shown
+
+
+def test_an_audit_that_is_no_regular_file_is_broken(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    audit = _place(cell).audit
+    for target in (cell.parent, Path("/dev/null"), cell.parent / "pipe"):
+        if not target.exists():
+            os.mkfifo(target)
+        audit.symlink_to(target)
+        reported = _verified(cell, capsys)
+        assert "correct `history.audit` of the cell file" in reported
+        assert "--audit" not in reported
+        audit.unlink()
+
+
+def test_a_deleted_audit_is_reported_as_missing(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (digest,) = _filled(cell, 1, lambda _: FLAT)
+    _enter_write(cell, digest, _write_down(cell, digest))
+    _place(cell).audit.unlink()
+    reported = _verified(cell, capsys)
+    assert "no file" in reported
+    assert "line 1" not in reported
+
+
+def test_bytes_of_a_damaged_row_stay_out_of_the_message(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _filled(cell, 1, lambda _: FLAT)
+    with closing(sqlite3.connect(_place(cell).store)) as other:
+        other.execute("UPDATE calibration SET software = CAST(x'ff41fe41' AS TEXT)")
+        other.commit()
+    assert main(["history", str(cell)]) == 4
+    reported = " ".join(capsys.readouterr().err.split())
+    assert "--rebuild" in reported
+    assert "with text" not in reported

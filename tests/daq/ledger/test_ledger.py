@@ -257,3 +257,22 @@ def test_another_cell_of_the_same_audit_has_its_own(bench: Bench) -> None:
         append(bench.place.audit, action, at=BEGIN, who="ben", subject=bench.controller, details=more)
     bench.rebuild()
     assert bench.rows() == before
+
+
+def test_a_path_that_is_not_utf_8_is_in_the_history(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    other = "/other/ctl\udcff.yaml"
+    bench.write(0, other)
+    bench.write(1)
+    with bench.ledger() as ledger:
+        ledger.acknowledge_change("J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox \udcff")
+        assert [event.target for event in ledger.events()] == [other, bench.controller]
+        assert ledger.in_force(other) == digest_of(calibration_of(0))
+    assert bench.verify() == 0
+    before = bench.rows()
+    bench.place.store.unlink()
+    assert main(["history", str(bench.file), "--rebuild", "--axis", "J4"]) == 0
+    assert bench.rows() == before
+    assert bench.verify() == 0
+    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(bench.file.with_suffix(".csv"))]):
+        assert main(["history", str(bench.file), *arguments]) == 0
+    assert "ctl\udcff" not in capsys.readouterr().out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from math import pi
 from pathlib import Path
@@ -15,7 +16,7 @@ from hypothesis.extra.numpy import arrays
 
 from daq.cli import main
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
+from daq.errors import ConfigurationInconsistent, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
 from daq.log.csv_import import import_csv, quantise
 
@@ -385,3 +386,32 @@ def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> Non
     np.testing.assert_allclose(run.current_a, current, atol=1e-9 * np.abs(current).max())
     # NOTICE: q2 has an offset of −π/2, q3 of +π/2; the arm starts stretched up, both URDF angles near zero.
     np.testing.assert_allclose(run.position_rad[0, 1:3], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("what", ["device", "pipe"])
+def test_a_recording_that_is_no_regular_file_is_refused(bench: Bench, what: str) -> None:
+    recording = bench.data / "run.csv"
+    recording.unlink()
+    if what == "device":
+        recording.symlink_to("/dev/null")
+    else:
+        os.mkfifo(recording)
+    with pytest.raises(TableUnfit, match="no regular file"):
+        import_csv(bench.description, bench.data, bench.out, software="test")
+    assert not bench.out.exists()
+
+
+def test_a_payload_that_is_not_the_cells_is_named_as_it_was_given(bench: Bench) -> None:
+    bench.describe(payload="brick")
+    with pytest.raises(ConfigurationInconsistent, match="'brick'") as caught:
+        import_csv(bench.description, bench.data, bench.out, software="test")
+    assert "None" not in str(caught.value)
+    assert "payload: NAME" in str(caught.value)
+
+
+def test_a_full_disk_is_not_reported_as_a_recording(bench: Bench) -> None:
+    bench.out.parent.rmdir()
+    with pytest.raises(OutputFailed) as caught:
+        import_csv(bench.description, bench.data, bench.out, software="test")
+    assert "nothing was written" in str(caught.value)
+    assert "record" not in str(caught.value)

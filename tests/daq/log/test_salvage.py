@@ -6,6 +6,7 @@ import fcntl
 import hashlib
 import json
 import logging
+import os
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,16 @@ import pytest
 import yaml
 
 from daq.cli.app import main
-from daq.errors import ExitCode, LogCorrupt, LogIncomplete, LogTruncated, LogUnreadable, UsageError
+from daq.errors import (
+    ExitCode,
+    LogCorrupt,
+    LogIncomplete,
+    LogMissing,
+    LogTruncated,
+    LogUnreadable,
+    OutputFailed,
+    UsageError,
+)
 from daq.log.conversion import load_run
 from daq.log.metadata import SEAL, sealed, unsealed
 from daq.log.reader import LogReader, SampleBlock, read_log
@@ -285,3 +295,22 @@ def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main(["info", str(out), "--json"]) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["partial"] is True
     assert main(["salvage", str(part), "--out", str(out)]) == ExitCode.USAGE
+
+
+@pytest.mark.parametrize("what", ["device", "pipe"])
+def test_a_log_that_is_no_regular_file_is_refused(what: str, tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    if what == "device":
+        log.symlink_to("/dev/null")
+    else:
+        os.mkfifo(log)
+    with pytest.raises(LogMissing, match="no regular file"):
+        read_log(log)
+    with pytest.raises(LogMissing, match="no regular file"):
+        salvage(log, tmp_path / "saved.mcap")
+
+
+def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(part: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputFailed, match="nothing was written") as caught:
+        salvage(part, tmp_path / "none" / "saved.mcap")
+    assert "record again" not in str(caught.value)

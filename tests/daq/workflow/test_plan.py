@@ -134,6 +134,10 @@ def test_what_cannot_be_planned_is_refused_with_evidence(demo: Cell, experiment:
         plan(replace(demo, payloads=()), seed=1)
     with pytest.raises(ConfigurationInconsistent, match="plate"):
         experiment_of(demo, "plate")
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        experiment_of(demo, "plate")
+    assert caught.value.found == "no payload 'plate'"
+    assert caught.value.expected == "disc"
 
 
 def test_a_slower_plan_keeps_its_ways(demo: Cell, experiment: Experiment) -> None:
