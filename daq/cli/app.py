@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
+from daq.cli.terminal import WRITTEN
 from daq.cli.verb import Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed, exit_code
@@ -87,6 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A process of one command: almost all that it makes at its start stays, and searching it for garbage again and
         # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
+    WRITTEN.clear()
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
@@ -101,19 +103,26 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         build_app()(args=None if arguments is None else list(arguments), prog_name="drivegain")
     except (DaqError, DriverError, IdentificationError) as error:
+        if isinstance(error, OutputFailed) and WRITTEN:
+            error.add_note(f"kept: {_kept()}")
         show_error(error, Console(stderr=True, soft_wrap=True))
         return exit_code(type(error)) or ExitCode.UNEXPECTED
     except OSError as error:
         return _output_failed(error)
     except SystemExit as stop:  # typer ends so, after success too
+        if isinstance(stop.__context__, BrokenPipeError):  # rich and click end so
+            return _output_failed(stop.__context__)
         return stop.code if isinstance(stop.code, int) else ExitCode.OK
     return ExitCode.OK
 
 
 def _output_failed(error: OSError) -> int:
-    # A reader that closed the pipe needs no message; a full disk does.
-    if not isinstance(error, BrokenPipeError):
+    # A reader that closed the pipe needs no message where nothing was written; a full disk does.
+    if WRITTEN or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
+        if not error.filename:
+            failed.expected = "an output that takes what is printed"
+            failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
         show_error(failed, Console(stderr=True, soft_wrap=True))
     try:
         sys.stdout.flush()
@@ -124,6 +133,10 @@ def _output_failed(error: OSError) -> int:
             os.dup2(null, wanted)
             os.close(null)
     return ExitCode.UNEXPECTED
+
+
+def _kept() -> str:
+    return f"{', '.join(map(str, WRITTEN))} was written before that, completely"
 
 
 def show_error(error: Exception, console: Console) -> None:

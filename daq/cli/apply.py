@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daq.cli.terminal import at_most_one, interruptible
+from daq.cli.terminal import at_most_one, interruptible, write_output
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import (
@@ -29,7 +29,6 @@ from daq.errors import (
     DaqError,
     ExitCode,
     UsageError,
-    writing,
 )
 
 if TYPE_CHECKING:
@@ -138,7 +137,7 @@ def apply_to(
             show(proposal, Console(), known)
         try:
             if yes:
-                with writing(edit.place):
+                with write_output(edit.place) if edit.has_effect else nullcontext():
                     written = apply(proposal, request.now, audit=audit, who=str(actor))
         except CalibrationRefused:
             if json:
@@ -280,7 +279,7 @@ def rollback(
             f"{cell}: controller", found="no file", expected="one", remedy="give it with --to FILE"
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
-    with writing(path):
+    with write_output(path):
         written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=audit, who=str(actor))
     if declared is not None:
         _enter_rollback(declared, written, now, actor)
@@ -308,7 +307,7 @@ def rollback_drives(
         if not json:
             show_drive_rollback(planned, console)
         if yes:
-            with writing(record_folder(declared)):
+            with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
     if written is not None:
         _enter_rollback(declared, written, now, actor)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
-from daq.errors import UsageError
+from daq.errors import UsageError, writing
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -22,6 +22,21 @@ if TYPE_CHECKING:
     from drivers.canopen.network import SignalBlocker
 
 ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
+
+WRITTEN: list[Path] = []
+"""Files and folders that this command has written, for the message of an error or interrupt that comes later."""
+
+
+@contextmanager
+def write_output(path: Path) -> Iterator[None]:
+    """Write a file or folder within the block, and note in `WRITTEN` that it is there.
+
+    Raises:
+        OutputFailed: the file system refuses.
+    """
+    with writing(path):
+        yield
+    WRITTEN.append(path)
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:

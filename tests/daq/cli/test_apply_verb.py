@@ -6,8 +6,11 @@ import hashlib
 import io
 import json
 import os
+import re
 import shlex
 import shutil
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -571,3 +574,33 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     with HistoryStore(place.store) as store:
         assert {event.target for event in store.events()} == {str(target)}
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["full disk", "closed pipe"])
+def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, closed: bool) -> None:
+    # The table of `apply` is printed before the write: without --json nothing would be written.
+    for arguments in (["apply", str(bench.calibration), "--yes", "--json"], ["rollback"]):
+        before = bench.controller.read_bytes()
+        reading, writing = os.pipe() if closed else (None, os.open("/dev/full", os.O_WRONLY))
+        if reading is not None:
+            os.close(reading)
+        command = [sys.executable, "-m", "daq", *arguments, "--cell", str(bench.cell)]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writing)
+        assert bench.controller.read_bytes() != before
+        assert done.returncode == ExitCode.UNEXPECTED
+        assert re.search(r"^error: +standard output$", done.stderr, re.MULTILINE)
+        assert f"only the printed output is lost: {bench.controller} was written" in done.stderr
+        assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
+
+
+def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    plot, folder = bench.cell.with_name("gains.svg"), bench.cell.with_name("none")
+    assert (
+        main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(folder / "x.csv")]) == ExitCode.UNEXPECTED
+    )
+    shown = capsys.readouterr().err
+    assert f"kept:     {plot} was written before that" in shown
+    assert "nothing was changed" not in shown
+    assert plot.exists()
