@@ -61,6 +61,15 @@ class _Verbs(TyperGroup):
         name, _, rest = super().resolve_command(ctx, args)
         return name, next(listed.load().command() for listed in VERBS if listed.name == name), rest
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the verb; an interrupt is one line that says what was written."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            unchanged = ": nothing was changed" if ctx.invoked_subcommand in {"apply", "rollback"} else ""
+            typer.echo(printable(f"interrupted: {_kept()}" if WRITTEN else f"interrupted{unchanged}"), err=True)
+            raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+
 
 def build_app() -> typer.Typer:
     """Build the command with its verbs."""

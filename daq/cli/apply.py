@@ -19,17 +19,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daq.cli.terminal import at_most_one, interruptible, write_output
+from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, write_output
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.environment import login
-from daq.errors import (
-    AuditUnusable,
-    CalibrationRefused,
-    ConfigurationInconsistent,
-    DaqError,
-    ExitCode,
-    UsageError,
-)
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -108,8 +101,9 @@ def apply_verb(
         apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
         return
     undo += "" if to is None else f" --to {shlex.quote(str(to))}"
-    file = nullcontext(FileTarget.of(declared, to))
-    apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json)
+    file, whole = nullcontext(FileTarget.of(declared, to)), delay_signals()
+    with interruptible():
+        apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json, whole=whole)
 
 
 def apply_to(
@@ -122,8 +116,12 @@ def apply_to(
     undo: str,
     yes: bool,
     json: bool,
+    whole: AbstractContextManager[None] | None = None,
 ) -> None:
-    """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it."""
+    """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it.
+
+    The write, its audit and its entry in the history are done within `whole`.
+    """
     from daq.files import sha256
     from daq.report.proposal import describe, show
     from daq.writeback.target import apply, propose
@@ -135,15 +133,6 @@ def apply_to(
         known = query_history(declared, edit.subject, request, edit.changes)
         if not json:
             show(proposal, Console(), known)
-        try:
-            if yes:
-                with write_output(edit.place) if edit.has_effect else nullcontext():
-                    written = apply(proposal, request.now, audit=audit, who=str(actor))
-        except CalibrationRefused:
-            if json:
-                print_json(describe(proposal, None, known))
-            raise
-    if yes and not proposal.refusals:
 
         def enter(ledger: Ledger) -> None:
             # A write of an earlier command too, that was killed before it could enter it.
@@ -152,7 +141,16 @@ def apply_to(
             after = sha256(edit.after)
             ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=after, entry=entry)
 
-        record_in_history(declared, actor, enter)
+        try:
+            if yes:
+                with whole or nullcontext():
+                    with write_output(edit.place) if edit.has_effect else nullcontext():
+                        written = apply(proposal, request.now, audit=audit, who=str(actor))
+                    record_in_history(declared, actor, enter)
+        except CalibrationRefused:
+            if json:
+                print_json(describe(proposal, None, known))
+            raise
     if json:
         print_json(describe(proposal, written, known))
     else:
@@ -279,17 +277,20 @@ def rollback(
             f"{cell}: controller", found="no file", expected="one", remedy="give it with --to FILE"
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
-    with write_output(path):
-        written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=audit, who=str(actor))
-    if declared is not None:
-        _enter_rollback(declared, written, now, actor)
-    if json:
-        print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
-        return
-    console = Console(soft_wrap=True, highlight=False)
-    show_file_rollback(written, console)
-    if audit is None:
-        console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
+    with interruptible():
+        with delay_signals():
+            with write_output(path):
+                file = FileTarget(path, format=format_, cell=declared)
+                written = target.rollback(file, now, audit=audit, who=str(actor))
+            if declared is not None:
+                _enter_rollback(declared, written, now, actor)
+        if json:
+            print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
+            return
+        console = Console(soft_wrap=True, highlight=False)
+        show_file_rollback(written, console)
+        if audit is None:
+            console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
 
 
 def rollback_drives(
@@ -438,7 +439,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
         ):
             yield DriveTarget(declared, network, saving)
     except KeyboardInterrupt as interrupt:
-        said = "; ".join(getattr(interrupt, "__notes__", ())) or "nothing was written to the drives"
+        written = "the drives were written" if WRITTEN else "nothing was written to the drives"
+        said = "; ".join(getattr(interrupt, "__notes__", ())) or written
         typer.echo(f"interrupted: {said}", err=True)
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 

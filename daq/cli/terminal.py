@@ -29,11 +29,7 @@ WRITTEN: list[Path] = []
 
 @contextmanager
 def write_output(path: Path) -> Iterator[None]:
-    """Write a file or folder within the block, and note in `WRITTEN` that it is there.
-
-    Raises:
-        OutputFailed: the file system refuses.
-    """
+    """Write a file or folder within the block, as `writing`, and note in `WRITTEN` that it is there."""
     with writing(path):
         yield
     WRITTEN.append(path)
@@ -156,6 +152,20 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
             console.print(f"  {step}", style="dim")
 
         yield show_step
+
+
+@contextmanager
+def delay_signals() -> Iterator[None]:
+    """Let a short write and the records of it be completed before a signal is a KeyboardInterrupt."""
+    came: list[int] = []
+    before = {one: signal.signal(one, lambda number, _: came.append(number)) for one in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -9,8 +9,10 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -604,3 +606,46 @@ def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsy
     assert f"kept:     {plot} was written before that" in shown
     assert "nothing was changed" not in shown
     assert plot.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("place", ["daq.writeback.target.append", "daq.writeback.file_target.replace_file"])
+def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_whole(
+    bench: Bench,
+    number: signal.Signals,
+    place: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module, _, name = place.rpartition(".")
+    genuine = getattr(sys.modules[module], name)
+
+    def interrupted(*given: object, **named: object) -> object:
+        signal.raise_signal(number)
+        return genuine(*given, **named)
+
+    works: list[Callable[[], int]] = [lambda: bench.apply("--yes"), bench.rollback]
+    for work in works:
+        before = bench.controller.read_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(place, interrupted)
+            assert work() == ExitCode.INTERRUPTED
+        assert bench.controller.read_bytes() != before
+        shown = capsys.readouterr().err
+        assert f"interrupted: {bench.controller} was written" in shown
+        assert shown.count("\n") == 1
+    assert bench.actions()[:3] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    assert bench.actions()[3:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_write_says_that_nothing_was_changed(
+    bench: Bench, number: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = bench.controller.read_bytes()
+    monkeypatch.setattr("daq.writeback.target.propose", lambda *_: signal.raise_signal(number))
+    assert bench.apply("--yes") == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err == "interrupted: nothing was changed\n"
+    assert bench.controller.read_bytes() == before
+    assert not bench.audit.exists()
