@@ -79,6 +79,7 @@ def apply_verb(
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
+    saving = saving_of(ram_only, save_unknown, drives=drives)
     declared, actor = load_cell(cell), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
@@ -97,7 +98,7 @@ def apply_verb(
     undo = f"drivegain rollback --cell {shlex.quote(str(cell))}"
     if drives:
         at_most_one(drives=drives, to=to)
-        opening = drives_on_the_bus(declared, saving_of(ram_only, save_unknown))
+        opening = drives_on_the_bus(declared, saving)
         apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
         return
     undo += "" if to is None else f" --to {shlex.quote(str(to))}"
@@ -253,6 +254,7 @@ def rollback(
     from daq.writeback import target
     from daq.writeback.file_target import FileTarget
 
+    saving = saving_of(ram_only, save_unknown, drives=drives)
     declared = None if cell is None else load_cell(cell)
     at_most_one(audit=audit, cell=cell)  # writes to a cell's controller are in the cell's audit
     if drives:
@@ -268,7 +270,6 @@ def rollback(
         require_separate_audit(audit, (to,))
     now, actor, audit = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if drives and declared is not None:
-        saving = saving_of(ram_only, save_unknown)
         rollback_drives(declared, now=now, actor=actor, saving=saving, audit=audit, yes=yes, json=json)
         return
     path = to if declared is None else to or declared.controller_path
@@ -414,11 +415,14 @@ def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], obj
         _LOG.warning("the history does not know of this: %s", error)
 
 
-def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
-    """Combine the two options, which exclude each other."""
+def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Saving:
+    """Combine the two options, which exclude each other and need --drives."""
     from drivers.canopen.parameters import Saving
 
     at_most_one(ram_only=ram_only, save_unknown=save_unknown)
+    if not drives and (ram_only or save_unknown):
+        name = "--ram-only" if ram_only else "--save-unknown"
+        raise UsageError(name, found="no --drives", expected="both, or neither", remedy="a file has nothing to save")
     return Saving.RAM if ram_only else Saving.ANY if save_unknown else Saving.KNOWN
 
 

@@ -649,3 +649,14 @@ def test_a_signal_before_the_write_says_that_nothing_was_changed(
     assert capsys.readouterr().err == "interrupted: nothing was changed\n"
     assert bench.controller.read_bytes() == before
     assert not bench.audit.exists()
+
+
+@pytest.mark.parametrize("option", ["--ram-only", "--save-unknown"])
+def test_an_option_of_the_drives_is_not_ignored_without_them(
+    bench: Bench, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = bench.controller.read_bytes()
+    codes = {bench.apply("--yes", option), bench.rollback(option), bench.apply(option)}
+    assert codes == {ExitCode.USAGE}
+    assert capsys.readouterr().err.count(f"error:    {option}\n") == 3
+    assert bench.controller.read_bytes() == before
