@@ -162,7 +162,8 @@ def show_error(error: Exception, console: Console) -> None:
     if unconfirmed:
         lines.append(("AXES", "NOT ALL ARE CONFIRMED STOPPED: use the emergency stop", "bold red"))
     for label, text, style in lines:
-        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text)))
+        # Indented, a line end in the name of a file cannot make another line of an error.
+        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text).replace("\n", "\n" + 10 * " ")))
 
 
 def _show_version(wanted: bool) -> None:

@@ -23,6 +23,7 @@ from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible,
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.environment import login
 from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
+from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -177,8 +178,8 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
         console.print(f"To undo: {undo}")
     elif written is not None:
         backup = "none" if written.backup is None else written.backup.name
-        console.print(f"Written to {edit.subject}, backup {backup}; the audit is {audit}.")
-        console.print(f"To undo: {undo}")
+        console.print(terminal_text(f"Written to {edit.subject}, backup {backup}; the audit is {audit}."))
+        console.print(terminal_text(f"To undo: {undo}"))
     elif not edit.has_effect:
         console.print("Nothing to write: the controller file has these gains already.")
     else:

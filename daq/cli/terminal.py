@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console, RenderableType
 
 from daq.errors import UsageError, writing
-from daq.report.text import printable
+from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -93,7 +93,7 @@ def say_written(console: Console, *paths: Path | None) -> None:
     for path in paths:
         if path is not None:
             name = f"{path}/" if path.is_dir() else str(path)
-            console.print(f"Written: {printable(name)}", markup=False, highlight=False)
+            console.print(terminal_text(f"Written: {name}"))
 
 
 class Stepper:

@@ -43,12 +43,13 @@ class FileEdit(Edit):
     @property
     def diff(self) -> str:
         """The change as a unified diff, empty where there is none."""
+        name = " ".join(self.file.name.splitlines())
         before, after = (self.document(content or b"").text for content in (self.before, self.after))
         lines = difflib.unified_diff(
             before.splitlines(keepends=True),
             after.splitlines(keepends=True),
-            f"{self.file.name} (now)",
-            f"{self.file.name} (calibrated)",
+            f"{name} (now)",
+            f"{name} (calibrated)",
             n=1,
         )
         return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)

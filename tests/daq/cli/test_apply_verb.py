@@ -660,3 +660,22 @@ def test_an_option_of_the_drives_is_not_ignored_without_them(
     assert codes == {ExitCode.USAGE}
     assert capsys.readouterr().err.count(f"error:    {option}\n") == 3
     assert bench.controller.read_bytes() == before
+
+
+def test_the_name_of_a_controller_file_neither_commands_the_terminal_nor_makes_a_line(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = bench.controller.with_name("ctl\x1b[31m\nerror: fake.yaml")
+    shutil.copyfile(bench.controller, file)
+    assert bench.apply("--to", str(file), "--yes") == ExitCode.OK
+    assert bench.rollback("--to", str(file)) == ExitCode.OK
+    plot = bench.cell.with_name("p\nerror: fake.svg")
+    assert main(["history", str(bench.cell), "--plot", str(plot)]) == ExitCode.OK
+    file.unlink()
+    assert bench.apply("--to", str(file)) == ExitCode.CALIBRATION_REFUSED
+    output = capsys.readouterr()
+    assert "Restored" in output.out
+    for text in (output.out, output.err):
+        assert "\x1b" not in text
+        assert "ctl\\x1b[31m" in text
+        assert not re.search(r"^error: fake", text, re.MULTILINE)
