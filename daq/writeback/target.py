@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused
+from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
 from daq.writeback.gates.gate import GateContext, Refusal
@@ -239,13 +239,16 @@ class _Recorder:
         """Append an entry; where that fails, nothing may be written."""
         if self.audit is None:
             return None
-        return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+        try:
+            return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+        except OSError as error:
+            raise OutputFailed.of(self.audit, error) from error
 
     def end(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
         """Append the last entry about the write; a failure is a warning."""
         try:
             return self.begin(action, details)
-        except (OSError, AuditUnusable) as error:
+        except (OutputFailed, AuditUnusable) as error:
             # The write is done, and the first entry has its digests: no reason to call it undone.
             _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
             return None

@@ -679,3 +679,24 @@ def test_the_name_of_a_controller_file_neither_commands_the_terminal_nor_makes_a
         assert "\x1b" not in text
         assert "ctl\\x1b[31m" in text
         assert not re.search(r"^error: fake", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("made", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("/dev/null")])
+def test_something_else_in_place_of_the_lock_is_named(
+    bench: Bench, made: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock = bench.controller.with_name(".demo.yaml.lock")
+    made(lock)
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes") == ExitCode.UNEXPECTED
+    assert f"error:    {lock}\n" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
+
+
+def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    audit = bench.cell.with_name("none") / "audit.jsonl"
+    bench.cell.write_text(f"{bench.cell.read_text()}history: {{audit: {json.dumps(str(audit))}}}\n")
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes", "--configuration-changed") == ExitCode.UNEXPECTED
+    assert f"error:    {audit}\n" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
