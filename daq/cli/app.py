@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import gc
+import io
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -98,6 +101,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        codecs.register_error("drivegain", _spelled)
+        sys.stdout.reconfigure(errors="drivegain")
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
@@ -106,6 +112,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         return code or _output_failed(error)
     return code
+
+
+def _spelled(error: Any) -> tuple[str, int]:
+    """Spell characters that the output's encoding lacks as \\u00b1, which is right in a JSON document too."""
+    return json.dumps(error.object[error.start : error.end])[1:-1], error.end
 
 
 def _run(arguments: Sequence[str] | None) -> int:

@@ -700,3 +700,17 @@ def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixt
     assert bench.apply("--yes", "--configuration-changed") == ExitCode.UNEXPECTED
     assert f"error:    {audit}\n" in capsys.readouterr().err
     assert bench.controller.read_bytes() == before
+
+
+def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) -> None:
+    file = bench.controller.with_name("é😀.yaml")
+    bench.controller.rename(file)
+    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration), "--cell", str(bench.cell), "--to"]
+    shown = []
+    for more in ([], ["--json"]):
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+        done = subprocess.run([*command, str(file), *more], capture_output=True, env=environment, check=False)
+        assert (done.returncode, done.stderr) == (ExitCode.OK, b"")
+        shown.append(done.stdout.decode("ascii"))
+    assert "-9.210 \\u00b1 0.037" in shown[0]
+    assert json.loads(shown[1])["file"] == str(file)
