@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from daq.cli.app import main
+from daq.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

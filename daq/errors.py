@@ -205,7 +205,7 @@ class OutputFailed(DaqError):
             str(path),
             found=(error.strerror or type(error).__name__).lower(),
             expected="a folder that can be written, with room",
-            remedy="nothing was changed; free space or rights, or choose another folder",
+            remedy="it is as it was; free space or rights, or choose another folder",
         )
 
 

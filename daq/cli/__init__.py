@@ -1,6 +1,8 @@
 """The command `drivegain`."""
 
 import os
+import sys
+from collections.abc import Sequence
 
 # More threads make linear algebra of this size slower and take several times the processor time. The libraries read the
 # variable when they are loaded; a value from the environment is kept.
@@ -8,6 +10,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # pydantic reads the metadata of every installed package in search of plugins; there are none for us.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
-from daq.cli.app import main
 
-__all__ = ["main"]
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line; see `daq.cli.app.main`. Ctrl-C while the command is imported is no traceback."""
+    try:
+        from daq.cli.app import main as run
+
+        return run(arguments)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return 130  # ExitCode.INTERRUPTED, which may not be imported yet

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import gc
+import io
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -15,6 +18,7 @@ from rich.console import Console
 from rich.text import Text
 from typer.core import TyperGroup
 
+from daq.cli.terminal import WRITTEN
 from daq.cli.verb import Listed
 from daq.environment import software
 from daq.errors import DaqError, ExitCode, OutputFailed, exit_code
@@ -60,6 +64,15 @@ class _Verbs(TyperGroup):
         name, _, rest = super().resolve_command(ctx, args)
         return name, next(listed.load().command() for listed in VERBS if listed.name == name), rest
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run the verb; an interrupt is one line that says what was written."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as interrupt:
+            unchanged = ": nothing was changed" if ctx.invoked_subcommand in {"apply", "rollback"} else ""
+            typer.echo(printable(f"interrupted: {_kept()}" if WRITTEN else f"interrupted{unchanged}"), err=True)
+            raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
+
 
 def build_app() -> typer.Typer:
     """Build the command with its verbs."""
@@ -87,6 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A process of one command: almost all that it makes at its start stays, and searching it for garbage again and
         # again is a sixth of the time of `info`. A recording sets limits of its own (daq/workflow/safeguards.py).
         gc.set_threshold(20_000, 50, 100)
+    WRITTEN.clear()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        codecs.register_error("drivegain", _spelled)
+        sys.stdout.reconfigure(errors="drivegain")
     code = _run(arguments)
     try:
         # Flush here: at the end of the interpreter a failure could not be reported.
@@ -97,23 +114,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return code
 
 
+def _spelled(error: Any) -> tuple[str, int]:
+    """Spell characters that the output's encoding lacks as \\u00b1, which is right in a JSON document too."""
+    return json.dumps(error.object[error.start : error.end])[1:-1], error.end
+
+
 def _run(arguments: Sequence[str] | None) -> int:
     try:
         build_app()(args=None if arguments is None else list(arguments), prog_name="drivegain")
     except (DaqError, DriverError, IdentificationError) as error:
+        if isinstance(error, OutputFailed) and WRITTEN:
+            error.add_note(f"kept: {_kept()}")
         show_error(error, Console(stderr=True, soft_wrap=True))
         return exit_code(type(error)) or ExitCode.UNEXPECTED
     except OSError as error:
         return _output_failed(error)
     except SystemExit as stop:  # typer ends so, after success too
+        if isinstance(stop.__context__, BrokenPipeError):  # rich and click end so
+            return _output_failed(stop.__context__)
         return stop.code if isinstance(stop.code, int) else ExitCode.OK
     return ExitCode.OK
 
 
 def _output_failed(error: OSError) -> int:
-    # A reader that closed the pipe needs no message; a full disk does.
-    if not isinstance(error, BrokenPipeError):
+    # A reader that closed the pipe needs no message where nothing was written; a full disk does.
+    if WRITTEN or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
+        if not error.filename:
+            failed.expected = "an output that takes what is printed"
+            failed.remedy = f"only the printed output is lost: {_kept()}" if WRITTEN else "send it elsewhere"
         show_error(failed, Console(stderr=True, soft_wrap=True))
     try:
         sys.stdout.flush()
@@ -124,6 +153,10 @@ def _output_failed(error: OSError) -> int:
             os.dup2(null, wanted)
             os.close(null)
     return ExitCode.UNEXPECTED
+
+
+def _kept() -> str:
+    return f"{', '.join(map(str, WRITTEN))} was written before that, completely"
 
 
 def show_error(error: Exception, console: Console) -> None:
@@ -140,7 +173,8 @@ def show_error(error: Exception, console: Console) -> None:
     if unconfirmed:
         lines.append(("AXES", "NOT ALL ARE CONFIRMED STOPPED: use the emergency stop", "bold red"))
     for label, text, style in lines:
-        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text)))
+        # Indented, a line end in the name of a file cannot make another line of an error.
+        console.print(Text(f"{label + ':':<10}", style=style) + Text(printable(text).replace("\n", "\n" + 10 * " ")))
 
 
 def _show_version(wanted: bool) -> None:

@@ -19,18 +19,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from daq.cli.terminal import at_most_one, interruptible
+from daq.cli.terminal import WRITTEN, at_most_one, delay_signals, interruptible, write_output
 from daq.cli.verb import JsonOption, Verb, print_json
 from daq.environment import login
-from daq.errors import (
-    AuditUnusable,
-    CalibrationRefused,
-    ConfigurationInconsistent,
-    DaqError,
-    ExitCode,
-    UsageError,
-    writing,
-)
+from daq.errors import AuditUnusable, CalibrationRefused, ConfigurationInconsistent, DaqError, ExitCode, UsageError
+from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
     from daq.config.cell import Cell
@@ -87,6 +80,7 @@ def apply_verb(
     from daq.writeback.file_target import FileTarget
     from daq.writeback.request import Request
 
+    saving = saving_of(ram_only, save_unknown, drives=drives)
     declared, actor = load_cell(cell), applier(by)
     content = read(calibration)
     fitted = decode(content, str(calibration))
@@ -105,12 +99,13 @@ def apply_verb(
     undo = f"drivegain rollback --cell {shlex.quote(str(cell))}"
     if drives:
         at_most_one(drives=drives, to=to)
-        opening = drives_on_the_bus(declared, saving_of(ram_only, save_unknown))
+        opening = drives_on_the_bus(declared, saving)
         apply_to(opening, declared, request, actor=actor, audit=audit, undo=f"{undo} --drives", yes=yes, json=json)
         return
     undo += "" if to is None else f" --to {shlex.quote(str(to))}"
-    file = nullcontext(FileTarget.of(declared, to))
-    apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json)
+    file, whole = nullcontext(FileTarget.of(declared, to)), delay_signals()
+    with interruptible():
+        apply_to(file, declared, request, actor=actor, audit=audit, undo=undo, yes=yes, json=json, whole=whole)
 
 
 def apply_to(
@@ -123,8 +118,12 @@ def apply_to(
     undo: str,
     yes: bool,
     json: bool,
+    whole: AbstractContextManager[None] | None = None,
 ) -> None:
-    """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it."""
+    """Show what a calibration changes in a target, and write it with `yes`; `undo` is the command that undoes it.
+
+    The write, its audit and its entry in the history are done within `whole`.
+    """
     from daq.files import sha256
     from daq.report.proposal import describe, show
     from daq.writeback.target import apply, propose
@@ -136,15 +135,6 @@ def apply_to(
         known = query_history(declared, edit.subject, request, edit.changes)
         if not json:
             show(proposal, Console(), known)
-        try:
-            if yes:
-                with writing(edit.place):
-                    written = apply(proposal, request.now, audit=audit, who=str(actor))
-        except CalibrationRefused:
-            if json:
-                print_json(describe(proposal, None, known))
-            raise
-    if yes and not proposal.refusals:
 
         def enter(ledger: Ledger) -> None:
             # A write of an earlier command too, that was killed before it could enter it.
@@ -153,7 +143,16 @@ def apply_to(
             after = sha256(edit.after)
             ledger.record_applied(digest, at=request.now, target=edit.subject, sha256_after=after, entry=entry)
 
-        record_in_history(declared, actor, enter)
+        try:
+            if yes:
+                with whole or nullcontext():
+                    with write_output(edit.place) if edit.has_effect else nullcontext():
+                        written = apply(proposal, request.now, audit=audit, who=str(actor))
+                    record_in_history(declared, actor, enter)
+        except CalibrationRefused:
+            if json:
+                print_json(describe(proposal, None, known))
+            raise
     if json:
         print_json(describe(proposal, written, known))
     else:
@@ -179,8 +178,8 @@ def _show_outcome(proposal: Proposal[E], written: Written | None, audit: Path | 
         console.print(f"To undo: {undo}")
     elif written is not None:
         backup = "none" if written.backup is None else written.backup.name
-        console.print(f"Written to {edit.subject}, backup {backup}; the audit is {audit}.")
-        console.print(f"To undo: {undo}")
+        console.print(terminal_text(f"Written to {edit.subject}, backup {backup}; the audit is {audit}."))
+        console.print(terminal_text(f"To undo: {undo}"))
     elif not edit.has_effect:
         console.print("Nothing to write: the controller file has these gains already.")
     else:
@@ -256,6 +255,7 @@ def rollback(
     from daq.writeback import target
     from daq.writeback.file_target import FileTarget
 
+    saving = saving_of(ram_only, save_unknown, drives=drives)
     declared = None if cell is None else load_cell(cell)
     at_most_one(audit=audit, cell=cell)  # writes to a cell's controller are in the cell's audit
     if drives:
@@ -271,7 +271,6 @@ def rollback(
         require_separate_audit(audit, (to,))
     now, actor, audit = datetime.now(UTC), applier(by), audit if declared is None else audit_of(declared, (cell, to))
     if drives and declared is not None:
-        saving = saving_of(ram_only, save_unknown)
         rollback_drives(declared, now=now, actor=actor, saving=saving, audit=audit, yes=yes, json=json)
         return
     path = to if declared is None else to or declared.controller_path
@@ -280,17 +279,20 @@ def rollback(
             f"{cell}: controller", found="no file", expected="one", remedy="give it with --to FILE"
         )
     format_ = None if declared is None or declared.controller is None else declared.controller.format
-    with writing(path):
-        written = target.rollback(FileTarget(path, format=format_, cell=declared), now, audit=audit, who=str(actor))
-    if declared is not None:
-        _enter_rollback(declared, written, now, actor)
-    if json:
-        print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
-        return
-    console = Console(soft_wrap=True, highlight=False)
-    show_file_rollback(written, console)
-    if audit is None:
-        console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
+    with interruptible():
+        with delay_signals():
+            with write_output(path):
+                file = FileTarget(path, format=format_, cell=declared)
+                written = target.rollback(file, now, audit=audit, who=str(actor))
+            if declared is not None:
+                _enter_rollback(declared, written, now, actor)
+        if json:
+            print_json({**describe_file_rollback(written), "audit": None if audit is None else str(audit)})
+            return
+        console = Console(soft_wrap=True, highlight=False)
+        show_file_rollback(written, console)
+        if audit is None:
+            console.print("Not in an audit: neither --cell nor --audit was given.", markup=False)
 
 
 def rollback_drives(
@@ -308,7 +310,7 @@ def rollback_drives(
         if not json:
             show_drive_rollback(planned, console)
         if yes:
-            with writing(record_folder(declared)):
+            with write_output(record_folder(declared)):
                 written = target.rollback(drives, now, audit=audit, who=str(actor), planned=planned)
     if written is not None:
         _enter_rollback(declared, written, now, actor)
@@ -414,11 +416,14 @@ def record_in_history(cell: Cell, actor: Applier, record: Callable[[Ledger], obj
         _LOG.warning("the history does not know of this: %s", error)
 
 
-def saving_of(ram_only: bool, save_unknown: bool) -> Saving:
-    """Combine the two options, which exclude each other."""
+def saving_of(ram_only: bool, save_unknown: bool, *, drives: bool = True) -> Saving:
+    """Combine the two options, which exclude each other and need --drives."""
     from drivers.canopen.parameters import Saving
 
     at_most_one(ram_only=ram_only, save_unknown=save_unknown)
+    if not drives and (ram_only or save_unknown):
+        name = "--ram-only" if ram_only else "--save-unknown"
+        raise UsageError(name, found="no --drives", expected="both, or neither", remedy="a file has nothing to save")
     return Saving.RAM if ram_only else Saving.ANY if save_unknown else Saving.KNOWN
 
 
@@ -439,7 +444,8 @@ def drives_on_the_bus(declared: Cell, saving: Saving) -> Iterator[DriveTarget]:
         ):
             yield DriveTarget(declared, network, saving)
     except KeyboardInterrupt as interrupt:
-        said = "; ".join(getattr(interrupt, "__notes__", ())) or "nothing was written to the drives"
+        written = "the drives were written" if WRITTEN else "nothing was written to the drives"
+        said = "; ".join(getattr(interrupt, "__notes__", ())) or written
         typer.echo(f"interrupted: {said}", err=True)
         raise typer.Exit(ExitCode.INTERRUPTED) from interrupt
 

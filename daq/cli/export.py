@@ -155,7 +155,7 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
     """Write the URDF whole or not at all, after reading it back as a robot with these links."""
     import numpy as np
 
-    from daq.errors import writing
+    from daq.cli.terminal import write_output
     from daq.files import replace_file
     from ident.physical.physical import urdf_links
 
@@ -168,7 +168,7 @@ def _write(updated: Updated, robot: PhysicalRobot, out: Path) -> None:
                 remedy="nothing was written; please report this URDF",
             )
 
-    with writing(out):
+    with write_output(out):
         replace_file(out, updated.content, check=check)
 
 

@@ -121,8 +121,7 @@ def _fit_cases(
     """Fit the paper's cases and ours, write a calibration of each, and tabulate them as Tables 1 to 4."""
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_output, print_view, status
-    from daq.errors import writing
+    from daq.cli.terminal import check_output, print_view, status, write_output
     from daq.files import replace_file
     from daq.report.fit import cases_document, cases_view
     from daq.report.paper_tables import case_tables, page
@@ -143,7 +142,7 @@ def _fit_cases(
             fits[case.name] = fit_case(reduced, case.method, case.known, gains_fixed=case.gains_fixed, ratio=ratio)
         calibrations = {name: calibration_of_case(found, created) for name, found in fits.items()}
     tables = case_tables(calibrations)
-    with writing(folder):
+    with write_output(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, file in files.items():
             save_calibration(calibrations[name], file)
@@ -236,14 +235,14 @@ RESIDUAL = Verb(
 
 
 def _save(fitted: Fit, calibration: Calibration, out: Path | None, pictures: Path | None) -> None:
-    from daq.errors import writing
+    from daq.cli.terminal import write_output
     from daq.report.plots import draw_fit
     from daq.workflow.calibration_file import save_calibration
 
     if out is not None:
-        with writing(out):
+        with write_output(out):
             save_calibration(calibration, out)
     if pictures is not None:
-        with writing(pictures):
+        with write_output(pictures):
             pictures.mkdir(parents=True, exist_ok=True)
             draw_fit(fitted, calibration, None, pictures)

@@ -39,8 +39,7 @@ def fleet_verb(
     """
     from datetime import UTC, datetime
 
-    from daq.cli.terminal import check_replaceable, print_view, progress_bar
-    from daq.errors import writing
+    from daq.cli.terminal import check_replaceable, print_view, progress_bar, write_output
     from daq.files import replace_file
     from daq.jobs.cell_fit import Loop, open_cache
     from daq.jobs.fleet import fit_fleet, worker_pool
@@ -59,7 +58,7 @@ def fleet_verb(
     with progress_bar("fitting the fleet") as report_progress, wanted as pool:
         rows = fit_fleet(found, pool, loop, cache, lambda: datetime.now(UTC), report_progress)
     if csv is not None:
-        with writing(csv):
+        with write_output(csv):
             replace_file(csv, fleet_csv(rows).encode())
     if json:
         print_json(fleet_document(rows))

@@ -12,9 +12,9 @@ import typer
 from rich.console import Console
 
 from daq.cli.apply import applier
-from daq.cli.terminal import check_replaceable, say_written
+from daq.cli.terminal import check_replaceable, say_written, write_output
 from daq.cli.verb import JsonOption, Verb, print_json
-from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError, writing
+from daq.errors import AuditUnusable, ConfigurationInconsistent, DataError, HistoryUnreadable, UsageError
 from daq.report.text import printable
 
 if TYPE_CHECKING:
@@ -277,10 +277,10 @@ def _write_files(chosen: tuple[Series, ...], cell: Cell, picture: Path | None, c
                 remedy="fit and apply one first",
             )
         kind = picture.suffix.lower().removeprefix(".")
-        with writing(picture):
+        with write_output(picture):
             replace_file(picture, plot_history(drawn, kind, title=f"Drive gains of {cell.name}"))
     if csv is not None:
-        with writing(csv):
+        with write_output(csv):
             replace_file(csv, csv_text(chosen).encode())
 
 

@@ -10,9 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
+from daq.cli.terminal import write_output
 from daq.cli.verb import Verb
 from daq.environment import shipped_configurations
-from daq.errors import UsageError, writing
+from daq.errors import UsageError
 
 TEMPLATES = (
     ("cells/demo.yaml", "cells/{name}.yaml"),
@@ -37,7 +38,7 @@ def make_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
             expected="a name of letters, digits, . _ -",
             remedy="rename it",
         )
-    with writing(folder):
+    with write_output(folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(
                 str(folder), found="something in it", expected="a new or empty folder", remedy="choose another name"

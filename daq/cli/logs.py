@@ -37,10 +37,12 @@ def import_files(
     """Convert the CSV files of another controller to a log."""
     from dataclasses import asdict
 
+    from daq.cli.terminal import WRITTEN
     from daq.environment import software
     from daq.log.csv_import import import_csv
 
     statistics = import_csv(description, data, out, software=software(), cell_path=cell)
+    WRITTEN.append(out)
     if json:
         print_json({"log": str(out), **asdict(statistics)})
     else:
@@ -61,12 +63,13 @@ def salvage_verb(
 
     `fit` accepts a valid partial log and says so; `apply` refuses the result.
     """
-    from daq.cli.terminal import progress_bar
+    from daq.cli.terminal import WRITTEN, progress_bar
     from daq.log.salvage import salvage
     from daq.report.text import printable
 
     with progress_bar("salvaging") as report_progress:
         saved = salvage(log, out, lambda samples: report_progress(samples, 0, "samples"))
+    WRITTEN.append(out)
     statistics = saved.statistics
     if json:
         print_json({"log": str(out), "partial": statistics.partial, "samples": statistics.samples,

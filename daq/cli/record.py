@@ -200,9 +200,8 @@ def plan_verb(
     The moves keep the joint limits and the cell's workspace, and keep clear of the arm itself. The prediction is for
     these moves made once without load and once with the payload.
     """
-    from daq.cli.terminal import check_output, progress_bar
+    from daq.cli.terminal import check_output, progress_bar, write_output
     from daq.config.cell_file import load_cell
-    from daq.errors import writing
     from daq.report.plan import plan_document, plan_text
     from daq.workflow.experiment import RUNS, experiment_of, extra_moves, paths_of
     from daq.workflow.plan import plan
@@ -224,7 +223,7 @@ def plan_verb(
             experiment=experiment,
             progress=lambda done, worst: report_progress(done, exchanges, f"worst gain σ {worst:.2f} %"),
         )
-    with writing(out):
+    with write_output(out):
         save_plan(made, out)
     excitation, _ = experiment.excitation(paths_of(declared, made.moves))
     judged = verdicts(experiment.design, [(excitation, RUNS)], extra_moves(experiment))

@@ -200,8 +200,7 @@ def demo(
 
     from rich.console import Console
 
-    from daq.cli.terminal import print_view, show_steps
-    from daq.errors import writing
+    from daq.cli.terminal import print_view, show_steps, write_output
     from daq.files import replace_file
     from daq.report.proposal import show as show_proposal
     from daq.report.text import json_text
@@ -210,7 +209,7 @@ def demo(
 
     began = time.monotonic()
     settings = Settings(out, simulation or shipped_simulation(), seed, duration)
-    with writing(out):
+    with write_output(out):
         with show_steps() as stepper:
             outcome = demonstrate(settings, lambda: datetime.now(UTC), ProgressReporter(stepper.step, stepper.progress))
         document = {**summary(outcome), "seconds": round(time.monotonic() - began, 1)}

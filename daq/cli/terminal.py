@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 
-from daq.errors import UsageError
-from daq.report.text import printable
+from daq.errors import UsageError, writing
+from daq.report.text import terminal_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -22,6 +22,17 @@ if TYPE_CHECKING:
     from drivers.canopen.network import SignalBlocker
 
 ProgressCallback = Callable[[int, int, str], None]  #: Called with the number done, the total, and a remark
+
+WRITTEN: list[Path] = []
+"""Files and folders that this command has written, for the message of an error or interrupt that comes later."""
+
+
+@contextmanager
+def write_output(path: Path) -> Iterator[None]:
+    """Write a file or folder within the block, as `writing`, and note in `WRITTEN` that it is there."""
+    with writing(path):
+        yield
+    WRITTEN.append(path)
 
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
@@ -82,7 +93,7 @@ def say_written(console: Console, *paths: Path | None) -> None:
     for path in paths:
         if path is not None:
             name = f"{path}/" if path.is_dir() else str(path)
-            console.print(f"Written: {printable(name)}", markup=False, highlight=False)
+            console.print(terminal_text(f"Written: {name}"))
 
 
 class Stepper:
@@ -141,6 +152,20 @@ def status(title: str) -> Iterator[Callable[[str], None]]:
             console.print(f"  {step}", style="dim")
 
         yield show_step
+
+
+@contextmanager
+def delay_signals() -> Iterator[None]:
+    """Let a short write and the records of it be completed before a signal is a KeyboardInterrupt."""
+    came: list[int] = []
+    before = {one: signal.signal(one, lambda number, _: came.append(number)) for one in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if came:
+        raise KeyboardInterrupt
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -33,9 +33,8 @@ def validate_verb(
     the gains give (Tables 7, 8); with --beside every calibration side by side (Table 6 too). With unloaded logs among
     the others, the payload mass does not depend on the calibration's robot parameters.
     """
-    from daq.cli.terminal import check_output, print_view, status
+    from daq.cli.terminal import check_output, print_view, status, write_output
     from daq.config.cell_file import load_cell
-    from daq.errors import writing
     from daq.files import replace_file
     from daq.report.paper_tables import page
     from daq.report.validation import (
@@ -55,11 +54,11 @@ def validate_verb(
         known = next(iter(calibrations.values()))
         found = cross_validate(calibrations, logs, None if cell is None else load_cell(cell))
         if pictures is not None:
-            with writing(pictures):
+            with write_output(pictures):
                 drawn = draw_validations(known, found.validations, pictures)
     if page_file is not None:
         tables = validation_tables(found, complete=True)
-        with writing(page_file):
+        with write_output(page_file):
             page_file.parent.mkdir(parents=True, exist_ok=True)
             replace_file(page_file, page(f"Validation of {known.cell}", tables, marker=TABLES).encode())
     if json:

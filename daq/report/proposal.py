@@ -140,10 +140,10 @@ def describe_drive_rollback(edit: DriveEdit, written: Written | None) -> dict[st
 def show_file_rollback(written: Written, console: Console) -> None:
     """Print a rollback of the controller's file as a diff and a line."""
     edit, backup = written.edit, written.backup
-    _show_diff(_rollback_diff(edit), console)
+    _show_diff(terminal_lines(_rollback_diff(edit)), console)
     replaced = "the file was gone" if backup is None else f"the content before is now {backup.name}"
     source = "" if edit.source is None else edit.source.name
-    console.print(f"Restored {source} to {edit.subject}; {replaced}.", markup=False)
+    console.print(terminal_text(f"Restored {source} to {edit.subject}; {replaced}."))
 
 
 def describe_file_rollback(written: Written) -> dict[str, Any]:
@@ -157,7 +157,7 @@ def describe_file_rollback(written: Written) -> dict[str, Any]:
 
 
 def _rollback_diff(edit: Edit) -> str:
-    name = edit.place.resolve().name
+    name = terminal_text(edit.place.resolve().name).plain
     before, after = (content.decode(errors="replace").splitlines() for content in (edit.before or b"", edit.after))
     return "\n".join(difflib.unified_diff(before, after, f"{name} (was)", f"{name} (restored)", lineterm="", n=1))
 

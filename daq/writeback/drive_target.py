@@ -171,17 +171,11 @@ class DriveEdit(Edit):
 
 @dataclass(frozen=True, slots=True)
 class DriveTarget:
-    """The drives of a cell.
+    """The drives of a cell."""
 
-    Attributes:
-        cell: as it is now, with `controller.objects`.
-        network: of all axes of the cell, open, and not prepared for recording.
-        saving: whether the drives save what is written.
-    """
-
-    cell: Cell
-    network: CanopenNetwork
-    saving: Saving = Saving.KNOWN
+    cell: Cell  #: as it is now, with `controller.objects`
+    network: CanopenNetwork  #: of all axes of the cell, open, and not prepared for recording
+    saving: Saving = Saving.KNOWN  #: whether the drives save what is written
 
     @property
     def subject(self) -> str:

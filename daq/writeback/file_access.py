@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from daq.errors import CalibrationRefused, ControllerUnfit
+from daq.errors import CalibrationRefused, ControllerUnfit, OutputFailed
 from daq.files import hold_lock, replace_file
 from daq.writeback.formats.document import read_bytes
 from daq.writeback.request import short_digest
@@ -124,11 +124,12 @@ def exclusive_writer(target: Path) -> Iterator[None]:
 
     Raises:
         CalibrationRefused: another drivegain writes it.
-        OSError: see `daq.files.hold_lock`.
+        OutputFailed: the lock file cannot be made, or something else has its name.
     """
+    lock = target.parent / f".{target.name}.lock"
     with contextlib.ExitStack() as held:
         try:
-            held.enter_context(hold_lock(target.parent / f".{target.name}.lock"))
+            held.enter_context(hold_lock(lock))
         except BlockingIOError as error:
             raise CalibrationRefused(
                 str(target),
@@ -136,6 +137,8 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 expected="one writer at a time",
                 remedy="wait until it has finished, then take a new dry run",
             ) from error
+        except OSError as error:
+            raise OutputFailed.of(lock, error) from error
         yield
 
 

@@ -43,12 +43,13 @@ class FileEdit(Edit):
     @property
     def diff(self) -> str:
         """The change as a unified diff, empty where there is none."""
+        name = " ".join(self.file.name.splitlines())
         before, after = (self.document(content or b"").text for content in (self.before, self.after))
         lines = difflib.unified_diff(
             before.splitlines(keepends=True),
             after.splitlines(keepends=True),
-            f"{self.file.name} (now)",
-            f"{self.file.name} (calibrated)",
+            f"{name} (now)",
+            f"{name} (calibrated)",
             n=1,
         )
         return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
@@ -60,21 +61,15 @@ class FileEdit(Edit):
 
 @dataclass(frozen=True, slots=True)
 class FileTarget:
-    """A controller's file.
+    """A controller's file."""
 
-    Attributes:
-        file: as it was named; a symbolic link stays one, and the file behind it is replaced.
-        keys: key of each axis's gain, by the axis's name; not needed for a rollback.
-        format: of the file; None where its name says it.
-        factors: number in the file = gain × factor, by the axis's name; 1 where it is missing.
-        cell: that the controller drives; None where nothing is compared with it.
-    """
-
-    file: Path
+    file: Path  #: as it was named; a symbolic link stays one, and the file behind it is replaced
+    #: Key of each axis's gain, by the axis's name; not needed for a rollback
     keys: Mapping[str, str] = field(default_factory=dict)
-    format: ControllerFormat | None = None
+    format: ControllerFormat | None = None  #: of the file; None where its name says it
+    #: Number in the file = gain × factor, by the axis's name; 1 where it is missing
     factors: Mapping[str, float] = field(default_factory=dict)
-    cell: Cell | None = None
+    cell: Cell | None = None  #: that the controller drives; None where nothing is compared with it
 
     @classmethod
     def of(cls, cell: Cell, file: Path | None = None) -> FileTarget:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused
+from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, AuditEntry, append, digest_now
 from daq.writeback.gates.gate import GateContext, Refusal
@@ -31,19 +31,12 @@ E = TypeVar("E", bound=Edit)
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """A change that was made.
+    """A change that was made."""
 
-    Attributes:
-        edit: the change.
-        backup: file with the content before it; None where there was none.
-        parameters: one for each drive that was written.
-        audit_sha256: digest of the audit's last entry about it, to be noted elsewhere; None without an audit.
-    """
-
-    edit: Edit
-    backup: Path | None
-    parameters: tuple[ParameterChange, ...] = ()
-    audit_sha256: str | None = None
+    edit: Edit  #: the change
+    backup: Path | None  #: file with the content before it; None where there was none
+    parameters: tuple[ParameterChange, ...] = ()  #: one for each drive that was written
+    audit_sha256: str | None = None  #: of the audit's last entry about it, to be noted elsewhere; None without an audit
 
 
 class Target(Protocol[E]):
@@ -98,19 +91,12 @@ class Target(Protocol[E]):
 
 @dataclass(frozen=True, slots=True)
 class Proposal(Generic[E]):
-    """A planned change with the verdict of the gates.
+    """A planned change with the verdict of the gates."""
 
-    Attributes:
-        target: where it would be made.
-        edit: the change.
-        refusals: failed checks; only a proposal without any can be applied.
-        evidence: digests of what the change rests on, for the audit.
-    """
-
-    target: Target[E]
-    edit: E
-    refusals: tuple[Refusal, ...]
-    evidence: Mapping[str, object] = field(default_factory=dict)
+    target: Target[E]  #: where it would be made
+    edit: E  #: the change
+    refusals: tuple[Refusal, ...]  #: failed checks; only a proposal without any can be applied
+    evidence: Mapping[str, object] = field(default_factory=dict)  #: digests of what the change rests on, for the audit
 
     @property
     def error(self) -> CalibrationRefused:
@@ -239,13 +225,16 @@ class _Recorder:
         """Append an entry; where that fails, nothing may be written."""
         if self.audit is None:
             return None
-        return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+        try:
+            return append(self.audit, action, at=self.at, who=self.who, subject=self.subject, details=details)
+        except OSError as error:
+            raise OutputFailed.of(self.audit, error) from error
 
     def end(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
         """Append the last entry about the write; a failure is a warning."""
         try:
             return self.begin(action, details)
-        except (OSError, AuditUnusable) as error:
+        except (OutputFailed, AuditUnusable) as error:
             # The write is done, and the first entry has its digests: no reason to call it undone.
             _LOG.warning("the audit log does not have that it is %s: %s", action.value, error)
             return None

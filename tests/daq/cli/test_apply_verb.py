@@ -6,8 +6,13 @@ import hashlib
 import io
 import json
 import os
+import re
 import shlex
 import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -571,3 +576,141 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     with HistoryStore(place.store) as store:
         assert {event.target for event in store.events()} == {str(target)}
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("closed", [False, True], ids=["full disk", "closed pipe"])
+def test_an_output_that_fails_after_a_write_says_what_was_written(bench: Bench, closed: bool) -> None:
+    # The table of `apply` is printed before the write: without --json nothing would be written.
+    for arguments in (["apply", str(bench.calibration), "--yes", "--json"], ["rollback"]):
+        before = bench.controller.read_bytes()
+        reading, writing = os.pipe() if closed else (None, os.open("/dev/full", os.O_WRONLY))
+        if reading is not None:
+            os.close(reading)
+        command = [sys.executable, "-m", "daq", *arguments, "--cell", str(bench.cell)]
+        done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writing)
+        assert bench.controller.read_bytes() != before
+        assert done.returncode == ExitCode.UNEXPECTED
+        assert re.search(r"^error: +standard output$", done.stderr, re.MULTILINE)
+        assert f"only the printed output is lost: {bench.controller} was written" in done.stderr
+        assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
+
+
+def test_an_output_that_fails_says_which_were_written_before(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.apply("--yes") == ExitCode.OK
+    plot, folder = bench.cell.with_name("gains.svg"), bench.cell.with_name("none")
+    assert (
+        main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(folder / "x.csv")]) == ExitCode.UNEXPECTED
+    )
+    shown = capsys.readouterr().err
+    assert f"kept:     {plot} was written before that" in shown
+    assert "nothing was changed" not in shown
+    assert plot.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("place", ["daq.writeback.target.append", "daq.writeback.file_target.replace_file"])
+def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_whole(
+    bench: Bench,
+    number: signal.Signals,
+    place: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    module, _, name = place.rpartition(".")
+    genuine = getattr(sys.modules[module], name)
+
+    def interrupted(*given: object, **named: object) -> object:
+        signal.raise_signal(number)
+        return genuine(*given, **named)
+
+    works: list[Callable[[], int]] = [lambda: bench.apply("--yes"), bench.rollback]
+    for work in works:
+        before = bench.controller.read_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(place, interrupted)
+            assert work() == ExitCode.INTERRUPTED
+        assert bench.controller.read_bytes() != before
+        shown = capsys.readouterr().err
+        assert f"interrupted: {bench.controller} was written" in shown
+        assert shown.count("\n") == 1
+    assert bench.actions()[:3] == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    assert bench.actions()[3:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_before_the_write_says_that_nothing_was_changed(
+    bench: Bench, number: signal.Signals, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = bench.controller.read_bytes()
+    monkeypatch.setattr("daq.writeback.target.propose", lambda *_: signal.raise_signal(number))
+    assert bench.apply("--yes") == ExitCode.INTERRUPTED
+    assert capsys.readouterr().err == "interrupted: nothing was changed\n"
+    assert bench.controller.read_bytes() == before
+    assert not bench.audit.exists()
+
+
+@pytest.mark.parametrize("option", ["--ram-only", "--save-unknown"])
+def test_an_option_of_the_drives_is_not_ignored_without_them(
+    bench: Bench, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = bench.controller.read_bytes()
+    codes = {bench.apply("--yes", option), bench.rollback(option), bench.apply(option)}
+    assert codes == {ExitCode.USAGE}
+    assert capsys.readouterr().err.count(f"error:    {option}\n") == 3
+    assert bench.controller.read_bytes() == before
+
+
+def test_the_name_of_a_controller_file_neither_commands_the_terminal_nor_makes_a_line(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = bench.controller.with_name("ctl\x1b[31m\nerror: fake.yaml")
+    shutil.copyfile(bench.controller, file)
+    assert bench.apply("--to", str(file), "--yes") == ExitCode.OK
+    assert bench.rollback("--to", str(file)) == ExitCode.OK
+    plot = bench.cell.with_name("p\nerror: fake.svg")
+    assert main(["history", str(bench.cell), "--plot", str(plot)]) == ExitCode.OK
+    file.unlink()
+    assert bench.apply("--to", str(file)) == ExitCode.CALIBRATION_REFUSED
+    output = capsys.readouterr()
+    assert "Restored" in output.out
+    for text in (output.out, output.err):
+        assert "\x1b" not in text
+        assert "ctl\\x1b[31m" in text
+        assert not re.search(r"^error: fake", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("made", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("/dev/null")])
+def test_something_else_in_place_of_the_lock_is_named(
+    bench: Bench, made: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock = bench.controller.with_name(".demo.yaml.lock")
+    made(lock)
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes") == ExitCode.UNEXPECTED
+    assert f"error:    {lock}\n" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
+
+
+def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    audit = bench.cell.with_name("none") / "audit.jsonl"
+    bench.cell.write_text(f"{bench.cell.read_text()}history: {{audit: {json.dumps(str(audit))}}}\n")
+    before = bench.controller.read_bytes()
+    assert bench.apply("--yes", "--configuration-changed") == ExitCode.UNEXPECTED
+    assert f"error:    {audit}\n" in capsys.readouterr().err
+    assert bench.controller.read_bytes() == before
+
+
+def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) -> None:
+    file = bench.controller.with_name("é😀.yaml")
+    bench.controller.rename(file)
+    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration), "--cell", str(bench.cell), "--to"]
+    shown = []
+    for more in ([], ["--json"]):
+        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+        done = subprocess.run([*command, str(file), *more], capture_output=True, env=environment, check=False)
+        assert (done.returncode, done.stderr) == (ExitCode.OK, b"")
+        shown.append(done.stdout.decode("ascii"))
+    assert "-9.210 \\u00b1 0.037" in shown[0]
+    assert json.loads(shown[1])["file"] == str(file)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from daq.cli.record import _interrupted
 from daq.cli.terminal import GRACE_S, SIGNALS, interruptible
+from daq.errors import ExitCode
 from drivers.errors import DriveFault
 
 
@@ -73,3 +76,20 @@ def test_what_is_not_known_to_rest_is_not_said_to() -> None:
     harmless = KeyboardInterrupt()
     harmless.__context__ = BlockingIOError()
     assert "axes stopped" in _interrupted(harmless, None, out)
+
+
+@pytest.mark.parametrize("module", ["daq.cli.app", "typer.core"])
+def test_an_interrupt_while_the_command_is_imported_is_no_traceback(module: str) -> None:
+    script = f"""
+import signal, sys
+
+def interrupt(event, given):
+    if event == "import" and given[0] == {module!r}:
+        signal.raise_signal(signal.SIGINT)
+
+sys.addaudithook(interrupt)
+from daq.cli import main
+sys.exit(main(["explain-emcy", "--help"]))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (ExitCode.INTERRUPTED, "", "interrupted\n")

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
-from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit
+from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit, OutputFailed
 from daq.ledger.audit import AuditAction, read
 from daq.writeback.file_access import backups, exclusive_writer
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -233,7 +233,7 @@ def test_whatever_step_fails_the_old_file_stays_and_nothing_is_left(
             patch.setattr(os, name, failing)
             try:
                 written = apply(proposal, NOW)
-            except (OSError, ControllerUnfit):  # a file that cannot be read is unfit
+            except (OSError, OutputFailed, ControllerUnfit):  # a file that cannot be read is unfit
                 written = None
         if failing.uses <= failures:
             break

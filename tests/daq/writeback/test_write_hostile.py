@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daq.errors import CalibrationMissing, ControllerUnfit
+from daq.errors import CalibrationMissing, ControllerUnfit, OutputFailed
 from daq.ledger.audit import AuditAction, Content, append, read, verify
 from daq.workflow import calibration_file
 from daq.writeback.file_target import FileTarget
@@ -130,7 +130,7 @@ def test_a_link_between_the_look_and_the_write_changes_nothing(controller: Path,
     proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
     victim = tmp_path / "victim"
     (controller.parent / ".demo.yaml.lock").symlink_to(victim)
-    with pytest.raises(OSError, match="symbolic link"):
+    with pytest.raises(OutputFailed, match=r"\.demo\.yaml\.lock: found .*symbolic link"):
         apply(proposal, NOW)
     assert not victim.exists()
 
