@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -87,7 +88,7 @@ class HistorySection:
         folder, stem = cell_file.parent, cell_file.stem
         store = (folder / (self.store or f"{stem}.history.sqlite")).resolve()
         for other in (cell_file, folder / (controller or cell_file.name)):
-            if store == other.resolve() or (store.exists() and other.exists() and store.samefile(other)):
+            if str(store) == os.path.realpath(other) or (store.exists() and other.exists() and store.samefile(other)):
                 where, found = f"{cell_file}: history.store", f"the same file as {other}"
                 expected, remedy = "a file of the history's own", "give it another name"
                 raise ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
