@@ -27,23 +27,14 @@ _READ_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """One node of a bus, as far as it reports.
+    """One node of a bus, as far as it reports."""
 
-    Attributes:
-        node_id: CANopen node id.
-        identity: object 1018h, or None when it answers no SDO (it may be stopped).
-        revision: 1018h:03, or None.
-        device_name: 1008h, or None.
-        nmt: NMT state of its last heartbeat, or None when it sends none.
-        statusword: 6041h, or None when it is no CiA 402 drive.
-    """
-
-    node_id: int
-    identity: Identity | None
-    revision: int | None
-    device_name: str | None
-    nmt: int | None
-    statusword: int | None
+    node_id: int  #: CANopen node id
+    identity: Identity | None  #: object 1018h, or None when it answers no SDO (it may be stopped)
+    revision: int | None  #: 1018h:03, or None
+    device_name: str | None  #: 1008h, or None
+    nmt: int | None  #: NMT state of its last heartbeat, or None when it sends none
+    statusword: int | None  #: 6041h, or None when it is no CiA 402 drive
 
     @property
     def state(self) -> State | None:

@@ -63,15 +63,10 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class MotionPermission:
-    """Permission to move these axes now, within limits; without it nothing moves.
+    """Permission to move these axes now, within limits; without it nothing moves."""
 
-    Attributes:
-        granted_by: operator or policy that takes the responsibility; it is logged.
-        limits: one for each axis.
-    """
-
-    granted_by: str
-    limits: tuple[AxisLimits, ...]
+    granted_by: str  #: operator or policy that takes the responsibility; it is logged
+    limits: tuple[AxisLimits, ...]  #: one for each axis
 
 
 def synchronised_move(

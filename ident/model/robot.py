@@ -42,15 +42,10 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A tree of n joints on a fixed base.
+    """A tree of n joints on a fixed base."""
 
-    Attributes:
-        joints: in the order of the axes.
-        gravity_m_s2: in the base frame, shape (3,); any mounting of the base is a direction of gravity.
-    """
-
-    joints: tuple[Joint, ...]
-    gravity_m_s2: FloatArray
+    joints: tuple[Joint, ...]  #: in the order of the axes
+    gravity_m_s2: FloatArray  #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
 
     @property
     def joint_count(self) -> int:
