@@ -88,19 +88,13 @@ class CurrentScale:
     """Ampere per raw unit = factor × product of the objects' values × weight of the switch's value.
 
     CiA 402 generic: factor 1e-6 (per mille of mA) × 6075h.
-
-    Attributes:
-        factor, objects: of the product; the objects are read by SDO at connect.
-        form: in a profile file.
-        switch: object whose value selects a weight, None where there is no choice.
-        weights: for the switch's values 0, 1, and so on.
     """
 
-    factor: float
-    objects: tuple[ObjectEntry, ...]
-    form: ScaleForm = ScaleForm.PRODUCT
-    switch: ObjectEntry | None = None
-    weights: tuple[float, ...] = (1.0,)
+    factor: float  #: of the product
+    objects: tuple[ObjectEntry, ...]  #: of the product; they are read by SDO at connect
+    form: ScaleForm = ScaleForm.PRODUCT  #: in a profile file
+    switch: ObjectEntry | None = None  #: object whose value selects a weight, None where there is no choice
+    weights: tuple[float, ...] = (1.0,)  #: for the switch's values 0, 1, and so on
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
         """Return the scale for the values of the objects and of the switch; IndexError for an unknown one."""

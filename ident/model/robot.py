@@ -298,11 +298,7 @@ def _finite(text: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
-
-    Attributes:
-        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
-    """
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint]."""
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray
