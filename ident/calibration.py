@@ -86,49 +86,30 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Gains, parameters and effects of a cell, with their errors and sources.
+    """Gains, parameters and effects of a cell, with their errors and sources."""
 
-    Attributes:
-        cell: name of the cell.
-        method: ls, wls, tls or ml.
-        gains: one an axis.
-        parameters: base parameters of the robot, then the unknown parameters of each payload mounting.
-        effects: accepted effects.
-        relative_error_percent: on the data of the fit.
-        holdout_error_percent: on a run that was used for nothing else, None where there was none; NaN for an axis that
-            did not move in it.
-        condition: of the weighted observation matrix.
-        rows: of the observation after masks and decimation.
-        filter: cut-offs, orders, decimation and standstill speeds, by name.
-        sources: logs, with digests and roles.
-        configuration_sha256: of the cell configuration that the logs carry.
-        created: ISO 8601 time, given by the caller.
-        software: name and version that made it.
-        nameplate_holdout_error_percent: on the same run, of the same model, effects included, fitted with the
-            nameplate's gains; the total weighs the axes by the torques under the identified gains. None where there is
-            none to compare.
-        recording_configuration_sha256: digest of the part of the configuration that a recording depends on; None in
-            calibrations of earlier versions.
-        session_began_s: when the first run of the fit began, by the clock of `Run.started_s`; None where a run has no
-            clock.
-    """
-
-    cell: str
-    method: str
-    gains: tuple[Gain, ...]
+    cell: str  #: name of the cell
+    method: str  #: ls, wls, tls or ml
+    gains: tuple[Gain, ...]  #: one an axis
+    #: Base parameters of the robot, then the unknown parameters of each payload mounting.
     parameters: tuple[Parameter, ...]
-    effects: tuple[AcceptedEffect, ...]
-    relative_error_percent: RelativeError
+    effects: tuple[AcceptedEffect, ...]  #: accepted effects
+    relative_error_percent: RelativeError  #: on the data of the fit
+    #: On a run that was used for nothing else, None where there was none; NaN for an axis that did not move in it.
     holdout_error_percent: RelativeError | None
-    condition: float
-    rows: int
-    filter: dict[str, float | list[float]]
-    sources: tuple[Source, ...]
-    configuration_sha256: str
-    created: str
-    software: str
+    condition: float  #: of the weighted observation matrix
+    rows: int  #: of the observation after masks and decimation
+    filter: dict[str, float | list[float]]  #: cut-offs, orders, decimation and standstill speeds, by name
+    sources: tuple[Source, ...]  #: logs, with digests and roles
+    configuration_sha256: str  #: of the cell configuration that the logs carry
+    created: str  #: ISO 8601 time, given by the caller
+    software: str  #: name and version that made it
+    #: When the first run of the fit began, by the clock of `Run.started_s`; None where a run has no clock.
     session_began_s: float | None = None
+    #: On the held-out run, of the same model, effects included, fitted with the nameplate's gains; the total weighs the
+    #: axes by the torques under the identified gains. None where there is none to compare.
     nameplate_holdout_error_percent: RelativeError | None = None
+    #: Digest of the part of the configuration that a recording depends on; None in calibrations of earlier versions.
     recording_configuration_sha256: str | None = None
 
 

@@ -39,21 +39,15 @@ _FRAME = re.compile(rb"< (?:frame ([0-9A-Fa-f]++) ([0-9]++\.?+[0-9]*+) ([0-9A-Fa
 
 @dataclass(frozen=True, slots=True)
 class BusAddress:
-    """Address of a bus.
+    """Address of a bus."""
 
-    Attributes:
-        interface: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the
-            name of any other python-can interface.
-        channel: of the interface, such as ``can0``.
-        bitrate_bit_s: of the wire; buses of the kernel and of a hub have theirs already.
-        host, port: of the hub (socketcand only).
-    """
-
+    #: ``virtual`` (one process), ``socketcand`` (a hub, across processes), ``socketcan`` (kernel), or the name of any
+    #: other python-can interface.
     interface: str
-    channel: str
-    bitrate_bit_s: int = 1_000_000
-    host: str = "127.0.0.1"
-    port: int = 29536
+    channel: str  #: of the interface, such as ``can0``
+    bitrate_bit_s: int = 1_000_000  #: of the wire; buses of the kernel and of a hub have theirs already
+    host: str = "127.0.0.1"  #: of the hub (socketcand only)
+    port: int = 29536  #: of the hub (socketcand only)
 
     def __str__(self) -> str:
         where = f"@{self.host}:{self.port}" if self.interface == "socketcand" else ""

@@ -26,19 +26,12 @@ class AxisLimits:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One synchronised point-to-point move in profile position mode.
+    """One synchronised point-to-point move in profile position mode; an axis that does not move gets no profile."""
 
-    Attributes:
-        target_counts: absolute, of each axis.
-        velocity_counts_s, acceleration_counts_s2: profile of each axis (6081h; 6083h and 6084h); not sent to an axis
-            that does not move.
-        dwell_cycles: samples to wait at the target.
-    """
-
-    target_counts: tuple[int, ...]
-    velocity_counts_s: tuple[int, ...]
-    acceleration_counts_s2: tuple[int, ...]
-    dwell_cycles: int = 0
+    target_counts: tuple[int, ...]  #: absolute, of each axis
+    velocity_counts_s: tuple[int, ...]  #: profile of each axis (6081h)
+    acceleration_counts_s2: tuple[int, ...]  #: profile of each axis (6083h and 6084h)
+    dwell_cycles: int = 0  #: samples to wait at the target
 
     def duration_s(self, start_counts: Sequence[int]) -> tuple[float, ...]:
         """Return the time that each axis needs from these positions."""
@@ -63,15 +56,10 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class MotionPermission:
-    """Permission to move these axes now, within limits; without it nothing moves.
+    """Permission to move these axes now, within limits; without it nothing moves."""
 
-    Attributes:
-        granted_by: operator or policy that takes the responsibility; it is logged.
-        limits: one for each axis.
-    """
-
-    granted_by: str
-    limits: tuple[AxisLimits, ...]
+    granted_by: str  #: operator or policy that takes the responsibility; it is logged
+    limits: tuple[AxisLimits, ...]  #: one for each axis
 
 
 def synchronised_move(

@@ -88,19 +88,13 @@ class CurrentScale:
     """Ampere per raw unit = factor × product of the objects' values × weight of the switch's value.
 
     CiA 402 generic: factor 1e-6 (per mille of mA) × 6075h.
-
-    Attributes:
-        factor, objects: of the product; the objects are read by SDO at connect.
-        form: in a profile file.
-        switch: object whose value selects a weight, None where there is no choice.
-        weights: for the switch's values 0, 1, and so on.
     """
 
-    factor: float
-    objects: tuple[ObjectEntry, ...]
-    form: ScaleForm = ScaleForm.PRODUCT
-    switch: ObjectEntry | None = None
-    weights: tuple[float, ...] = (1.0,)
+    factor: float  #: of the product
+    objects: tuple[ObjectEntry, ...]  #: of the product; they are read by SDO at connect
+    form: ScaleForm = ScaleForm.PRODUCT  #: in a profile file
+    switch: ObjectEntry | None = None  #: object whose value selects a weight, None where there is no choice
+    weights: tuple[float, ...] = (1.0,)  #: for the switch's values 0, 1, and so on
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
         """Return the scale for the values of the objects and of the switch; IndexError for an unknown one."""
@@ -139,36 +133,23 @@ class Fact:
 
 @dataclass(frozen=True, slots=True)
 class DriveProfile:
-    """Objects, types, scales and conventions of one make of amplifier, each fact with its source.
-
-    Attributes:
-        position: encoder position [counts], motor side.
-        current: the signal whose gain is identified.
-        current_scale: from raw unit to ampere in the stated amplitude convention.
-        saturation_bit: bit of statusword 6041h that shows an active limit, None when the drive has none.
-        toggle_bit: bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none:
-            then frozen data show as values that do not change in a move (drivers/motion/watch.py).
-        update_period_us: period in which the drive refreshes the mapped objects.
-        save_semantics: content of a save, in words; it decides what must be restored before a save.
-        source: documents, in short.
-        facts: the same for each key of the profile.
-        rated: the motor's name plate in the drive, None where it has none.
-        save: command that saves, None where there is none or it is unknown.
-    """
+    """Objects, types, scales and conventions of one make of amplifier, each fact with its source."""
 
     name: str
-    position: ObjectEntry
-    current: ObjectEntry
-    current_scale: CurrentScale
+    position: ObjectEntry  #: encoder position [counts], motor side
+    current: ObjectEntry  #: the signal whose gain is identified
+    current_scale: CurrentScale  #: from raw unit to ampere in the stated amplitude convention
     amplitude: Amplitude
     tap: TapPoint
-    saturation_bit: int | None
-    update_period_us: int
-    save_semantics: str
-    source: str
-    facts: tuple[Fact, ...] = ()
-    rated: RatedMotor | None = None
-    save: Save | None = None
+    saturation_bit: int | None  #: bit of statusword 6041h that shows an active limit, None when the drive has none
+    update_period_us: int  #: period in which the drive refreshes the mapped objects
+    save_semantics: str  #: content of a save, in words; it decides what must be restored before a save
+    source: str  #: documents, in short
+    facts: tuple[Fact, ...] = ()  #: the same for each key of the profile
+    rated: RatedMotor | None = None  #: the motor's name plate in the drive, None where it has none
+    save: Save | None = None  #: command that saves, None where there is none or it is unknown
+    #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it has none: then frozen
+    #: data show as values that do not change in a move (drivers/motion/watch.py).
     toggle_bit: int | None = None
 
     @property
@@ -209,19 +190,12 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """One amplifier of the cell.
+    """One amplifier of the cell."""
 
-    Attributes:
-        name: for messages and logs.
-        node_id: CANopen node id, 1 to 127.
-        profile: objects of position and current.
-        identity: expected 1018h, or None when it is not configured.
-    """
-
-    name: str
-    node_id: int
-    profile: DriveProfile = CIA402
-    identity: Identity | None = None
+    name: str  #: for messages and logs
+    node_id: int  #: CANopen node id, 1 to 127
+    profile: DriveProfile = CIA402  #: objects of position and current
+    identity: Identity | None = None  #: expected 1018h, or None when it is not configured
 
 
 class ParameterKind(Enum):

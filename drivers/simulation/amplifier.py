@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from drivers.simulation.dynamics import compiled
 from drivers.simulation.effects import Lag, build_effect
 from drivers.simulation.plant import Plant, reduction
-from drivers.simulation.spec import CellSpec
-
-FloatArray = NDArray[np.float64]
+from drivers.simulation.spec import CellSpec, FloatArray
 
 VELOCITY_BANDWIDTH_RAD_S = 220.0
 """Bandwidth of the closed velocity loop at the tuned inertia; an axis a few times lighter is still stable."""

@@ -311,22 +311,18 @@ class SimulatedCell:
             amplifiers.control(plant.motor_rad)
         self.cycles += 1
         amplifiers.report()
-        now_us = self.time_us
         for node in self.nodes:
             node.end_cycle()
-        self._send_together(synchronised, now_us)
+        # The answers to a SYNC are one burst: on a hub one system call instead of one for each frame.
+        self._burst = []
+        for node in synchronised:
+            node.send_sync(self.time_us)
+        burst, self._burst = self._burst, None
+        self._put(burst)
 
     def _send_of(self, index: int, can_id: int, data: bytes) -> None:
         for frame in self._disturbance.sent(index, self.nodes[index].node_id, can_id, data):
             self._send(*frame)
-
-    def _send_together(self, nodes: Sequence[Node], now_us: int) -> None:
-        """Send the nodes' answers to a SYNC as one burst: on a hub one system call instead of one for each frame."""
-        self._burst = []
-        for node in nodes:
-            node.send_sync(now_us)
-        burst, self._burst = self._burst, None
-        self._put(burst)
 
     def _send(self, can_id: int, data: bytes) -> None:
         message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)

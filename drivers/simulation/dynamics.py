@@ -24,6 +24,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.simulation.spec import FloatArray
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -35,8 +37,6 @@ def compiled(function: F) -> F:
     """
     return cast(F, numba.njit(cache=True)(function))
 
-
-FloatArray = NDArray[np.float64]
 
 TOLERANCE_RAD_S = 1e-10  #: Largest speed that a direction may keep while its friction is inside its bound [rad/s]
 

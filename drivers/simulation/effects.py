@@ -13,11 +13,8 @@ from functools import partial
 from inspect import Parameter, signature
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.simulation.spec import SpecInvalid, UndeclaredEffect
-
-FloatArray = NDArray[np.float64]
+from drivers.simulation.spec import FloatArray, SpecInvalid, UndeclaredEffect
 
 
 @dataclass(slots=True)

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from drivers.simulation.dynamics import TOLERANCE_RAD_S, Mechanics, advance
 from drivers.simulation.effects import Coupling, Effect, Elasticity, Lag, Moment, build_effect
-from drivers.simulation.spec import Body, CellSpec, FrictionUnsolved, SpecInvalid
-
-FloatArray = NDArray[np.float64]
+from drivers.simulation.spec import Body, CellSpec, FloatArray, FrictionUnsolved, SpecInvalid
 
 BRAKE_FACTOR = 2.0  #: Holding torque of a brake over the peak torque of its motor
 

@@ -17,35 +17,20 @@ from drivers.profiles.profile import Axis
 
 @dataclass(frozen=True, slots=True)
 class StreamStatistics:
-    """Counts of frames up to now; in a sound run all are zero but `cycles`, `frames` and `foreign`.
+    """Counts of frames up to now; in a sound run all are zero but `cycles`, `frames` and `foreign`."""
 
-    Attributes:
-        cycles: SYNCs sent, or followed.
-        frames: answers used.
-        missing: answers that did not come in their cycle.
-        late: answers that came in a later cycle, where that could be known.
-        duplicate: second answers of an axis to one SYNC.
-        surplus: PDOs of an axis of the cell that are not mapped.
-        wrong_length: answers whose length differs from the mapping; they count as missing too.
-        skipped_periods: periods without a SYNC because the schedule slipped, or a followed SYNC did not come.
-        kernel_dropped: frames of any kind that the kernel dropped because its receive buffer was full.
-        interface_dropped: frames dropped by the interface, before the buffer.
-        backlog_dropped: frames that the capture process dropped because this process did not read them.
-        foreign: PDOs that do no harm: of nodes that are no axes of the cell, or from before the first SYNC.
-    """
-
-    cycles: int = 0
-    frames: int = 0
-    missing: int = 0
-    late: int = 0
-    duplicate: int = 0
-    surplus: int = 0
-    wrong_length: int = 0
-    skipped_periods: int = 0
-    kernel_dropped: int = 0
-    interface_dropped: int = 0
-    backlog_dropped: int = 0
-    foreign: int = 0
+    cycles: int = 0  #: SYNCs sent, or followed
+    frames: int = 0  #: answers used
+    missing: int = 0  #: answers that did not come in their cycle
+    late: int = 0  #: answers that came in a later cycle, where that could be known
+    duplicate: int = 0  #: second answers of an axis to one SYNC
+    surplus: int = 0  #: PDOs of an axis of the cell that are not mapped
+    wrong_length: int = 0  #: answers whose length differs from the mapping; they count as missing too
+    skipped_periods: int = 0  #: periods without a SYNC because the schedule slipped, or a followed SYNC did not come
+    kernel_dropped: int = 0  #: frames of any kind that the kernel dropped because its receive buffer was full
+    interface_dropped: int = 0  #: frames dropped by the interface, before the buffer
+    backlog_dropped: int = 0  #: frames that the capture process dropped because this process did not read them
+    foreign: int = 0  #: PDOs that do no harm: of nodes that are no axes of the cell, or from before the first SYNC
 
 
 @dataclass(frozen=True, slots=True)

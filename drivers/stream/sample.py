@@ -12,23 +12,17 @@ class Sample:
     """Reports of all axes for one SYNC.
 
     Values are raw counts, converted late: the gain is to be identified, so the data contain no assumed gain.
-
-    Attributes:
-        cycle: number of the sampling period since the stream began; a period that had no SYNC leaves a gap.
-        time_ns: time of the SYNC, not of the frames that answered it: wall time at the stream's first SYNC plus the
-            monotonic time since [ns since 1970].
-        position_counts: motor-side position of each axis [encoder counts].
-        current_raw: signal of the current loop of each axis [unit of the drive profile's current object].
-        statusword: CiA 402 object 6041h of each axis.
-        missing: bit i is set when axis i did not answer this SYNC; its values then repeat the last known ones.
     """
 
-    cycle: int
+    cycle: int  #: number of the sampling period since the stream began; a period that had no SYNC leaves a gap
+    #: Time of the SYNC, not of the frames that answered it: wall time at the stream's first SYNC plus the monotonic
+    #: time since [ns since 1970].
     time_ns: int
-    position_counts: tuple[int, ...]
+    position_counts: tuple[int, ...]  #: motor-side position of each axis [encoder counts]
+    #: Signal of the current loop of each axis [unit of the drive profile's current object].
     current_raw: tuple[int, ...]
-    statusword: tuple[int, ...]
-    missing: int = 0
+    statusword: tuple[int, ...]  #: CiA 402 object 6041h of each axis
+    missing: int = 0  #: bit i is set when axis i did not answer this SYNC; its values then repeat the last known ones
 
 
 class EventKind(Enum):
@@ -60,22 +54,15 @@ class EventKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class CellEvent:
-    """One event of the cell.
+    """One event of the cell."""
 
-    Attributes:
-        time_ns: time of the SYNC before it [ns since 1970].
-        axis: index of the axis from 0, or None for the whole cell.
-        kind: of the event.
-        code: by kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the
-            cycle, bits of the controller's state, number of frames.
-        text: for the operator.
-    """
-
-    time_ns: int
-    axis: int | None
-    kind: EventKind
+    time_ns: int  #: time of the SYNC before it [ns since 1970]
+    axis: int | None  #: index of the axis from 0, or None for the whole cell
+    kind: EventKind  #: of the event
+    #: By kind: EMCY error code, NMT state, statusword, identifier of a frame, number of the move or of the cycle, bits
+    #: of the controller's state, number of frames.
     code: int
-    text: str
+    text: str  #: for the operator
 
 
 EventSink = Callable[[CellEvent], None]

@@ -33,17 +33,11 @@ _FROM_NODES = frozenset((0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700))
 
 @dataclass(frozen=True, slots=True)
 class BusPart:
-    """One of the buses of a cell.
+    """One of the buses of a cell."""
 
-    Attributes:
-        name: for messages.
-        address: of the bus.
-        node_ids: of the amplifiers on it.
-    """
-
-    name: str
-    address: BusAddress
-    node_ids: frozenset[int]
+    name: str  #: for messages
+    address: BusAddress  #: of the bus
+    node_ids: frozenset[int]  #: of the amplifiers on it
 
     def __str__(self) -> str:
         return f"{self.name} ({self.address})"

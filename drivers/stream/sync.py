@@ -51,18 +51,12 @@ class LockstepSync:
     """Send the next SYNC when the last one is answered: for a simulated cell, whose time is the SYNC itself.
 
     The time of the samples is made up, one period a cycle.
-
-    Attributes:
-        period_ns: time of one cycle [ns].
-        timeout_s: time in which one cycle must be answered [s of the clock].
-        start_ns: wall time of cycle 0 [ns since 1970].
-        clock: for the time-out and the heartbeats [ns].
     """
 
-    period_ns: int
-    timeout_s: float = 1.0
-    start_ns: int = 0
-    clock: Clock = time.monotonic_ns
+    period_ns: int  #: time of one cycle [ns]
+    timeout_s: float = 1.0  #: time in which one cycle must be answered [s of the clock]
+    start_ns: int = 0  #: wall time of cycle 0 [ns since 1970]
+    clock: Clock = time.monotonic_ns  #: for the time-out and the heartbeats [ns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +64,11 @@ class TimedSync:
     """Send a SYNC every period by the clock, on an absolute schedule that starts with the first one.
 
     Whole periods that were missed are counted and left out; there is never a burst to catch up.
-
-    Attributes:
-        period_ns: of the schedule [ns].
-        start_ns: wall time of the first SYNC [ns since 1970].
-        clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
 
-    period_ns: int
-    start_ns: int = 0
-    clock: Clock = time.monotonic_ns
+    period_ns: int  #: of the schedule [ns]
+    start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
+    clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,26 +76,19 @@ class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
 
     The order of the frames on the bus decides which cycle they belong to: a late reader loses nothing.
-
-    Attributes:
-        period_ns: of the producer [ns].
-        producer: its name, for messages.
-        in_kernel: the producer is this machine's kernel; a SYNC from the wire is then another device's.
-        timeout_s: time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself,
-            because the axes are stopped by frames that act on SYNC.
-        seen: called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where
-            the producer must be steered.
-        start_ns: wall time of the first SYNC [ns since 1970].
-        clock: monotonic [ns]; the time since the first SYNC is added to start_ns.
     """
 
-    period_ns: int
-    producer: str
-    in_kernel: bool = False
+    period_ns: int  #: of the producer [ns]
+    producer: str  #: its name, for messages
+    in_kernel: bool = False  #: the producer is this machine's kernel; a SYNC from the wire is then another device's
+    #: Time without a SYNC after which the producer counts as dead; the stream then sends SYNC itself, because the axes
+    #: are stopped by frames that act on SYNC.
     timeout_s: float = 0.1
+    #: Called with the monotonic time of each SYNC [ns], and the number of periods since the one before, where the
+    #: producer must be steered.
     seen: Callable[[int, int], None] | None = None
-    start_ns: int = 0
-    clock: Clock = time.monotonic_ns
+    start_ns: int = 0  #: wall time of the first SYNC [ns since 1970]
+    clock: Clock = time.monotonic_ns  #: monotonic [ns]; the time since the first SYNC is added to start_ns
 
 
 Pacing = LockstepSync | TimedSync | FollowedSync

@@ -17,21 +17,16 @@ from ident.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """How raw samples become rows.
+    """How raw samples become rows."""
 
-    Attributes:
-        position_cutoff_hz, position_order: zero-phase Butterworth on the position, before the central differences.
-        decimation_cutoff_hz: of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
-        standstill_rad_s: speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty,
-            it is derived from each run (`ident.data.dataset.standstill_speed`).
-        standstill_share: a row is left out when standstill fills more than this share of its filter window.
-    """
-
-    position_cutoff_hz: float = 40.0
-    position_order: int = 4
+    position_cutoff_hz: float = 40.0  #: zero-phase Butterworth on the position, before the central differences
+    position_order: int = 4  #: order of that filter
+    #: Of the parallel decimation of every column; a row is kept every 1/(2.5 cut-off).
     decimation_cutoff_hz: float = 20.0
+    #: Speed below which a joint is at standstill, one a joint (m/s for a prismatic one); if empty, it is derived from
+    #: each run (`ident.data.dataset.standstill_speed`).
     standstill_rad_s: tuple[float, ...] = ()
-    standstill_share: float = 0.1
+    standstill_share: float = 0.1  #: a row is left out when standstill fills more than this share of its filter window
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""

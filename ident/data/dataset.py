@@ -26,34 +26,21 @@ LONGEST_MOVE_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Dataset:
-    """A run with derivatives; arrays have the shape (k, n), and each axis is contiguous in memory.
+    """A run with derivatives; arrays have the shape (k, n), and each axis is contiguous in memory."""
 
-    Attributes:
-        name: of the run.
-        rate_hz: sampling rate.
-        time_s: shape (k,), from the run.
-        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints, low-passed and differentiated.
-        current_a: of the motors, as recorded.
-        moving: joint faster than its standstill speed.
-        motor_moving: motor faster than its joint's standstill speed times the reduction.
-        valid: sample may be used.
-        move: number of the move of each sample, shape (k,); a move longer than LONGEST_MOVE_S counts as several.
-        payload: what was mounted, None without load.
-        started_s: when the run began, on a clock that the runs of one session share; None without a clock.
-    """
-
-    name: str
-    rate_hz: float
-    time_s: FloatArray
-    position_rad: FloatArray
-    velocity_rad_s: FloatArray
-    acceleration_rad_s2: FloatArray
-    current_a: FloatArray
-    moving: BoolArray
-    motor_moving: BoolArray
-    valid: BoolArray
-    move: IntArray
-    payload: Payload | None
+    name: str  #: of the run
+    rate_hz: float  #: sampling rate
+    time_s: FloatArray  #: shape (k,), from the run
+    position_rad: FloatArray  #: of the joints, low-passed
+    velocity_rad_s: FloatArray  #: of the joints, low-passed and differentiated
+    acceleration_rad_s2: FloatArray  #: of the joints, low-passed and differentiated twice
+    current_a: FloatArray  #: of the motors, as recorded
+    moving: BoolArray  #: joint faster than its standstill speed
+    motor_moving: BoolArray  #: motor faster than its joint's standstill speed times the reduction
+    valid: BoolArray  #: sample may be used
+    move: IntArray  #: number of the move of each sample, shape (k,); one longer than LONGEST_MOVE_S counts as several
+    payload: Payload | None  #: what was mounted, None without load
+    #: When the run began, on a clock that the runs of one session share; None without a clock.
     started_s: float | None = None
 
     def motion(self, part: slice = slice(None)) -> Motion:

@@ -25,34 +25,25 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One recording of n joints over k samples at a constant rate.
+    """One recording of n joints over k samples at a constant rate."""
 
-    Attributes:
-        name: for messages and reports (the log's stem).
-        time_s: time of each sample [s], shape (k,), uniform.
-        position_rad: joint positions [rad; m for a prismatic joint], shape (k, n).
-        current_a: input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is
-            Nm at the joint per that unit], shape (k, n).
-        payload: what was mounted, or None without load.
-        move: number of the move that each sample belongs to, shape (k,), or None where it was not recorded.
-        digest: of the log it was read from (sha256, hex).
-        valid: whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
-        started_s: when the run began, on a clock that the runs of one session share [s]; None without a clock.
-        partial: it is what was saved of a recording that was never finished, or one whose losses were accepted.
-        recording: how the log was made; None where the run is from no log.
-    """
-
-    name: str
-    time_s: FloatArray
-    position_rad: FloatArray
+    name: str  #: for messages and reports (the log's stem)
+    time_s: FloatArray  #: time of each sample [s], shape (k,), uniform
+    position_rad: FloatArray  #: joint positions [rad; m for a prismatic joint], shape (k, n)
+    #: Input references of the current loops, one a motor [A, or whatever unit the drive speaks: a gain is Nm at the
+    #: joint per that unit], shape (k, n).
     current_a: FloatArray
-    payload: Payload | None = None
+    payload: Payload | None = None  #: what was mounted, or None without load
+    #: Number of the move that each sample belongs to, shape (k,), or None where it was not recorded.
     move: IntArray | None = None
-    digest: str = ""
+    digest: str = ""  #: of the log it was read from (sha256, hex)
+    #: Whether each sample may be used, shape (k, n): False where a frame was missing or a limit acted.
     valid: BoolArray | None = None
+    #: When the run began, on a clock that the runs of one session share [s]; None without a clock.
     started_s: float | None = None
+    #: It is what was saved of a recording that was never finished, or one whose losses were accepted.
     partial: bool = False
-    recording: Recording | None = None
+    recording: Recording | None = None  #: how the log was made; None where the run is from no log
 
     @property
     def rate_hz(self) -> float:

@@ -44,29 +44,17 @@ MAX_EFFECTS = 12  #: More effects than this on one robot mean that the declared 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """An estimate with its rows at hand, for searches and plots.
+    """An estimate with its rows at hand, for searches and plots."""
 
-    Attributes:
-        model: the declared model.
-        conditioning: the filters.
-        datasets: all runs, held-out runs last.
-        held_out: number of held-out runs.
-        rows_without_effects: rows of all runs, without effects.
-        training: rows of the fit, with the columns of the effects.
-        holdout: rows of the held-out runs, None without any.
-        effects: in the model, in the order of their columns.
-        estimate: of the training rows.
-    """
-
-    model: Model
-    conditioning: Conditioning
-    datasets: tuple[Dataset, ...]
-    held_out: int
-    rows_without_effects: Observation
-    training: Observation
-    holdout: Observation | None
-    effects: tuple[PlacedEffect, ...]
-    estimate: Estimate
+    model: Model  #: the declared model
+    conditioning: Conditioning  #: the filters
+    datasets: tuple[Dataset, ...]  #: all runs, held-out runs last
+    held_out: int  #: number of held-out runs
+    rows_without_effects: Observation  #: rows of all runs, without effects
+    training: Observation  #: rows of the fit, with the columns of the effects
+    holdout: Observation | None  #: rows of the held-out runs, None without any
+    effects: tuple[PlacedEffect, ...]  #: in the model, in the order of their columns
+    estimate: Estimate  #: of the training rows
 
     @property
     def trained(self) -> tuple[Dataset, ...]:
@@ -87,24 +75,16 @@ class Evidence:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One turn of the loop: the findings, and the model after it.
+    """One turn of the loop: the findings, and the model after it."""
 
-    Attributes:
-        findings: named effects on all axes, the best on held-out moves first.
-        structures: smooth and periodic terms: on the axis of the best named effect, which must not be much worse than
-            they are, or on all axes where no named effect passed.
-        limits_nm: torque (root mean square) that a detectable effect has at each motor, shape (n,).
-        accepted: the finding, or the structure without a name, that joined the model; None ends the loop.
-        after: the model with it.
-        ended: reason why the search ended here although the residual may call for more; else empty.
-    """
-
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...]  #: named effects on all axes, the best on held-out moves first
+    #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse than they are, or
+    #: on all axes where no named effect passed.
     structures: tuple[Finding, ...]
-    limits_nm: FloatArray
-    accepted: Finding | None
-    after: Evidence
-    ended: str = ""
+    limits_nm: FloatArray  #: torque (root mean square) that a detectable effect has at each motor, shape (n,)
+    accepted: Finding | None  #: the finding, or the structure without a name, that joined the model; None ends the loop
+    after: Evidence  #: the model with it
+    ended: str = ""  #: reason why the search ended here although the residual may call for more; else empty
 
 
 def find_effects(

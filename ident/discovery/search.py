@@ -142,13 +142,8 @@ def effect_key(effect: Effect, axis: int) -> EffectKey:
     return effect.name, axis, tuple(value for value in effect.settings.values() if isinstance(value, int))
 
 
-def is_better(one: Finding, other: Finding) -> bool:
-    """Whether one finding explains more than another by a paired comparison over folds."""
-    return bool(_better(one.fold_errors, other.fold_errors))
-
-
 def _better(one: FloatArray, other: FloatArray) -> BoolArray:
-    """The same for ‖e‖² of each fold, folds last."""
+    """Whether one ‖e‖² is less than the other by a paired comparison over folds, folds last."""
     gain = other - one
     count = gain.shape[-1]
     error = np.std(gain, axis=-1, ddof=1) * np.sqrt(count)
@@ -336,7 +331,7 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
     Then the true effect is only similar to the named one, and the residual counts as unexplained.
     """
     more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
-    return structure.passed and more and is_better(structure, named)
+    return structure.passed and more and bool(_better(structure.fold_errors, named.fold_errors))
 
 
 def detection_limits_nm(search_problem: SearchProblem, gates: Gates) -> FloatArray:

@@ -45,33 +45,20 @@ def of_squares(size: FloatArray, left: FloatArray) -> RelativeError:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Gains and parameters, with their covariance and the condition of their equations.
+    """Gains and parameters, with their covariance and the condition of their equations."""
 
-    Attributes:
-        method: which estimator.
-        gains: g of each motor [Nm at the joint per A], shape (n,).
-        gains_fixed: the gains were given, not estimated.
-        unknowns: name and unit of each parameter: χ, then χ_uL.
-        parameters: their values, shape (p,).
-        covariance: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed.
-        axis_noise: standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
-        singular_values: of the weighted observation matrix W_r (``tls``: of W_tot).
-        condition: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5.
-        rows: equations used.
-        iterations: of an iterative estimator.
-    """
-
-    method: Method
-    gains: FloatArray
-    gains_fixed: bool
-    unknowns: tuple[Column, ...]
-    parameters: FloatArray
-    covariance: FloatArray
+    method: Method  #: which estimator
+    gains: FloatArray  #: g of each motor [Nm at the joint per A], shape (n,)
+    gains_fixed: bool  #: the gains were given, not estimated
+    unknowns: tuple[Column, ...]  #: name and unit of each parameter: χ, then χ_uL
+    parameters: FloatArray  #: their values, shape (p,)
+    covariance: FloatArray  #: of (gains, parameters), shape (n + p, n + p); gains' rows are zero where they were fixed
+    #: Standard deviation of the residual [Nm for joint equations, A for ml's motor equations], shape (n,).
     axis_noise: FloatArray
-    singular_values: FloatArray
-    condition: float
-    rows: int
-    iterations: int = 0
+    singular_values: FloatArray  #: of the weighted observation matrix W_r (``tls``: of W_tot)
+    condition: float  #: of W_r, rows of a joint divided by the deviation of this estimate's residual, as in Table 5
+    rows: int  #: equations used
+    iterations: int = 0  #: of an iterative estimator
 
     @property
     def gains_std(self) -> FloatArray:

@@ -33,21 +33,13 @@ LARGEST_UNKNOWN_PERCENT = 25.0  #: The same, on an axis whose gain is smaller th
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """An estimate with the equations it rests on, and those that it has not seen.
+    """An estimate with the equations it rests on, and those that it has not seen."""
 
-    Attributes:
-        model: the declared model.
-        conditioning: the filters.
-        system: of the fit.
-        holdout: of the runs that were held out, with the unknowns of the fit; None without any.
-        estimate: from ``system`` alone.
-    """
-
-    model: Model
-    conditioning: Conditioning
-    system: System
-    holdout: System | None
-    estimate: Estimate
+    model: Model  #: the declared model
+    conditioning: Conditioning  #: the filters
+    system: System  #: of the fit
+    holdout: System | None  #: of the runs that were held out, with the unknowns of the fit; None without any
+    estimate: Estimate  #: from ``system`` alone
 
     @property
     def training_error(self) -> RelativeError:

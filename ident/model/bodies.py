@@ -31,18 +31,14 @@ _ROWS, _COLUMNS = np.triu_indices(3)
 class Payload:
     """A weighed body as it was mounted; each mounting has its own unknowns.
 
-    Attributes:
-        name: of the body.
-        mounting: names one way of mounting it; runs that share it share their unknown parameters.
-        known: known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame
-            (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
-
     Raises:
         ModelError: a name is not in LINK_PARAMETERS, or a value is no number.
     """
 
-    name: str
-    mounting: str
+    name: str  #: of the body
+    mounting: str  #: names one way of mounting it; runs that share it share their unknown parameters
+    #: Known inertial parameters by their names in LINK_PARAMETERS, in the last joint's frame (paper eq. 5, χ_kL); the
+    #: weighed mass alone is {"m": 4.59}.
     known: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -18,13 +18,9 @@ DRIVE_UNITS = {JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"), JointKind.PRISMATI
 
 @dataclass(frozen=True, slots=True)
 class DriveTrain:
-    """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24).
+    """Gears between motors and joints: q_motor = R q_joint and τ_joint = Rᵀ τ_motor (paper eq. 24)."""
 
-    Attributes:
-        ratio: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do.
-    """
-
-    ratio: FloatArray
+    ratio: FloatArray  #: R, shape (n, n), invertible; row i belongs to motor i. Nested lists will do
 
     def __post_init__(self) -> None:
         ratio = as_array("the drive train", self.ratio)

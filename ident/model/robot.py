@@ -42,15 +42,10 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A tree of n joints on a fixed base.
+    """A tree of n joints on a fixed base."""
 
-    Attributes:
-        joints: in the order of the axes.
-        gravity_m_s2: in the base frame, shape (3,); any mounting of the base is a direction of gravity.
-    """
-
-    joints: tuple[Joint, ...]
-    gravity_m_s2: FloatArray
+    joints: tuple[Joint, ...]  #: in the order of the axes
+    gravity_m_s2: FloatArray  #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
 
     @property
     def joint_count(self) -> int:
@@ -303,11 +298,7 @@ def _finite(text: str) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint].
-
-    Attributes:
-        position_rad, velocity_rad_s, acceleration_rad_s2: of the joints.
-    """
+    """Motion of n joints over k samples, arrays of shape (k, n) [rad; m for a prismatic joint]."""
 
     position_rad: FloatArray
     velocity_rad_s: FloatArray
