@@ -190,8 +190,7 @@ def fit_fleet(
 
     def row_of(cell: CellLogs, result: Summary | Failure, seconds: float) -> FleetRow:
         fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
-        several = configurations[cell.cell]
-        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, several)
+        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations[cell.cell])
 
     missing = []
     for cell in cells:
