@@ -43,31 +43,18 @@ class DataUse(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """One run under a calibration; arrays are joint-first, decimated rows last.
+    """One run under a calibration; arrays are joint-first, decimated rows last."""
 
-    Attributes:
-        log: where the run was read.
-        run: its name.
-        digest: of the log (sha256, hex).
-        data_use: whether the fit has seen it.
-        same_configuration: the log carries the cell configuration that the calibration was made with.
-        partial: the log was salvaged from a recording that never finished.
-        time_s: of each row, since the start of the run, shape (r,).
-        measured_nm: V g with the calibration's gains, shape (n, r).
-        predicted_nm: what the calibration says the joints need, shape (n, r).
-        use: rows of each joint that count, shape (n, r).
-    """
-
-    log: Path
-    run: str
-    digest: str
-    data_use: DataUse
-    same_configuration: bool
-    partial: bool
-    time_s: FloatArray
-    measured_nm: FloatArray
-    predicted_nm: FloatArray
-    use: BoolArray
+    log: Path  #: where the run was read
+    run: str  #: its name
+    digest: str  #: of the log (sha256, hex)
+    data_use: DataUse  #: whether the fit has seen it
+    same_configuration: bool  #: the log carries the cell configuration that the calibration was made with
+    partial: bool  #: the log was salvaged from a recording that never finished
+    time_s: FloatArray  #: of each row, since the start of the run, shape (r,)
+    measured_nm: FloatArray  #: V g with the calibration's gains, shape (n, r)
+    predicted_nm: FloatArray  #: what the calibration says the joints need, shape (n, r)
+    use: BoolArray  #: rows of each joint that count, shape (n, r)
 
     @property
     def error(self) -> RelativeError:
