@@ -99,15 +99,16 @@ def cron_line(wanted: Installation) -> str:
 
 def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str, ...]:
     """Commands to type next."""
-    user = "--user " if wanted.user else ""
+    systemctl = "systemctl --user" if wanted.user else "systemctl"
+    journal = "journalctl --user" if wanted.user else "journalctl"
     service = timer.name.removesuffix(".timer") + ".service"
     return (
-        f"systemd-analyze {user}verify {shlex.quote(str(folder / timer.name))}",
-        f"systemctl {user}daemon-reload",
-        f"systemctl {user}start {service}    # once, with an operator at the cell",
-        f"systemctl {user}enable --now {timer.name}",
-        f"systemctl {user}list-timers {timer.name}",
-        f"journalctl {user}-u {service} -o cat",
+        f"systemd-analyze {'--user ' if wanted.user else ''}verify {shlex.quote(str(folder / timer.name))}",
+        f"{systemctl} daemon-reload",
+        f"{systemctl} start {service}    # once, with an operator at the cell",
+        f"{systemctl} enable --now {timer.name}",
+        f"{systemctl} list-timers {timer.name}",
+        f"{journal} -u {service} -o cat",
     )
 
 

@@ -51,7 +51,8 @@ def show_axis(series: Series, all_series: Sequence[Series], actions: Mapping[str
             f"New baseline of {series.axis} from {noted.since:%Y-%m-%d %H:%M} on: {printable(noted.why)} "
             f"({printable(noted.who)}, {noted.at:%Y-%m-%d})"
         )
-    if alarm_text(series) is not None:
+    words = alarm_text(series)
+    if words is not None:
         say_alarms(all_series, console)
     elif series.drift is not None:
         console.print(f"No alarm. σ of the changes is {series.dispersion:.2f} × that of the fits.")
@@ -100,7 +101,8 @@ def calibration_table(entries: Sequence[Entry], all_series: Sequence[Series], ac
 
 def gain_table(all_series: Sequence[Series]) -> Table:
     """Each gain as it was found last, beside its baseline."""
-    table = plain_table(("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit"), left=(0, 5, 6))
+    headings = ("axis", "gain ± σ", "nameplate", "since baseline %", "σ", "state", "unit")
+    table = plain_table(headings, left=(0, 5, 6))
     for series in all_series:
         if not series.points:
             table.add_row(printable(series.axis), "not identified", "-", "-", "-", "-", printable(series.unit))
