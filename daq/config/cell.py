@@ -144,48 +144,28 @@ class MotionPolicy(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cell:
-    """A cell as declared, in SI units.
-
-    Attributes:
-        name: name of the cell.
-        urdf: text of the URDF.
-        gravity_m_s2: in the base frame.
-        ratio: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m for a prismatic joint.
-        buses: buses of the amplifiers, usually one; empty in a cell that only imports recordings.
-        sync: sampling; None in such a cell.
-        axes: n axes.
-        payloads: bodies that can be mounted.
-        conditioning: the filters.
-        controller: destination of the gains, None without write-back.
-        clearance: the room around the arm, None if it is not declared.
-        folder: folder of the cell file; None for a cell from a log.
-        digest: sha256 of the cell file and all files it refers to, hex.
-        recording_digest: sha256 of the content that a recording or its fit depends on: without comments, and without
-            the later use of a calibration (`policy`, `history`, `recalibration`).
-        motion: permission that a recording needs.
-        apply: bounds and permissions of the write-back.
-        history: files of the history; None for a cell from a log.
-        recalibration: the scheduled job; None without one, or for a cell from a log.
-    """
+    """A cell as declared, in SI units."""
 
     name: str
-    urdf: str
-    gravity_m_s2: tuple[float, float, float]
-    ratio: FloatArray
-    buses: tuple[Bus, ...]
-    sync: Sync | None
-    axes: tuple[Axis, ...]
-    payloads: tuple[WeighedPayload, ...]
-    conditioning: Conditioning
-    controller: Controller | None
-    clearance: Clearance | None
-    folder: Path | None
-    digest: str
+    urdf: str  #: text of the URDF
+    gravity_m_s2: tuple[float, float, float]  #: in the base frame
+    ratio: FloatArray  #: drive train R with q_motor = R q_joint (paper eq. 24), shape (n, n); rad/m, prismatic joints
+    buses: tuple[Bus, ...]  #: buses of the amplifiers, usually one; empty in a cell that only imports recordings
+    sync: Sync | None  #: sampling; None in such a cell
+    axes: tuple[Axis, ...]  #: n axes
+    payloads: tuple[WeighedPayload, ...]  #: bodies that can be mounted
+    conditioning: Conditioning  #: the filters
+    controller: Controller | None  #: destination of the gains, None without write-back
+    clearance: Clearance | None  #: the room around the arm, None if it is not declared
+    folder: Path | None  #: folder of the cell file; None for a cell from a log
+    digest: str  #: sha256 of the cell file and all files it refers to, hex
+    #: sha256 of the content that a recording or its fit depends on, hex: without comments, and without the later use of
+    #: a calibration (`policy`, `history`, `recalibration`).
     recording_digest: str
-    motion: MotionPolicy = MotionPolicy.ASK
-    apply: ApplyPolicy = DEFAULT_APPLY_POLICY
-    history: HistoryPlace | None = None
-    recalibration: Recalibration | None = None
+    motion: MotionPolicy = MotionPolicy.ASK  #: permission that a recording needs
+    apply: ApplyPolicy = DEFAULT_APPLY_POLICY  #: bounds and permissions of the write-back
+    history: HistoryPlace | None = None  #: files of the history; None for a cell from a log
+    recalibration: Recalibration | None = None  #: the scheduled job; None without one, or for a cell from a log
 
     @property
     def controller_path(self) -> Path | None:

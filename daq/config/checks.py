@@ -171,8 +171,7 @@ def _kind_faults(path: Location, axis: AxisModel, joint: Joint) -> Iterator[Faul
             f"limits in {written.name}, and {what}",
             f"position_{name}, velocity_{name}_s and acceleration_{name}_s2",
         )
-    offsets = ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm))
-    for other, offset in offsets:
+    for other, offset in ((DEGREE, axis.zero_offset_deg), (MILLIMETRE, axis.zero_offset_mm)):
         if offset is not None and other is not unit:
             yield Fault((*path, f"zero_offset_{other.name}"), f"{other.name}, and {what}", f"zero_offset_{unit.name}")
     if axis.lead_mm is not None and joint.kind is not JointKind.PRISMATIC:
@@ -185,13 +184,9 @@ def _gain_faults(model: CellModel, joints: Sequence[Joint]) -> Iterator[Fault]:
     except ValueError:
         gained = ()  # _ratio_faults refuses the drive train
     for index, axis in enumerate(model.axes):
-        gains = {
-            "nameplate_gain": axis.nameplate_gain,
-            "nameplate_gain_nm_per_a": axis.nameplate_gain_nm_per_a,
-            "nameplate_gain_n_per_a": axis.nameplate_gain_n_per_a,
-        }
-        key, value = next((key, value) for key, value in gains.items() if value is not None)
-        if not value:
+        keys = ("nameplate_gain", "nameplate_gain_nm_per_a", "nameplate_gain_n_per_a")
+        key = next(key for key in keys if getattr(axis, key) is not None)
+        if not getattr(axis, key):
             yield Fault(("axes", index, key), "0", "the manufacturer's gain, signed, not zero")
         if index >= len(gained) or gained[index] >= len(joints):
             continue

@@ -99,9 +99,8 @@ class ImportDescription(StrictModel):
     table: Table = Table()  #: layout of the files
     position: PositionColumns  #: column of the position
     current: CurrentColumns  #: column of the current
-    #: Sampling rate [Hz], or the time column; exactly one of the two.
-    rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None
-    time: TimeColumn | None = None  #: sampling rate [Hz], or the time column; exactly one of the two
+    rate_hz: Annotated[float, Field(ge=1.0, le=1e6)] | None = None  #: sampling rate [Hz]; either this or `time`
+    time: TimeColumn | None = None  #: the time column, instead of a rate
     payload: Name | None = None  #: mounted payload, as named in the cell; None without load
     mounting: Name | None = None  #: its mounting, as named in the cell; None without load
     operator: str = ""  #: person who recorded it

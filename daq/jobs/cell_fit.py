@@ -179,12 +179,8 @@ class CalibrationCache:
         try:
             # Read without waiting for a pipe, and no more than a calibration can have.
             state = json.loads(read_regular(file.with_suffix(".json"), MAX_BYTES))
-            found = hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest()
-            if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != (
-                FORMAT,
-                self._inputs(cell),
-                found,
-            ):
+            wanted = (FORMAT, self._inputs(cell), hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest())
+            if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != wanted:
                 return None
             return _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -204,10 +200,8 @@ class CalibrationCache:
             "seconds": fitted.seconds,
             "summary": asdict(fitted.summary),
         }
-        for path, content in (
-            (file, fitted.content),
-            (file.with_suffix(".json"), json.dumps(state, indent=1).encode()),
-        ):
+        contents = {file: fitted.content, file.with_suffix(".json"): json.dumps(state, indent=1).encode()}
+        for path, content in contents.items():
             with writing(path):
                 replace_file(path, content)
         return file

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from datetime import datetime
 from pathlib import Path
@@ -17,6 +16,7 @@ from daq.ledger.audit import AuditAction, append
 from daq.ledger.audit import read as read_audit
 from daq.ledger.judgement import Spread, judge, known_of
 from daq.ledger.ledger import Ledger
+from daq.report.text import json_text, picked
 from daq.workflow.calibration_file import read
 from daq.writeback.file_access import resolve_links
 from daq.writeback.file_target import FileEdit, FileTarget
@@ -160,21 +160,13 @@ def _write_proposal(session: Session, proposal: Proposal[FileEdit], after_sha256
         "base_sha256": proposal.edit.base_sha256,
         "after_sha256": after_sha256,
         "changes": [
-            {
-                "axis": change.axis,
-                "key": change.key,
-                "old": _finite(change.old),
-                "new": _finite(change.new),
-                "std": _finite(change.std),
-                "unit": change.unit,
-                "change_percent": _finite(change.change_percent),
-            }
+            picked(change, "axis", "key", "old", "new", "std", "unit", "change_percent")
             for change in proposal.edit.changes
         ],
         "refusals": [{"gate": refusal.gate.value, "text": str(refusal)} for refusal in proposal.refusals],
     }
     with writing(session.folder / PROPOSAL):
-        replace_file(session.folder / PROPOSAL, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode())
+        replace_file(session.folder / PROPOSAL, json_text(document).encode())
         replace_file(session.folder / DIFF, proposal.edit.diff.encode())
 
 

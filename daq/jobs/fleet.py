@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from daq.errors import ConfigurationMissing, UsageError
-from daq.jobs.cell_fit import CalibrationCache, Failure, Fitted, Loop, Summary, failure_of, fit_cell
+from daq.jobs.cell_fit import CalibrationCache, Failure, Loop, Summary, failure_of, fit_cell
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 
 HERE = "127.0.0.1"
@@ -190,8 +190,7 @@ def fit_fleet(
 
     def row_of(cell: CellLogs, result: Summary | Failure, seconds: float) -> FleetRow:
         fit, holdout = (tuple(seen.log.name for seen in logs) for logs in (cell.fit, cell.holdout))
-        several = configurations[cell.cell]
-        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, several)
+        return FleetRow(cell.cell, cell.configuration_sha256, fit, holdout, result, seconds, configurations[cell.cell])
 
     missing = []
     for cell in cells:
@@ -201,11 +200,7 @@ def fit_fleet(
         else:
             rows.append(replace(row_of(cell, *cached), file=cache.file(cell), kept=True))
     report_progress(len(rows), len(cells), "")
-
-    def submit(cell: CellLogs) -> Future[Fitted | Failure]:
-        return pool.executor.submit(fit_cell, cell, loop, now())
-
-    for cell, made in each(submit, missing, pool):
+    for cell, made in each(lambda cell: pool.executor.submit(fit_cell, cell, loop, now()), missing, pool):
         # An exception is a worker that was killed, or an error of ours: the other cells have nothing to do with it.
         found = failure_of(made) if isinstance(made, BaseException) else made
         if isinstance(found, Failure):
@@ -266,11 +261,7 @@ def _surveyed(
     seen: list[SeenLog] = []
     unknown: list[UnknownLog] = []
     surveyed = 0
-
-    def submit(portion: tuple[StoredLog, ...]) -> Future[tuple[SeenLog | UnknownLog, ...]]:
-        return pool.executor.submit(survey, portion)
-
-    for portion, found in each(submit, portions, pool):
+    for portion, found in each(lambda portion: pool.executor.submit(survey, portion), portions, pool):
         if isinstance(found, BaseException):  # a worker that was killed, or an error of ours
             unknown += [UnknownLog(log, found) for log in portion]
         else:

@@ -180,8 +180,7 @@ def check_drives(cell: Cell, block_signals: SignalBlocker) -> None:
         for axis, statusword in zip(network.axes, network.statuswords(), strict=True):
             state = decode(statusword)
             if state in FAULTS:
-                reason = f"{state} before the job began; find its cause, then reset it"
-                raise DriveFault(axis, reason, statusword)
+                raise DriveFault(axis, f"{state} before the job began; find its cause, then reset it", statusword)
             if state not in IDLE:
                 left = LEFT_BEHIND if state is State.QUICK_STOP_ACTIVE else ""
                 raise StateRefused(axis, "no power before a job begins", f"{state}{left}", statusword)

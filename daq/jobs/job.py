@@ -125,8 +125,7 @@ def _run(context: JobContext, session: Session) -> Session:
         for gain in watched:
             if gain.alarm:
                 # Each slice of a slow drift may be small enough to be written without an operator.
-                watching = context.within("watch").journal
-                watching.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
+                context.within("watch").journal.say(Level.WARNING, "drift", axis=gain.axis, text=gain.alarm)
         return decide_outcome(context.within("decide"), session, calibration, ledger)
 
 

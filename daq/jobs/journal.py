@@ -60,8 +60,7 @@ class Journal:
             details = "".join(letter if letter.isprintable() else " " for letter in details)
             line = f"{at} {self.step + ': ' if self.step else ''}{event}{': ' + details if details else ''}"
         else:
-            known = {"session": self.session, "step": self.step}
-            named = {key: value for key, value in known.items() if value}
+            named = {key: value for key, value in (("session", self.session), ("step", self.step)) if value}
             entry = {"time": at, "level": level.name.lower(), "event": event, **named, **fields}
             line = json.dumps(_plain(entry), ensure_ascii=False, allow_nan=False, default=str)
             if self.form is Form.JOURNAL:

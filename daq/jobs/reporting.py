@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import shlex
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from daq.jobs.recording import calibration_of_session
 from daq.jobs.session import CALIBRATION, REPORT, Outcome, Session, SessionState
 from daq.ledger.audit import AuditAction, AuditEntry, append
 from daq.ledger.store import HistoryStore
+from daq.report.text import json_text, picked
 from drivers.errors import WHILE
 from ident.calibration import Calibration
 
@@ -110,8 +110,7 @@ def _report(
     context.journal.say(level, "session ended", outcome=outcome.value, exit_code=int(code), remark=remark)
     with writing(session.folder):
         replace_file(session.folder / SUMMARY_TEXT, text(conclusion, context.file).encode())
-        summary = json.dumps(document(conclusion, context.file), indent=2, ensure_ascii=False) + "\n"
-        replace_file(session.folder / SUMMARY_JSON, summary.encode())
+        replace_file(session.folder / SUMMARY_JSON, json_text(document(conclusion, context.file)).encode())
     found = sessions.sessions(context.section.folder, context.cell.name)
     if context.section.metrics is not None:
         duration_s = context.tools.monotonic_s() - context.began_s
@@ -145,8 +144,7 @@ def document(conclusion: Conclusion, cell_file: Path) -> dict[str, Any]:
     """Convert a conclusion to the JSON of `recalibrate --json` and summary.json."""
     found: dict[str, Any] = {
         "outcome": conclusion.outcome.value,
-        "exit_code": conclusion.exit_code,
-        "remark": conclusion.remark,
+        **picked(conclusion, "exit_code", "remark"),
         "to_do": to_do(conclusion, cell_file),
     }
     if conclusion.session is not None:
@@ -297,8 +295,7 @@ def _set_calibration_gauges(gauge: Callable[..., Gauge], calibration: Calibratio
         std.labels(cell, gain.axis, gain.unit).set(gain.std)
     residual = gauge("residual_percent", "Relative error of the torques.", "axis", "data")
     axes = [gain.axis for gain in calibration.gains]
-    errors = (("fit", calibration.relative_error_percent), ("holdout", calibration.holdout_error_percent))
-    for data, error in errors:
+    for data, error in (("fit", calibration.relative_error_percent), ("holdout", calibration.holdout_error_percent)):
         if error is not None:
             for axis, percent in zip((*axes, "total"), (*error.axes, error.total), strict=True):
                 residual.labels(cell, axis, data).set(percent)

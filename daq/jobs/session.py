@@ -70,11 +70,7 @@ class Fitted(StrictModel):
 
 
 class JudgedGain(StrictModel):
-    """A gain beside the one in the controller, with their σ, and whether they differ significantly.
-
-    `drift_sigma` is their difference in σ of the difference, None where both σ are 0; an unknown σ is 0.
-    `change_percent` is None where the number in the controller is 0.
-    """
+    """A gain beside the one in the controller, with their σ, and whether they differ significantly."""
 
     axis: str
     unit: str
@@ -82,8 +78,8 @@ class JudgedGain(StrictModel):
     old_std: float
     new: float
     new_std: float
-    change_percent: float | None
-    drift_sigma: float | None
+    change_percent: float | None  #: None where the number in the controller is 0
+    drift_sigma: float | None  #: difference in σ of the difference, None where both σ are 0; an unknown σ is 0
     differs: bool
 
 
@@ -95,16 +91,13 @@ class Decision(StrictModel):
 
 
 class Target(StrictModel):
-    """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made.
-
-    `looked_at` is the value for `apply --base`; `unsigned` means that required signatures are missing.
-    """
+    """The planned write, saved before it is made: after a kill, the file's digest shows whether it was made."""
 
     file: str
     base_sha256: str
     after_sha256: str
-    looked_at: str = ""
-    unsigned: bool = False
+    looked_at: str = ""  #: value for `apply --base`
+    unsigned: bool = False  #: required signatures are missing
 
 
 class WatchedGain(StrictModel):
@@ -115,18 +108,14 @@ class WatchedGain(StrictModel):
 
 
 class SessionState(StrictModel):
-    """`state.json`; results of steps that are not done yet are None or missing from the list.
-
-    `plans_sha256` is the digest of the approved plans that the runs name, `audit_sha256` that of the audit entry about
-    the end of the session.
-    """
+    """`state.json`; results of steps that are not done yet are None or missing from the list."""
 
     format: Literal["drivegain-recalibration"] = "drivegain-recalibration"
     version: Literal[1] = 1
     session: str
     cell: str
     configuration_sha256: str
-    plans_sha256: str = ""
+    plans_sha256: str = ""  #: of the approved plans that the runs name
     began: str
     attempt: int = 1
     attempt_began: str
@@ -139,7 +128,7 @@ class SessionState(StrictModel):
     exit_code: int | None = None
     problem: str = ""
     ended: str | None = None
-    audit_sha256: str | None = None
+    audit_sha256: str | None = None  #: of the audit entry about the end of the session
 
     def with_(self, **changed: object) -> SessionState:
         """A copy with other values."""

@@ -104,8 +104,7 @@ def cases_document(fits: Mapping[str, CaseFit], calibrations: Mapping[str, Calib
 
 
 def _removed(found: CaseFit) -> list[dict[str, Any]]:
-    steps = () if found.essential is None else found.essential.removed
-    return [picked(step, "name", "std_percent") for step in steps]
+    return [] if found.essential is None else [picked(step, "name", "std_percent") for step in found.essential.removed]
 
 
 def cases_view(fits: Mapping[str, CaseFit], tables: tuple[paper_tables.PaperTable, ...]) -> Iterator[RenderableType]:

@@ -49,15 +49,8 @@ def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None
 
 def gain_table(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str | None = None) -> Table:
     """Table of the gains, a row an axis, beside the true ones of a simulated cell; fits a terminal of 80 columns."""
-    headings = [
-        "axis",
-        "a priori",
-        "identified ± σ",
-        "σ %",
-        "change %",
-        *(("truth", "error %") if truth else ()),
-        "unit",
-    ]
+    true = ("truth", "error %") if truth else ()
+    headings = ("axis", "a priori", "identified ± σ", "σ %", "change %", *true, "unit")
     table = plain_table(headings, title=title, left=(0, len(headings) - 1))
     for gain in gains:
         row = [

@@ -133,12 +133,11 @@ def error_table(found: CrossValidation) -> PaperTable:
             reasons.setdefault(run.left_out, []).append(run.run)
     unmet = [f"{', '.join(runs)}: {reason}." for reason, runs in reasons.items()]
     seen = sorted({run.run for run in found.runs if run.seen_by})
-    notes = [f"Used by a fit: {', '.join(seen)}."] if seen else []
     return PaperTable(
         title="Table 6: relative error norms ‖ρ‖/‖Y‖ [%]",
         headings=("run, joint", *labels),
         rows=(*rows, ("mean", *(percent(mean) for mean in means))),
-        notes=tuple(notes + unmet),
+        notes=(*([f"Used by a fit: {', '.join(seen)}."] if seen else ()), *unmet),
     )
 
 

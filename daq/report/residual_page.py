@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from unicodedata import category
 
-from daq.errors import OutputFailed
+from daq.errors import writing
 from daq.files import replace_file
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
@@ -108,8 +108,7 @@ def _spelled(text: str) -> str:
     HTML allows no control characters, and those that reverse the direction of writing (U+202E and others of category
     Cf) can make a name look like another.
     """
-    shown = "".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text)
-    return escape(shown)
+    return escape("".join(c if c == "\n" or category(c) not in _UNSEEN else f"\\u{ord(c):04x}" for c in text))
 
 
 def save_report(fitted: Fit, account: Account, calibration: Calibration, folder: Path) -> None:
@@ -120,11 +119,9 @@ def save_report(fitted: Fit, account: Account, calibration: Calibration, folder:
     """
     document = {"format": FORMAT, "version": VERSION, **residual_document(fitted, account, calibration)}
     content = {PAGE: residual_page(fitted, account, calibration), DOCUMENT: json_text(document)}
-    try:
+    with writing(folder):
         for name, text in content.items():
             replace_file(folder / name, text.encode())
-    except OSError as error:
-        raise OutputFailed.of(folder, error) from error
 
 
 def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> str:
@@ -137,7 +134,6 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
         if turn is not None:
             sections += [_effect(fitted, before, step, turn, placed) for placed in turn.added]
         before = step.after
-    torques = picture(draw_torques(before, fitted.cell), "Measured and predicted joint torques")
     return page(
         f"Residual of cell {fitted.cell.name}",
         (
@@ -154,7 +150,7 @@ def residual_page(fitted: Fit, account: Account, calibration: Calibration) -> st
                 ),
             ),
             *sections,
-            section("Torques", torques),
+            section("Torques", picture(draw_torques(before, fitted.cell), "Measured and predicted joint torques")),
             _gains(fitted, account),
             *(_turn(fitted, number, step) for number, step in enumerate(fitted.steps, start=1)),
             _limits(fitted),

@@ -28,8 +28,7 @@ def urdf_view(
 
     `same_configuration` says whether the cell file is that of the fit; None without a cell file.
     """
-    headings = ("joint", "link", "mass kg", "centre of mass m", "damping", "friction")
-    table = plain_table(headings, left=(0, 1))
+    table = plain_table(("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1))
     for name, update in updates.items():
         centre = " ".join(f"{value:+.3f}" for value in update.body.centre_m)
         figures = f"{update.body.mass_kg:.3g}", centre, f"{update.damping:.3g}", f"{update.friction:.3g}"

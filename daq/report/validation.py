@@ -56,10 +56,9 @@ def validation_view(calibration: Calibration, found: CrossValidation) -> Iterato
 
 def validation_tables(found: CrossValidation, *, complete: bool) -> list[paper_tables.PaperTable]:
     """Tables 5 to 8 of the paper; unless complete, Table 6 is left out where the table of errors shows the same."""
-    whole = complete or len(found.calibrations) > 1
     return [
         paper_tables.condition_table(found),
-        *([paper_tables.error_table(found)] if whole else []),
+        *([paper_tables.error_table(found)] if complete or len(found.calibrations) > 1 else []),
         *paper_tables.mass_tables(found),
     ]
 

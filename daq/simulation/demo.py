@@ -20,6 +20,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from daq.errors import UsageError
 from daq.report.plots import draw_fit
+from daq.report.text import picked
 from daq.simulation.simulation_file import load_simulation, require_simulator
 from daq.workflow.calibration_file import as_document, save_calibration
 from daq.workflow.fit import Fit, calibration_of, close_loop, fit
@@ -152,21 +153,10 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "error_before_percent_axes": axes[0],
         "error_after_percent_axes": axes[1],
         "plans": [
-            {
-                "moves": len(plan.moves),
-                "condition": plan.condition,
-                "predicted_std_percent": list(plan.predicted_std_percent),
-            }
-            for plan in outcome.plans
+            {"moves": len(plan.moves), **picked(plan, "condition", "predicted_std_percent")} for plan in outcome.plans
         ],
         "logs": [
-            {
-                "log": run.path.name,
-                "samples": run.log.samples,
-                "lost_cycles": run.log.lost_cycles,
-                "valid": run.log.valid,
-            }
-            for run in outcome.recorded
+            {"log": run.path.name, **picked(run.log, "samples", "lost_cycles", "valid")} for run in outcome.recorded
         ],
         "controller_diff": outcome.proposal.edit.diff,
         "applied": outcome.written is not None,

@@ -46,26 +46,16 @@ from ident.planning.excitation import (
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """An identification with its cell and logs.
+    """An identification with its cell and logs."""
 
-    Attributes:
-        cell: as the logs describe it.
-        logs, holdout: what was fitted, and what was not; they are read again where rows are needed.
-        sources: the same, with digests and roles.
-        identification: the estimate without effects.
-        steps: turns of the loop, empty without a search for effects.
-        paper: the paper's total least squares on the same equations, None with fixed gains.
-        lossy: how logs with losses were handled.
-    """
-
-    cell: Cell
-    logs: tuple[Path, ...]
-    holdout: tuple[Path, ...]
-    sources: tuple[Source, ...]
-    identification: Identification
-    steps: tuple[Step, ...]
-    paper: Estimate | None
-    lossy: LossyLogs = LossyLogs.REFUSED
+    cell: Cell  #: as the logs describe it
+    logs: tuple[Path, ...]  #: of the fit; they are read again where rows are needed
+    holdout: tuple[Path, ...]  #: held out of the fit; read again likewise
+    sources: tuple[Source, ...]  #: all of these, with digests and roles
+    identification: Identification  #: the estimate without effects
+    steps: tuple[Step, ...]  #: turns of the loop, empty without a search for effects
+    paper: Estimate | None  #: the paper's total least squares on the same equations, None with fixed gains
+    lossy: LossyLogs = LossyLogs.REFUSED  #: how logs with losses were handled
 
     @property
     def estimate(self) -> Estimate:

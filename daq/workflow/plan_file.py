@@ -66,8 +66,7 @@ def save_plan(plan: Plan, path: Path) -> None:
         "moves:",
     ]
     for move in plan.moves:
-        values = zip(move.target_rad, plan.units, strict=True)
-        target = ", ".join(f"{value / unit.si:.3f}" for value, unit in values)
+        target = ", ".join(f"{at / unit.si:.3f}" for at, unit in zip(move.target_rad, plan.units, strict=True))
         lines.append(
             f"  - {{{key}: [{target}], velocity: {move.velocity:.3f}, acceleration: {move.acceleration:.4f}, "
             f"dwell_s: {move.dwell_s:.3f}}}"

@@ -46,10 +46,9 @@ def bus_lock(cell: Cell, folder: Path | None = None) -> Iterator[None]:
         OutputFailed: the lock file cannot be made, or something else is there.
     """
     where = folder or _shared_folder()
-    # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
-    buses = sorted({lock_name(bus): bus for bus in cell.buses}.items())
     with ExitStack() as held:
-        for name, bus in buses:
+        # In one order for all: two cells that share two buses must not wait for, or refuse, each other crosswise.
+        for name, bus in sorted({lock_name(bus): bus for bus in cell.buses}.items()):
             lock = where / name
             try:
                 held.enter_context(hold_lock(lock))
